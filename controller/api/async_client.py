@@ -117,15 +117,17 @@ class AsyncClient(AsyncCalls):
         position: tuple[float, float],
         *,
         level_db_sl: float | None = None,
+        taps: Sequence[tuple[float, float, float]] = (),
         loop: bool = False,
     ) -> None:
         """Play an effect at the finger nearest to x, y [m]; its status says what it feels.
 
-        effect: its name, or points: time [s], intensity and sharpness, 0 to 1.
+        effect: its name, or points of what lasts: time [s], intensity and sharpness, 0 to 1; taps:
+        the same of short ones beside them.
         """
         x, y = as_position(position)
         played = {"effect": effect} if isinstance(effect, str) else {"points": [*effect]}
-        more = {"level_db_sl": level_db_sl, "loop": loop}
+        more = {"level_db_sl": level_db_sl, "taps": [*taps], "loop": loop}
         await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:

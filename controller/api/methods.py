@@ -209,11 +209,14 @@ class EffectsResult(Message):
     effects: list[EffectDescription]
 
 
+GivenPoints = Annotated[list[tuple[float, float, float]], Field(max_length=MAX_GIVEN), FailFast()]
+
+
 class PlayParams(Message):
     """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
     effect: Name | None = Field(
-        None, description="of the layout, or a named content; null where points are given"
+        None, description="of the layout, or a named content; null where points or taps are given"
     )
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
@@ -222,10 +225,12 @@ class PlayParams(Message):
         description="from -20; at most, and by default, the effect's own; of points by default 20, "
         "at most the highest of the layout",
     )
-    points: Annotated[list[tuple[float, float, float]], Field(max_length=MAX_GIVEN)] | None = Field(
-        None,
-        description="`[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1",
+    points: GivenPoints = Field(
+        [],
+        description="of what lasts: `[time_s, intensity, sharpness]`, in order of time; "
+        "0 to 60 s, 0 to 1",
     )
+    taps: GivenPoints = Field([], description="short ones beside it, in the same way")
     loop: bool = Field(False, description="whether points or a file begin anew at their end")
 
 

@@ -14,6 +14,7 @@ from controller.content.pattern import Pattern
 from controller.content.rendition import (
     CLICK_DURATION,
     SMOOTHING,
+    Rendition,
     averaged,
     level_wanted,
     rendered,
@@ -53,6 +54,20 @@ class Part:
     def frequency(self) -> float | None:
         """Of its carrier [Hz]; None of several."""
         return self.answer.layers[0].frequency
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedContent:
+    """Content as it is played at a finger in time.
+
+    parts: of the rendition; rate [Hz]: of samples; accelerations (n, p) [m/s²]: at the points of
+    the fingertip, by 0.1 s or more longer than the rendition.
+    """
+
+    rendition: Rendition
+    parts: tuple[Part, ...]
+    rate: float
+    accelerations: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +150,28 @@ def check_content(
     level_db_sl: of intensity 1; at, quiet [m]: of the finger, and of others that are to feel
     nothing, beside which it is smoothed. Raises InputError for fingers off the plate or too close.
     """
+    played = play_content(pattern, table, level_db_sl, at=at, quiet=quiet)
+    rate, duration = played.rate, played.rendition.duration
+    times = np.arange(len(played.accelerations)) / rate
+    power = 2 * over_threshold(played.accelerations, rate, table.threshold) ** 2
+    over = [averaged(each, 1 / rate, SMOOTHING) for each in power.T]
+    given = decibels(fingertip_weights(*at, table.plate) @ np.sqrt(over))
+    power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
+    wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
+    kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
+    lost = (*played.rendition.remarks, *_weaker(played.parts))
+    return CheckedContent(duration, played.parts, lost, 1 / rate, wanted, given, kept)
+
+
+def play_content(
+    pattern: Pattern,
+    table: LocalizationTable,
+    level_db_sl: float,
+    *,
+    at: Position,
+    quiet: Sequence[Position] = (),
+) -> PlayedContent:
+    """Play a pattern at a finger in time; arguments and errors as of `check_content`."""
     rendition = rendered(pattern, level_db_sl, table.frequencies)
     if quiet:
         rendition = rendition.smoothed()
@@ -152,12 +189,15 @@ def check_content(
     rate = max(_MIN_RATE, _RATE * highest)
     samples = (rendition.duration + _AFTER) * rate
     times = np.arange((_FAST[bisect_left(_FAST, 2 * samples)] + 1) // 2) / rate
-    given = _level_at(table, at, quiet, _signals(parts, table, times), rate)
-    power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
-    wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
-    kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
-    lost = (*rendition.remarks, *_weaker(parts))
-    return CheckedContent(rendition.duration, parts, lost, 1 / rate, wanted, given, kept)
+    plate = loaded_plate(table, [at, *quiet])
+    moved = from_rest(
+        plate,
+        _signals(parts, table, times),
+        plate.shapes_at(fingertip_points(*at, table.plate)),
+        sample_rate=rate,
+        factors=np.ones(len(table.eras), dtype=complex),
+    )
+    return PlayedContent(rendition, parts, rate, moved)
 
 
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:
@@ -176,23 +216,6 @@ def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray)
             tone = shares * np.exp(2j * np.pi * frequency * tau)
             signals[:, during] += ((bases / strokes)[:, None] * tone).imag
     return signals
-
-
-def _level_at(
-    table: LocalizationTable,
-    at: Position,
-    quiet: Sequence[Position],
-    signals: FloatArray,
-    rate: float,
-) -> FloatArray:
-    """Level [dB SL] at a finger of what moves the ERAs: rms over 20 ms, mean over the fingertip."""
-    plate = loaded_plate(table, [at, *quiet])
-    shapes = plate.shapes_at(fingertip_points(*at, table.plate))
-    factors = np.ones(len(table.eras), dtype=complex)
-    moved = from_rest(plate, signals, shapes, sample_rate=rate, factors=factors)
-    power = 2 * over_threshold(moved, rate, table.threshold) ** 2
-    over = [averaged(each, 1 / rate, SMOOTHING) for each in power.T]
-    return decibels(fingertip_weights(*at, table.plate) @ np.sqrt(over))
 
 
 def _weaker(parts: Sequence[Part]) -> Iterator[str]:

@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from controller.check.content_check import RANGE_DB, TOLERANCE_DB, CheckedContent
-from controller.content.pattern import Pattern
-from controller.content.rendition import along, sharpness_hz
+from controller.content.pattern import Pattern, along
+from controller.content.rendition import sharpness_hz
 
 _WANTED, _FELT = "#888888", "#0b5cad"
 

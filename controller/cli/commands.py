@@ -22,6 +22,7 @@ from controller.cli.daemon import (
 )
 from controller.cli.demo import demo
 from controller.cli.layout import layout_app
+from controller.cli.play import play
 from controller.cli.rig import rig_app
 from drivers.by_hand import cli as by_hand
 from model.errors import InputError
@@ -131,7 +132,7 @@ app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)
 app.command(cls=DashboardCommand)(demo)
-for _command in (gateway, report, touch, watch):
+for _command in (gateway, play, report, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from controller.cli.play import pattern_of
 from model.commands.options import JsonOption, print_report
 from model.config.points import parse_point
 from model.counting import counted
@@ -65,7 +66,6 @@ def check(
     sharpness is only mentioned. Exit status 1 if less than --least is kept.
     """
     from controller.check.content_check import check_content
-    from controller.content.formats import named_content, read_content
     from model.commands.options import Stopwatch
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
@@ -76,7 +76,7 @@ def check(
     middle = table.plate.length / 2, table.plate.width / 2
     place = middle if at is None else parse_point(at, what="--at")
     others = [parse_point(each, what="--quiet") for each in quiet or []]
-    pattern = read_content(file if file.suffix else named_content(str(file)), channel)
+    pattern = pattern_of(file, channel)
     with Stopwatch() as watch:
         checked = check_content(pattern, table, level, at=place, quiet=others)
     files = []

@@ -7,6 +7,10 @@ felt, how sharply, and transients beside it.
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
+
+from model.arrays import FloatArray
+
 Curve: TypeAlias = tuple[tuple[float, float], ...]
 """Times [s], none before the one ahead of it, and values 0 to 1: straight lines, steps where two
 times are equal."""
@@ -35,3 +39,9 @@ class Pattern:
     sharpness: Curve = ()
     transients: tuple[Transient, ...] = ()
     remarks: tuple[str, ...] = ()
+
+
+def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
+    """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
+    moments, values = np.array(curve or ((0.0, 0.0),)).T
+    return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))

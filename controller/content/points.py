@@ -1,39 +1,72 @@
-"""Points that a program gives: time [s], intensity and sharpness of each."""
+"""Points and taps that a program gives: time [s], intensity and sharpness of each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
+import numpy as np
 
 from controller.content.format import MAX_DURATION
-from controller.content.pattern import Pattern
+from controller.content.pattern import Pattern, Transient, along
 from model.errors import InputError
 
 MAX_GIVEN = 500
-"""Most points, the bound of OpenXR; Android guarantees 16."""
+"""Most points, and most taps: the bound of OpenXR; Android guarantees 16."""
+
+_Given: TypeAlias = tuple[float, float, float]
 
 
-def pattern_of_points(points: Sequence[Sequence[float]]) -> Pattern:
-    """Return the pattern of `[time_s, intensity, sharpness]` in order of time.
+def pattern_of_points(points: Sequence[_Given], taps: Sequence[_Given] = ()) -> Pattern:
+    """Return the pattern of points, between which straight lines last, and of taps beside them.
 
-    Raises InputError, with the index of a point, for one that is none.
+    Raises InputError, with the index of one, for what is none.
     """
-    if not 1 <= len(points) <= MAX_GIVEN:
-        raise InputError(f"points must be 1 to {MAX_GIVEN}, got {len(points)}")
+    if not (len(points) <= MAX_GIVEN >= len(taps) and (points or taps)):
+        raise InputError(
+            f"points or taps must be 1 to {MAX_GIVEN}, got {len(points)} and {len(taps)}"
+        )
+    lasting, short = [*_checked("points", points)], [*_checked("taps", taps)]
+    return Pattern(
+        max([time for time, _, _ in (*lasting[-1:], *short[-1:])]),
+        tuple([(time, intensity) for time, intensity, _ in lasting]),
+        tuple([(time, sharpness) for time, _, sharpness in lasting]),
+        tuple([Transient(*each) for each in short]),
+    )
+
+
+def points_of(pattern: Pattern) -> tuple[list[_Given], list[_Given]]:
+    """Return the points and taps of a pattern: at even distances where it has too many points.
+
+    Raises InputError for too many taps.
+    """
+    if (count := len(pattern.transients)) > MAX_GIVEN:
+        raise InputError(f"taps must be up to {MAX_GIVEN}, got {count}; leave some out")
+    taps = [(each.time, each.intensity, each.sharpness) for each in pattern.transients]
+    if not pattern.intensity:
+        return [], taps
+    times, levels = np.array(pattern.intensity).T
+    if len(levels) > MAX_GIVEN:
+        times = np.linspace(times[0], times[-1], MAX_GIVEN)
+        levels = along(pattern.intensity, times)
+    between = np.setdiff1d([time for time, _ in pattern.sharpness], times)
+    within = between[(between > times[0]) & (between < times[-1])][: MAX_GIVEN - len(times)]
+    moments = np.append(times, within)
+    order = np.argsort(moments, kind="stable")
+    moments, levels = moments[order], np.append(levels, along(pattern.intensity, within))[order]
+    sharpness = along(pattern.sharpness, moments)
+    return [*zip(moments.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
+
+
+def _checked(what: str, given: Sequence[_Given]) -> Iterator[_Given]:
+    """Yield each of what is given; raises InputError for what is none."""
     before = 0.0
-    for index, point in enumerate(points):
-        if len(point) != 3:
-            raise InputError(
-                f"points[{index}] must be [time_s, intensity, sharpness], got {len(point)} values"
-            )
-        time, intensity, sharpness = point
+    for index, each in enumerate(given):
+        time, intensity, sharpness = each
         if not before <= time <= MAX_DURATION:
             raise InputError(
-                f"points[{index}] time_s must be {before:g} to {MAX_DURATION:g}, got {time:g}"
+                f"{what}[{index}] time_s must be {before:g} to {MAX_DURATION:g}, got {time:g}"
             )
         for name, value in (("intensity", intensity), ("sharpness", sharpness)):
             if not 0 <= value <= 1:
-                raise InputError(f"points[{index}] {name} must be 0 to 1, got {value:g}")
+                raise InputError(f"{what}[{index}] {name} must be 0 to 1, got {value:g}")
         before = time
-    return Pattern(
-        before,
-        tuple((time, intensity) for time, intensity, _ in points),
-        tuple((time, sharpness) for time, _, sharpness in points),
-    )
+        yield time, intensity, sharpness

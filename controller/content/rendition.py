@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from controller.content.pattern import Curve, Pattern, Transient
+from controller.content.pattern import Pattern, Transient, along
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray
@@ -163,12 +163,6 @@ def _with_taps(
     during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
     np.maximum.at(level, during, levels[number])
     return level
-
-
-def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
-    """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
-    moments, values = np.array(curve or ((0.0, 0.0),)).T
-    return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
 
 
 def sharpness_hz(sharpness: FloatArray) -> FloatArray:

@@ -356,17 +356,17 @@ class ApiService:
 
     def _played(self, params: PlayParams) -> tuple[str, Effect, float]:
         """Return what is to be played: its name, effect and highest level; raises RpcError."""
-        layout, points = self._layouts.player.layout, params.points
-        if (params.effect is None) == (points is None):
+        layout, is_made = self._layouts.player.layout, bool(params.points or params.taps)
+        if (params.effect is None) != is_made:
             raise RpcError(
                 ErrorCode.INVALID_PARAMS,
-                "play must have an effect or points, got both or neither",
+                "play must have an effect, or points and taps, got both or neither",
                 where="effect",
                 remedy="leave one of them out",
             )
-        if points is not None:
+        if is_made:
             try:
-                pattern = pattern_of_points(points)
+                pattern = pattern_of_points(params.points, params.taps)
             except InputError as error:
                 raise RpcError(ErrorCode.INVALID_PARAMS, f"{error}", where="points") from error
             highest = min(layout.max_db_sl, MAX_DB_SL)

@@ -1,0 +1,121 @@
+"""`era play`: content at a finger of a running daemon, or of a simulated plate."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from controller.cli.daemon import Socket, connected
+from model.commands.options import JsonOption, print_report
+from model.config.points import parse_point
+from model.errors import InputError
+from model.finger.perception import STRONG_DB_SL
+
+if TYPE_CHECKING:
+    from controller.content.pattern import Pattern
+
+_RATE = 8000  # Hz; the least that all players of sound take
+_PEAK = 0.9  # of full scale
+
+
+def play(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="A file of content, or the name of an effect or a content."
+        ),
+    ],
+    at: Annotated[str, typer.Option(metavar="X,Y", help="Position of the finger in metres.")],
+    level: Annotated[
+        float | None,
+        typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL; default: 20, or its own."),
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
+    simulate: Annotated[
+        Path | None,
+        typer.Option(metavar="TABLE", help="Table file of a plate that is simulated instead."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="WAV", help="With --simulate: what is felt."),
+    ] = None,
+    socket: Socket = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Play content once at a finger that is on the plate, within 20 mm of a position.
+
+    With --simulate write the acceleration at a finger that is alone there as sound, to listen to
+    and to look at.
+    """
+    place = parse_point(at, what="--at")
+    if (simulate is None) != (output is None):
+        raise InputError("--simulate TABLE and -o WAV must be given together, or neither")
+    if simulate is not None and output is not None:
+        if loop:
+            raise InputError("--loop must be left out with --simulate")
+        _simulate(file, simulate, output, place, level=level, as_json=as_json)
+        return
+    with connected(socket) as era:
+        if file.suffix:
+            from controller.content.formats import read_content
+            from controller.content.points import points_of
+
+            points, taps = points_of(read_content(file))
+            era.play(points, place, taps=taps, level_db_sl=level, loop=loop)
+        else:
+            era.play(str(file), place, level_db_sl=level, loop=loop)
+    print_report(
+        [f"{file} plays at ({place[0]:g}, {place[1]:g}) m", "Next: era status"],
+        {"file": str(file), "at_m": [*place]},
+        as_json=as_json,
+    )
+
+
+def pattern_of(file: Path, channel: int | None = None) -> "Pattern":
+    """Read a file of content, or the one that a name without an ending stands for."""
+    from controller.content.formats import named_content, read_content
+
+    return read_content(file if file.suffix else named_content(str(file)), channel)
+
+
+def _simulate(
+    file: Path,
+    table_file: Path,
+    output: Path,
+    place: tuple[float, float],
+    *,
+    level: float | None,
+    as_json: bool,
+) -> None:
+    """Write what a finger feels as a WAV file."""
+    import numpy as np
+    from scipy.io import wavfile
+    from scipy.signal import resample
+
+    from controller.check.content_check import play_content
+    from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
+    from model.finger.fingertip import fingertip_weights
+    from model.table.file import load_table
+
+    check_ending(output, ".wav", what="a sound")
+    check_place(output, example="felt.wav")
+    check_replaceable(output, is_own=begins_with(output, b"RIFF"), what="WAV file")
+    table = load_table(table_file)
+    given = STRONG_DB_SL if level is None else level
+    played = play_content(pattern_of(file), table, given, at=place)
+    felt = played.accelerations @ fingertip_weights(*place, table.plate)
+    sound = resample(felt, round(len(felt) * _RATE / played.rate))
+    full_scale = float(np.abs(sound).max()) / _PEAK or 1.0
+    wavfile.write(output, _RATE, (sound / full_scale).astype(np.float32))
+    print_report(
+        [f"full scale is {full_scale:.3g} m/s²", f"wrote {output}"],
+        {
+            "file": str(file),
+            "at_m": [*place],
+            "full_scale_m_s2": full_scale,
+            "sample_rate_hz": _RATE,
+            "duration_s": len(sound) / _RATE,
+            "files": [str(output)],
+        },
+        as_json=as_json,
+    )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import wavfile
 from typer.testing import CliRunner
 
 from controller.check.content_check import check_content, kept_shares
@@ -14,7 +15,7 @@ from controller.check.simulated_touch import loaded_plate
 from controller.cli.commands import app
 from controller.content.pattern import Pattern, Transient
 from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, over_threshold
+from model.finger.perception import decibels, detection_threshold, over_threshold
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable
@@ -140,3 +141,24 @@ def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> 
     assert result.exit_code == 1
     assert "lost too much, at least 100 % must be" in result.stdout
     assert "dB above quiet fingers" in result.stdout
+
+
+def test_what_is_felt_is_written_as_sound(tmp_path: Path) -> None:
+    """Intensity 1 for a second at 20 dB SL: ten times the threshold at its frequency, sampled."""
+    save_table(table(), tmp_path / "table.npz")
+    envelope = {"amplitude": [{"time": 0, "amplitude": 1}, {"time": 1, "amplitude": 1}]}
+    content = {"version": {"major": 1, "minor": 0, "patch": 0}, "metadata": {}}
+    signals = {"signals": {"continuous": {"envelopes": envelope}}}
+    (tmp_path / "even.haptic").write_text(json.dumps(content | signals))
+    arguments = ["play", str(tmp_path / "even.haptic"), "--at", "0.11,0.13", "--json", "--simulate"]
+    sound = tmp_path / "felt.wav"
+    result = CliRunner().invoke(app, [*arguments, str(tmp_path / "table.npz"), "-o", str(sound)])
+    assert result.exit_code == 0
+    rate, samples = wavfile.read(sound)
+    middle = samples[int(0.3 * rate) : int(0.7 * rate)].astype(float)
+    middle *= json.loads(result.stdout)["full_scale_m_s2"]
+    spectrum = np.abs(np.fft.rfft(middle))
+    frequency = np.fft.rfftfreq(len(middle), 1 / rate)[spectrum.argmax()]
+    threshold = float(detection_threshold(np.array(frequency), table().threshold))
+    level = decibels(math.sqrt(2) * middle.std() / threshold)
+    assert level == pytest.approx(20.0, abs=1.0)

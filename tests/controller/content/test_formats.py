@@ -14,8 +14,8 @@ from controller.content.formats import (
     named_contents,
     read_content,
 )
-from controller.content.pattern import Pattern
-from controller.content.points import pattern_of_points
+from controller.content.pattern import Pattern, Transient
+from controller.content.points import pattern_of_points, points_of
 from model.errors import InputError
 
 Read = Callable[..., Pattern]
@@ -114,19 +114,32 @@ def test_damaged_file_is_read_or_refused(read: Read, name: str) -> None:
             assert 0 <= pattern.duration <= 60
 
 
-def test_points_of_a_program() -> None:
-    """The points of both curves; a point out of place is named."""
-    pattern = pattern_of_points([[0, 0.5, 1], [0.2, 1, 0]])
-    assert pattern == Pattern(0.2, ((0, 0.5), (0.2, 1)), ((0, 1), (0.2, 0)))
+def test_points_and_taps_of_a_program() -> None:
+    """Both curves of the points, and taps; one out of place is named."""
+    tap = (0.3, 1.0, 0.5)
+    pattern = pattern_of_points([(0, 0.5, 1), (0.2, 1, 0)], [tap])
+    taps = (Transient(*tap),)
+    assert pattern == Pattern(0.3, ((0, 0.5), (0.2, 1)), ((0, 1), (0.2, 0)), taps)
     for points, words in (
-        ([], "points must be 1 to 500, got 0"),
-        ([[0, 0, 0]] * 501, "points must be 1 to 500, got 501"),
-        ([[0, 0]], r"points\[0\] must be \[time_s, intensity, sharpness\], got 2 values"),
-        ([[1, 0, 0], [0, 0, 0]], r"points\[1\] time_s must be 1 to 60, got 0"),
-        ([[0, float("nan"), 0]], r"points\[0\] intensity must be 0 to 1, got nan"),
+        ([], "points or taps must be 1 to 500, got 0"),
+        ([(0, 0, 0)] * 501, "points or taps must be 1 to 500, got 501"),
+        ([(1, 0, 0), (0, 0, 0)], r"points\[1\] time_s must be 1 to 60, got 0"),
+        ([(0, float("nan"), 0)], r"points\[0\] intensity must be 0 to 1, got nan"),
     ):
         with pytest.raises(InputError, match=words):
             pattern_of_points(points)
+
+
+def test_points_are_given_of_a_pattern_whose_curves_have_their_own_times() -> None:
+    """A step stays one; sharpness is given at its own times too; 2 001 points become 500."""
+    level, sharp = ((0.0, 0.0), (0.1, 1.0), (0.1, 0.5), (0.4, 0.5)), ((0.0, 0.0), (0.2, 1.0))
+    points, taps = points_of(Pattern(0.4, level, sharp, (Transient(0.3, 1, 0),)))
+    assert points == [(0, 0, 0), (0.1, 1, 0.5), (0.1, 0.5, 0.5), (0.2, 0.5, 1), (0.4, 0.5, 1)]
+    assert taps == [(0.3, 1, 0)]
+    rise = tuple((number / 1000, number / 2000) for number in range(2001))
+    many, _ = points_of(Pattern(2.0, rise))
+    assert len(many) == 500
+    assert max(abs(level - time / 2) for time, level, _ in many) < 1e-9
 
 
 def test_formats_are_listed() -> None:

@@ -22,7 +22,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")
 
 # Of the sources: what is neither a program nor made by one.
-DATA = re.compile(r"\.(c|h|pyi?|typed|yaml|csv|json|ahap|haptic|hjif|js|css|html|svg|service|rules|conf)$")
+DATA = re.compile(
+    r"\.(c|h|pyi?|typed|yaml|csv|json|ahap|haptic|hjif|js|css|html|svg|service|rules|conf)$"
+)
 
 
 def build(target: str, root: Path, folder: Path, **environment: str) -> Path:

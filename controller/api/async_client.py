@@ -112,11 +112,21 @@ class AsyncClient(AsyncCalls):
         await self._call(Empty, "touch", source=source, touches=touches_at(positions))
 
     async def play(
-        self, effect: str, position: tuple[float, float], *, level_db_sl: float | None = None
+        self,
+        effect: str | Sequence[tuple[float, float, float]],
+        position: tuple[float, float],
+        *,
+        level_db_sl: float | None = None,
+        loop: bool = False,
     ) -> None:
-        """Play an effect at the finger nearest to x, y [m]; its status says what it feels."""
+        """Play an effect at the finger nearest to x, y [m]; its status says what it feels.
+
+        effect: its name, or points: time [s], intensity and sharpness, 0 to 1.
+        """
         x, y = as_position(position)
-        await self._call(Empty, "play", effect=effect, x_m=x, y_m=y, level_db_sl=level_db_sl)
+        played = {"effect": effect} if isinstance(effect, str) else {"points": [*effect]}
+        more = {"level_db_sl": level_db_sl, "loop": loop}
+        await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""

@@ -34,6 +34,7 @@ from controller.api.schema import (
     TouchInputStatus,
     TouchPoint,
 )
+from controller.content.points import MAX_GIVEN
 from controller.effects.gains import GainDb, SourceName
 
 DEFAULT_LEASE = 10.0  # s
@@ -209,14 +210,23 @@ class EffectsResult(Message):
 
 
 class PlayParams(Message):
-    """Play an effect once at the finger nearest to a position; it ends when the finger lifts."""
+    """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
-    effect: Name
+    effect: Name | None = Field(
+        None, description="of the layout, or a named content; null where points are given"
+    )
     x_m: float = Field(description="a finger must be within 20 mm of the position")
     y_m: float
     level_db_sl: float | None = Field(
-        None, description="from -20; at most, and by default, the effect's own"
+        None,
+        description="from -20; at most, and by default, the effect's own; of points by default 20, "
+        "at most the highest of the layout",
     )
+    points: Annotated[list[tuple[float, float, float]], Field(max_length=MAX_GIVEN)] | None = Field(
+        None,
+        description="`[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1",
+    )
+    loop: bool = Field(False, description="whether points or a file begin anew at their end")
 
 
 class StrengthParams(Message):

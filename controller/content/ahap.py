@@ -16,7 +16,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 
 from controller.content.format import ContentFormat, too_much
-from controller.content.json_file import ContentSection, read_json, unknown_keys
+from controller.content.json_file import ContentSection, Entries, read_json, unknown_keys
 from controller.content.mixing import Segment, mixed
 from controller.content.pattern import Curve, Pattern, Transient
 from model.config.sections import Validation
@@ -55,7 +55,7 @@ class _Event(ContentSection):
     Time: float = 0.0
     EventDuration: float = 0.0
     EventWaveformPath: str = ""
-    EventParameters: Annotated[list[_Value], Field(default_factory=list)]
+    EventParameters: Annotated[Entries[_Value], Field(default_factory=list)]
 
 
 class _ControlPoint(ContentSection):
@@ -66,7 +66,7 @@ class _ControlPoint(ContentSection):
 class _ParameterCurve(ContentSection):
     ParameterID: str
     Time: float = 0.0
-    ParameterCurveControlPoints: Annotated[list[_ControlPoint], Field(default_factory=list)]
+    ParameterCurveControlPoints: Annotated[Entries[_ControlPoint], Field(default_factory=list)]
 
 
 class _Entry(ContentSection):
@@ -78,7 +78,7 @@ class _Entry(ContentSection):
 class _Ahap(ContentSection):
     Version: Annotated[float, Field(ge=0)] = 1.0
     Metadata: object = None
-    Pattern: list[_Entry]
+    Pattern: Entries[_Entry]
 
 
 class Ahap(ContentFormat):

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field
 
 from controller.content.format import ContentFormat, too_much
-from controller.content.json_file import ContentSection, read_json, unknown_keys
+from controller.content.json_file import ContentSection, Entries, read_json, unknown_keys
 from controller.content.pattern import Pattern, Transient
 from model.config.document import KeyPath
 from model.config.sections import Validation
@@ -43,8 +43,8 @@ class _Frequency(ContentSection):
 
 
 class _Envelopes(ContentSection):
-    amplitude: Annotated[list[_Amplitude], Field(min_length=1)]
-    frequency: list[_Frequency] | None = None
+    amplitude: Annotated[Entries[_Amplitude], Field(min_length=1)]
+    frequency: Entries[_Frequency] | None = None
 
 
 class _Continuous(ContentSection):

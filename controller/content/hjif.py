@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from controller.content.format import MAX_HZ, MIN_HZ, ContentFormat, refusal, sharpness_of, too_much
-from controller.content.json_file import ContentSection, read_json
+from controller.content.json_file import ContentSection, Entries, read_json
 from controller.content.mixing import Segment, between, mixed
 from controller.content.pattern import Pattern, Transient
 from controller.content.wav import course_of
@@ -38,11 +38,12 @@ _RMS = {
 
 _Ticks = Annotated[float, Field(ge=0)]
 _Hz = Annotated[float, Field(ge=0)]
+_Gain = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 class _Keyframe(ContentSection):
     relative_position: _Ticks = 0.0
-    amplitude_modulation: float | None = None
+    amplitude_modulation: _Gain | None = None
     frequency_modulation: _Hz | None = None
 
 
@@ -51,7 +52,7 @@ class _Effect(ContentSection):
     position: _Ticks = 0.0
     id: float | None = None
     base_signal: Literal["Sine", "Square", "Triangle", "SawToothUp", "SawToothDown"] = "Sine"
-    keyframes: Annotated[list[_Keyframe], Field(default_factory=list)]
+    keyframes: Annotated[Entries[_Keyframe], Field(default_factory=list)]
 
 
 class _Band(ContentSection):
@@ -59,19 +60,19 @@ class _Band(ContentSection):
     curve_type: Literal["Unknown", "Cubic", "Linear", "Akima", "Bezier", "Bspline"] = "Unknown"
     lower_frequency_limit: _Hz = 0.0
     upper_frequency_limit: _Hz = math.inf
-    effects: list[_Effect]
+    effects: Entries[_Effect]
 
 
 class _Channel(ContentSection):
-    gain: float = 1.0
-    bands: list[_Band]
+    gain: _Gain = 1.0
+    bands: Entries[_Band]
 
 
 class _Perception(ContentSection):
     perception_modality: str
     perception_unit_exponent: Annotated[float, Field(ge=-6, le=6)] = 0.0
-    effect_library: Annotated[list[_Effect], Field(default_factory=list)]
-    channels: list[_Channel]
+    effect_library: Annotated[Entries[_Effect], Field(default_factory=list)]
+    channels: Entries[_Channel]
 
 
 class _HjifVersion(ContentSection):
@@ -81,7 +82,7 @@ class _HjifVersion(ContentSection):
 
 class _HjifFile(_HjifVersion):
     timescale: Annotated[float, Field(ge=1, le=48_000)] = 1000.0
-    perceptions: list[_Perception]
+    perceptions: Entries[_Perception]
 
 
 class Hjif(ContentFormat):
@@ -166,7 +167,7 @@ class _Reading:
                 self._validation.add((*where, "id" if effect is None else "effect_type"), message)
                 continue
             ticks = [each.relative_position for each in effect.keyframes]
-            times = [(placed.position + each) * self._tick for each in ticks]
+            times = [round((placed.position + each) * self._tick, 9) for each in ticks]
             self._count += len(times)
             self._end = max([self._end, *times])
             if ticks != sorted(ticks):

@@ -5,10 +5,10 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, GetCoreSchemaHandler
 
 from controller.content.format import MAX_POINTS, refusal
 from model.config.document import Document, KeyPath, decoded, key_name
@@ -20,10 +20,27 @@ _MAX_OPENED = 5 * MAX_POINTS  # brackets: an event of AHAP has five
 _MAX_NAMED = 5  # unknown keys in remarks
 
 _SPACE = re.compile(r"[ \t\n\r]*")
-_STRING = r'"[^"\\]*(?:\\.[^"\\]*)*"'
+_STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
 _STRINGS = re.compile(_STRING, re.DOTALL)
 _TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
 _DECODER = json.JSONDecoder()
+
+
+_T = TypeVar("_T")
+
+
+class _FirstOfMany:
+    """Annotation of a list: the first invalid entry is reported, and no more of them are looked at.
+
+    pydantic's own, FailFast, cannot be in a union.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        return {**handler(source), "fail_fast": True, "max_length": MAX_POINTS}
+
+
+Entries: TypeAlias = Annotated[list[_T], _FirstOfMany()]
+"""A list of which the first invalid entry is reported."""
 
 
 class ContentSection(Section):

@@ -12,6 +12,7 @@ Segment: TypeAlias = tuple[float, float, float, float, float, float]
 """Start and end [s], intensity at both, sharpness at both; straight lines between."""
 
 _STEP = 0.005  # s; products and sums of straight lines are straight lines within it
+_DIGITS = 9  # times are of whole nanoseconds, so that none are all but the same
 _MAX_OVERLAP = 1_000_000  # parts of segments
 
 
@@ -27,13 +28,15 @@ def mixed(
     Intensities add as powers, up to 1; the sharpness is that of the strongest. factor, addend: of
     all intensities and sharpnesses over time. source: the file, for the error of too many.
     """
-    rows = np.array([each for each in segments if each[1] > each[0]])
+    rows = np.array(segments).reshape(-1, 6)
+    rows[:, :2] = rows[:, :2].round(_DIGITS)
+    rows = rows[rows[:, 1] > rows[:, 0]]
     if not len(rows):
         return (), ()
     begins, ends = rows[:, 0], rows[:, 1]
-    given = [np.array([time for time, _ in curve]) for curve in (factor, addend)]
+    given = [time for curve in (factor, addend) for time, _ in curve]
     grid = np.arange(begins.min(), ends.max(), _STEP)
-    knots = np.unique(np.concatenate([begins, ends, grid, *given]))
+    knots = np.unique(np.concatenate([begins, ends, np.round([*grid, *given], _DIGITS)]))
     knots = knots[(knots >= begins.min()) & (knots <= ends.max())]
     first = np.searchsorted(knots, begins)
     counts = np.searchsorted(knots, ends) - first
@@ -60,6 +63,7 @@ def mixed(
 def between(curve: Curve, knots: FloatArray) -> FloatArray:
     """Return a curve (2, n) after and before the ends of each stretch between knots."""
     times, values = np.array(curve).T
+    times = times.round(_DIGITS)
     width = np.diff(knots)
     early, late = (np.interp(knots[:-1] + part * width, times, values) for part in (0.25, 0.75))
     return np.stack([1.5 * early - 0.5 * late, 1.5 * late - 0.5 * early])

@@ -1,12 +1,13 @@
 """The surface layouts of a running daemon, of which one is in use."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.topics import LayoutEvent
 from controller.daemon.config import DaemonConfig
 from controller.daemon.reload import ConfigChange
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
 from model.arrays import FloatArray
@@ -25,8 +26,8 @@ class LayoutChoice:
     def __init__(
         self, config: DaemonConfig, frequencies: FloatArray, *, changed: Callable[[], None]
     ) -> None:
-        self._layouts = config.layouts
         self._frequencies = frequencies
+        self._layouts = self._for_table(config.layouts)
         self._changed = changed
         self.name = next(iter(self._layouts))
         """Of the layout in use; None if none is configured."""
@@ -59,13 +60,18 @@ class LayoutChoice:
 
         If it was removed it is the first, of which it returns a note.
         """
-        before, self._layouts = self.name, change.config.layouts
+        before, self._layouts = self.name, self._for_table(change.config.layouts)
         name = before if before in self._layouts else next(iter(self._layouts))
         if change.layouts:
             self._warn_of_bands()
         if name != before or name in change.layouts:
             self._play(name)
         return [] if name == before else [f"layout in use: {name or 'none'}"]
+
+    def _for_table(
+        self, layouts: Mapping[str | None, SurfaceLayout]
+    ) -> Mapping[str | None, SurfaceLayout]:
+        return {name: each.for_table(self._frequencies) for name, each in layouts.items()}
 
     def event(self) -> LayoutEvent:
         """The layout in use, as an event."""

@@ -38,11 +38,13 @@ from controller.api.methods import (
 from controller.api.registered import METHODS
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
+from controller.content.points import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import effects_result, hello_result, playing_of
 from controller.daemon.publisher import EventPublisher
-from controller.effects.effect import MIN_DB_SL
+from controller.effects.effect import MIN_DB_SL, Effect
+from controller.effects.file import File
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER
@@ -60,6 +62,8 @@ from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
+from model.errors import InputError
+from model.finger.perception import STRONG_DB_SL
 from model.table.table import LocalizationTable
 from registry import clock
 from registry.suggestions import did_you_mean
@@ -312,26 +316,17 @@ class ApiService:
 
     @api_method(is_repeated=False)
     def play(self, client: Connection, params: PlayParams) -> Empty:
-        """Play an effect at a finger; only while armed."""
+        """Play an effect, or points, at a finger; only while armed."""
         # At the contact nearest to the position, at the effect's own level or below.
         operation = self._supervisor.operation
         if operation.state is not _ENABLED or self._controller.group.members.degraded:
             raise _wrong_state(operation)
-        effects = self._layouts.player.layout.effects
-        effect = effects.get(params.effect)
-        if effect is None:
-            raise RpcError(
-                ErrorCode.REFUSED,
-                f"unknown effect {params.effect!a}",
-                where="effect",
-                remedy=f"choose one of {', '.join(sorted(effects))}",
-            )
-        level_max = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        name, effect, level_max = self._played(params)
         level = params.level_db_sl
         if level is not None and not MIN_DB_SL <= level <= level_max:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"level of effect {params.effect!a} must be from {MIN_DB_SL:g} to {level_max:g} "
+                f"level of effect {name!a} must be from {MIN_DB_SL:g} to {level_max:g} "
                 f"dB SL, got {level:g}",
                 where="level_db_sl",
                 remedy="choose one of these, or another level in the surface layout",
@@ -349,14 +344,53 @@ class ApiService:
                 remedy="touch the plate there, or send a touch over the API",
             )
         self._layouts.player.play(
-            params.effect,
+            name,
             nearest,
             clock.now(),
             level_db_sl=level,
             player=client.name,
+            effect=effect,
         )
         self._controller.cycle.request_update()
         return Empty()
+
+    def _played(self, params: PlayParams) -> tuple[str, Effect, float]:
+        """Return what is to be played: its name, effect and highest level; raises RpcError."""
+        layout, points = self._layouts.player.layout, params.points
+        if (params.effect is None) == (points is None):
+            raise RpcError(
+                ErrorCode.INVALID_PARAMS,
+                "play must have an effect or points, got both or neither",
+                where="effect",
+                remedy="leave one of them out",
+            )
+        if points is not None:
+            try:
+                pattern = pattern_of_points(points)
+            except InputError as error:
+                raise RpcError(ErrorCode.INVALID_PARAMS, f"{error}", where="points") from error
+            highest = min(layout.max_db_sl, MAX_DB_SL)
+            level = min(STRONG_DB_SL, highest)
+            made = File.of(pattern, name="points", level_db_sl=level, loop=params.loop)
+            return "points", made.for_table(self._table.frequencies), highest
+        name = params.effect or ""
+        if (effect := layout.effects.get(name)) is None:
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"unknown effect {name!a}",
+                where="effect",
+                remedy=f"choose one of {', '.join(sorted(layout.effects))}",
+            )
+        level = MAX_DB_SL if effect.level_db_sl is None else effect.level_db_sl
+        if not params.loop:
+            return name, effect, level
+        if not isinstance(effect, File):
+            raise RpcError(
+                ErrorCode.REFUSED,
+                f"loop must be left out of effect {name!a}, which is no file",
+                where="loop",
+            )
+        return name, effect.model_copy(update={"loop": True}), level
 
     @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:

@@ -2,7 +2,8 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Strict, model_validator
@@ -10,7 +11,9 @@ from pydantic import Strict, model_validator
 from controller.effects.region import Region
 from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.course import Course
 from model.answer.fingers import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
+from model.arrays import FloatArray
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY, LEVEL
 from model.finger.perception import STRONG_DB_SL
@@ -47,13 +50,22 @@ class EffectStimulus:
     level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
     the finger does nothing; None for never. pulse: for a vibration of limited duration, which the
     amplifiers end by themselves. modulation_hz: how often a second its strength comes and goes, 10
-    to 30; None for a steady one, as are pulses below 0.2 s.
+    to 30; None for a steady one, as are pulses below 0.2 s. course: along which it is felt over its
+    pulse, at the level where that is 1, and anew until the pulse ends; None for steadily. band: its
+    own frequencies, where the layout says none. click: a short pulse that is felt beside it.
+    is_absolute: whether a short pulse is as strong as its level says, whatever lasts there.
+    among_others: what is felt instead while other fingers are on the plate; None: the same.
     """
 
     level_db_sl: float | None
     until: float | None = None
     pulse: Pulse | None = None
     modulation_hz: float | None = None
+    course: Course | None = field(default=None, repr=False)
+    band: Band | None = None
+    click: "EffectStimulus | None" = None
+    is_absolute: bool = False
+    among_others: "EffectStimulus | None" = None
 
     def target(
         self,
@@ -67,25 +79,28 @@ class EffectStimulus:
     ) -> Target:
         """Return the target of a finger that feels it in a region, or outside of all.
 
-        effect: its name; above_db: that a short pulse has over what lasts there.
+        effect: its name; band: by the layout, None for its own; above_db: that a short pulse has
+        over what lasts there.
         """
+        is_raised = self.is_short and self.pulse is not None and self.pulse.is_raised
         return Target(
             key,
             self.level_db_sl,
             pulse=self.pulse,
-            band=band,
+            band=self.band if band is None else band,
             priority=priority,
             content=effect,
             is_own=region is not None and region.is_own,
             may_share=region is not None and region.may_share,
             modulation_hz=self.modulation_hz,
-            above_db=above_db if self.is_short and self.pulse and self.pulse.is_raised else None,
+            above_db=above_db if is_raised and not self.is_absolute else None,
+            course=self.course,
         )
 
     @property
     def is_short(self) -> bool:
         """Whether it is a short pulse, beside which another is felt that lasts."""
-        return self.pulse is not None and self.pulse.is_short
+        return self.pulse is not None and self.pulse.is_short and self.course is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +192,18 @@ class Effect(TunedSection, ABC):
     ) -> EffectRun:
         """Start in a region, or outside of all; for effects that depend on it."""
         return self.start(contact, now, level_db_sl=level_db_sl)
+
+    def read(self, folder: Path) -> None:
+        """Read what it names, from the folder of its layout; raises InputError."""
+
+    def for_table(self, frequencies: FloatArray) -> Self:
+        """Return it as it is played at the frequencies of a table [Hz]."""
+        return self
+
+    @property
+    def gives_level(self) -> bool:
+        """Whether its layout gives it a level of its own."""
+        return "level" in self.model_fields_set
 
     @property
     def has_end(self) -> bool:

@@ -7,12 +7,13 @@ from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.dial import Dial
 from controller.effects.effect import Effect
+from controller.effects.file import File
 from controller.effects.ramp import Ramp
 from controller.effects.texture import Texture
 from model.errors import InputError
 from registry.plugins import PluginRegistry
 
-BUILT_IN: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, Ramp, Texture)
+BUILT_IN: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, File, Ramp, Texture)
 """The kinds of the project itself."""
 
 _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 from controller.effects.effect import Effect
+from controller.effects.file import named_effects
 from controller.effects.kinds import BUILT_IN
 from controller.effects.region import USES, Region
 from controller.play.intent import Band, band_problem
@@ -22,7 +23,8 @@ ELSEWHERE = "elsewhere"
 def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
     """Return the effects that every layout has without defining them, at a level."""
     effects = [each for each in BUILT_IN if not each.needs_entry]
-    return {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
+    plain = {each.kind: each.model_construct(set(), level=level_db_sl) for each in effects}
+    return {**named_effects(level_db_sl), **plain}
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,11 @@ class SurfaceLayout:
         if self.elsewhere is not None:
             yield None, ELSEWHERE, self.elsewhere
 
+    def for_table(self, frequencies: FloatArray) -> Self:
+        """Return it as it is played at the frequencies of a table [Hz]."""
+        effects = {name: each.for_table(frequencies) for name, each in self.effects.items()}
+        return replace(self, effects=effects)
+
     @property
     def max_db_sl(self) -> float:
         """The highest level of all effects; infinite for what the neighbours allow."""
@@ -75,7 +82,7 @@ class SurfaceLayout:
     def gives_level(self, name: str, region: Region | None) -> bool:
         """Whether it gives an effect, by name, a level of its own in a region."""
         is_given = region is not None and region.has_level
-        return is_given or "level" in self.effects[name].model_fields_set
+        return is_given or self.effects[name].gives_level
 
     def band_of(self, name: str, region: Region | None) -> Band | None:
         """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""

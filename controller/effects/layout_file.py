@@ -77,7 +77,7 @@ def layout_of(
     """Make the layout of a document; arguments and errors as of `load_layout`."""
     _check_kind(document)
     validation = Validation(document, LayoutSection)
-    effects = _effects(validation, level_db_sl)
+    effects = _effects(document, validation, level_db_sl)
     for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
         _check_region(validation, ("regions", name), effects, plate)
     elsewhere = validation.field(("elsewhere",), LayoutSection)
@@ -107,7 +107,9 @@ def _check_kind(document: Document) -> None:
         )
 
 
-def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[str, Effect | None]:
+def _effects(
+    document: Document, validation: Validation[LayoutSection], level_db_sl: float
+) -> dict[str, Effect | None]:
     """Return effects by name, with the default ones; None for an invalid one."""
     effects: dict[str, Effect | None] = {**default_effects(level_db_sl)}
     own = validation.mapping(("effects",))
@@ -124,7 +126,12 @@ def _effects(validation: Validation[LayoutSection], level_db_sl: float) -> dict[
             is_named = "kind" in parameters or name in effect_kinds()
             validation.add(where, f"{error}" if is_named else f"needs a kind; {error}")
             continue
-        effects[name] = validation.nested(path, section, without="kind")
+        effects[name] = effect = validation.nested(path, section, without="kind")
+        try:
+            if effect is not None:
+                effect.read(document.beside(""))
+        except InputError as error:
+            validation.add((*path, "file"), f"{error}")
     return effects
 
 

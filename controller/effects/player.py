@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.effects.layout import SurfaceLayout
@@ -105,7 +106,7 @@ class EffectPlayer:
                 sensed.append((play.number, play, contact.key, stimulus))
                 if play.is_elsewhere:
                     newest_elsewhere = max(newest_elsewhere, play.number)
-        sensed.sort()
+        sensed.sort(key=itemgetter(0))
         waiting, self._waiting, targets = self._waiting, {}, list[Target]()
         gains_db = dict[tuple[ContactKey, bool], float]()
         self._sensing, self._targets, self._felt = set(), set(), set()
@@ -113,6 +114,8 @@ class EffectPlayer:
             self._sensing.add(key)
             if play.is_elsewhere and number < newest_elsewhere:
                 continue
+            if len(contacts) > 1 and stimulus.among_others is not None:
+                stimulus = stimulus.among_others
             target = stimulus.target(
                 key,
                 play.name,
@@ -182,13 +185,14 @@ class EffectPlayer:
         *,
         level_db_sl: float | None,
         player: str | None = None,
+        effect: Effect | None = None,
     ) -> None:
         """Start a named effect at a finger, again if it was requested there before.
 
-        level_db_sl: replaces its own unless None. player: the client whose strength it has. Raises
-        KeyError for an unknown effect.
+        level_db_sl: replaces its own unless None. player: the client whose strength it has; effect:
+        in place of that of the layout. Raises KeyError for an unknown effect.
         """
-        effect = self.layout.effects[name]
+        effect = effect or self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
         finger = self._fingers.get(contact.key)
         if finger is None or finger.since != contact.since:
@@ -200,8 +204,9 @@ class EffectPlayer:
             if (play.name, play.priority) != (name, REQUESTED_PRIORITY)
         ]
         requested = REQUESTED_PRIORITY
-        self._start(finger, finger.region, name, contact, now, level=level, priority=requested)
-        is_given = level_db_sl is not None or self.layout.gives_level(name, None)
+        at = finger, finger.region, name, effect, contact, now
+        self._start(*at, level=level, priority=requested)
+        is_given = level_db_sl is not None or effect.gives_level
         finger.plays[-1].above_db = None if is_given else CLICK_ABOVE_DB
         finger.plays[-1].player = player
 
@@ -298,13 +303,15 @@ class EffectPlayer:
         """Start an effect of a region, or that outside of all."""
         level = self.layout.level_of(name, region)
         priority = 0 if region is None else region.priority
-        self._start(finger, region, name, contact, now, level=level, priority=priority)
+        effect = self.layout.effects[name]
+        self._start(finger, region, name, effect, contact, now, level=level, priority=priority)
 
     def _start(
         self,
         finger: _Finger,
         region: Region | None,
         name: str,
+        effect: Effect,
         contact: Contact,
         now: float,
         *,
@@ -313,13 +320,13 @@ class EffectPlayer:
     ) -> None:
         """Start an effect in a region, or outside of all."""
         self._number += 1
-        effect = self.layout.effects[name]
         run = effect.start_in(region, contact, now, level_db_sl=level)
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
-        band = self.layout.band_of(name, region)
+        band = effect.tuned_band if region is None or region.band is None else region.band
         is_elsewhere = region is None and priority != REQUESTED_PRIORITY
-        above = None if self.layout.gives_level(name, region) else CLICK_ABOVE_DB
+        is_given = effect.gives_level or (region is not None and region.has_level)
+        above = None if is_given else CLICK_ABOVE_DB
         finger.plays.append(
             _Play(name, effect, run, self._number, priority, band, region, is_elsewhere, above)
         )
@@ -346,5 +353,9 @@ class EffectPlayer:
                 ends.append(result.until)
             if isinstance(result, EffectStimulus):
                 felt[result.is_short] = play, result
+                if not result.is_short and True in felt and felt[True][1].is_absolute:
+                    del felt[True]  # of a file before
+                if result.click is not None:
+                    felt[True] = play, result.click
         finger.plays = lasting
         return felt.values()

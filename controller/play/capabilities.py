@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
+from controller.play.pieces import LONGEST_STEP
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
@@ -21,8 +22,9 @@ from model.rig.rig import Rig
 from model.transients.base_motion import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 
-MAX_SET_TIME = 0.010
-"""How long [s] a set may take on its wire, so that its onset does not delay a touch."""
+MAX_SET_TIME, MAX_PIECE_TIME = 0.010, 0.020
+"""How long [s] a set may take on its wire, so that its onset does not delay a touch, and one that
+continues a course, for which a touch may have to wait."""
 
 _FREQUENCY, _LEVEL, _RAMP = (QUANTITIES[name] for name in ("frequency", "level", "ramp"))
 _PHASE_STEP = QUANTITIES["phase_step"]
@@ -49,7 +51,7 @@ class PlaybackCapabilities:
 
     drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
     play; limits: of a drive; envelope_support: knots that every amplifier plays; ramp_max [s];
-    layers: contents at once.
+    layers: contents at once; course_knots: of a piece of a course, 0: ramps.
     """
 
     drive_mode: str
@@ -58,6 +60,7 @@ class PlaybackCapabilities:
     envelope_support: EnvelopeSupport
     ramp_max: float = math.inf
     layers: int = 1
+    course_knots: int = 0
 
     def left_by(self, taken: Mapping[str, float], strokes: Mapping[str, float]) -> Self:
         """Return what amplitudes [m] leave of these and of the power, their peaks together."""
@@ -115,42 +118,60 @@ def playback_capabilities(
         envelope_support=envelope_support(rig, amplifiers),
         ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
         layers=min(one.capabilities["layers"] for one in amplifiers.values()),
+        course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=LONGEST_STEP),
     )
 
 
 def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
     """Return what all open amplifiers, by name, play, and their wires carry within 10 ms."""
+    knots, onset, ending = _knots(rig, amplifiers), ONSET_KNOTS - 1, ENDING_KNOTS - 1
+    return EnvelopeSupport(min(knots, onset), ending if knots >= ending else 0)
+
+
+def _knots(
+    rig: Rig,
+    amplifiers: Mapping[str, Amplifier],
+    *,
+    within: float = MAX_SET_TIME,
+    step: float = KNOT_STEP,
+) -> int:
+    """Return how many knots all open amplifiers play, and their wires carry within a time [s].
+
+    step [s]: the longest between two of them.
+    """
     wired: dict[str, int] = defaultdict(int)
     for channel in rig.wiring.values():
         wired[channel.amplifier] += 1
     by_line: dict[Line, list[str]] = defaultdict(list)
     for name in wired:
         by_line[amplifiers[name].line].append(name)
-    carried = [_knots_on(line, [wired[name] for name in names]) for line, names in by_line.items()]
+    carried = [
+        _knots_on(line, [wired[name] for name in names], within) for line, names in by_line.items()
+    ]
     carried += [
         _knots_in(amplifiers[name].capabilities["set_words"], [count])
         for name, count in wired.items()
     ]
-    each = min(map(_knots_of, (amplifiers[name] for name in wired)), default=0)
-    knots, onset, ending = max(min(carried, default=0), 0), ONSET_KNOTS - 1, ENDING_KNOTS - 1
-    if min(knots, each) < ending:
-        ending = 0
-    return EnvelopeSupport(min(knots, each, onset), ending)
+    each = min([_knots_of(amplifiers[name], step) for name in wired], default=0)
+    return min(max(min(carried, default=0), 0), each)
 
 
-def _knots_of(amplifier: Amplifier) -> int:
-    """Return how many knots an envelope of an amplifier may have, in the steps of the model."""
+def _knots_of(amplifier: Amplifier, longest: float) -> int:
+    """Return how many knots an envelope of an amplifier may have.
+
+    In steps from that of the model to a longest one [s].
+    """
     can = amplifier.capabilities
     low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
-    return int(can["knots"]) if low <= KNOT_STEP <= high else 0
+    return int(can["knots"]) if low <= KNOT_STEP <= longest <= high else 0
 
 
-def _knots_on(line: Line, channels: list[int]) -> int:
+def _knots_on(line: Line, channels: list[int], within: float) -> int:
     """Return the knots of each channel that a line carries in time, for its amplifiers' sets."""
     takes = line.wire.transit(MAX_WORDS)
     if takes <= 0:
         return int(QUANTITIES["knots"].maximum)
-    return _knots_in(int(MAX_WORDS * MAX_SET_TIME / takes), channels)
+    return _knots_in(int(MAX_WORDS * within / takes), channels)
 
 
 def _knots_in(words: int, channels: list[int]) -> int:

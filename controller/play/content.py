@@ -10,6 +10,7 @@ import numpy as np
 from controller.play.intent import Gains, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
+from model.answer.course import Course
 from model.answer.fingers import Placement
 from model.finger.fingertip import fingertip_points
 from model.finger.perception import detection_threshold
@@ -131,6 +132,14 @@ class Content:
     def frequency(self) -> float | None:
         """Its frequency [Hz]; None of several."""
         return self.layer.frequency
+
+    @property
+    def course(self) -> tuple[Course, Pulse] | None:
+        """The course along which it is felt, and its pulse; None for steadily."""
+        target = self.targets[0][1]
+        if target.course is None or target.pulse is None:
+            return None
+        return target.course, target.pulse
 
 
 @dataclass(frozen=True)

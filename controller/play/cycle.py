@@ -158,8 +158,12 @@ class Cycle:
                 return sent_at
             if self.group.sets.is_in_doubt:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
-            is_preempted = self._wake.is_set if sets.endings else None
-            played = await self.group.apply(sets.by_amplifier, is_preempted)
+            played = await self.group.apply(
+                sets.by_amplifier,
+                (lambda: self._wake.is_set() and clock.now() < sets.gives_way_until)
+                if sets.endings
+                else None,
+            )
         except Overtaken:  # endings, by what has come since: they follow it
             return None
         except BaseException as error:

@@ -11,6 +11,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.course import Course
 from model.answer.fingers import SHAPED_FROM
 from model.arrays import FloatArray
 from model.choice import best_of
@@ -84,7 +85,8 @@ class Target:
     this one alone. is_own: whether it feels its own content or none; may_share: whether it may also
     feel that of any finger that may share. modulation_hz: how often a second the strength of what
     lasts comes and goes. above_db: by how much at least a short pulse is above what lasts at its
-    finger; None as strong as its level says.
+    finger; None as strong as its level says. course: along which it is felt from the start of its
+    pulse on, None for steadily; it begins anew until the pulse ends.
     """
 
     key: ContactKey
@@ -97,6 +99,7 @@ class Target:
     may_share: bool = False
     modulation_hz: float | None = None
     above_db: float | None = None
+    course: Course | None = field(default=None, hash=False, repr=False)  # of thousands of points
 
     @property
     def voice(self) -> int:
@@ -106,14 +109,14 @@ class Target:
     @property
     def shared_as(self) -> str | bool | None:
         """Equal for contacts that may feel one vibration that lasts; None for its own alone."""
-        if self.is_short or self.is_own:
+        if self.is_short or self.is_own or self.course:
             return None
         return self.may_share or self.content
 
     @property
     def is_short(self) -> bool:
         """Whether it is a short pulse."""
-        return self.pulse is not None and self.pulse.is_short
+        return self.pulse is not None and self.pulse.is_short and self.course is None
 
 
 @dataclass(frozen=True)

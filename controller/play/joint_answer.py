@@ -152,7 +152,7 @@ def selection_of(
                     (contact.key, target.voice + voice),
                     tuple(own),
                     placed,
-                    shape(placed, played, is_continued) if shape else played,
+                    shape(placed, played, is_continued) if shape and not target.course else played,
                     () if voice else _predictions(own, sensations, layer),
                 )
             )
@@ -183,7 +183,7 @@ def fingers_of(
     """
     found = []
     for contact, target in targets:
-        is_over = len(targets) == 1 or target.is_short
+        is_over = target.course is None and (len(targets) == 1 or target.is_short)
         duration = None
         if is_over and target.pulse is not None and target.pulse.is_raised:
             duration = target.pulse.duration
@@ -194,8 +194,10 @@ def fingers_of(
             None if duration is not None else target.modulation_hz,
             is_limit=target.level_db_sl is None,
             name=target.content,
+            course=target.course,
         )
-        sharing = NEVER if target.is_own else ANY if target.may_share else BY_NAME
+        never = target.is_own or target.course is not None  # each has begun at its own time
+        sharing = NEVER if never else ANY if target.may_share else BY_NAME
         found.append(
             Finger(
                 (contact.x, contact.y),

@@ -15,13 +15,15 @@ from typing import Any
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
-from controller.play.intent import CLICK, FADED_AFTER
+from controller.play.intent import CLICK, FADED_AFTER, Pulse
+from controller.play.pieces import HELD, piece_of
 from controller.play.routing import (
     BESIDE_CLICK,
     FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
+    full_drive,
     tones_by_era,
 )
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
@@ -31,6 +33,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
+from model.answer.course import Course
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 
@@ -70,8 +73,9 @@ class LayerContent:
 
     layer: with the ramp, onset and ending of its sets; drive: by ERA, as confirmed; settled_at
     [s]: when its onset has ended. is_shaped: whether it may have an ending, which is sent at
-    ending_due [s], once the onset has ended: until then it fades. confirmed_until [s]: when its
-    first target would have been lifted, as known when it was sent; between renewal_due and
+    ending_due [s], once the onset has ended: until then it fades. Of one with a course the next
+    piece is sent then; course_until [s]: when what has been sent of it ends. confirmed_until [s]:
+    when its first target would have been lifted, as known when it was sent; between renewal_due and
     renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
     ended by itself unless it was renewed. is_falling: whether another content takes its place along
     a cross-fade: it falls at ending_due, and is not renewed.
@@ -88,6 +92,7 @@ class LayerContent:
     renewable_until: float = math.inf
     ends_at: float = math.inf
     is_falling: bool = False
+    course_until: float = -math.inf
 
     @property
     def settled_after(self) -> float:
@@ -104,7 +109,8 @@ class Sets:
     layers: those that change, by number; started: of these, those that play another content;
     endings: of those that play on, which get an ending; silence: ramp [s] along which all layers
     fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents
-    that a ledger does not admit, for a reason; retry_at [s]: when it may.
+    that a ledger does not admit, for a reason; retry_at [s]: when it may. gives_way_until [s]: when
+    endings, among which are pieces of courses, are no longer preempted by a touch.
     """
 
     layers: Mapping[int, PlateLayer] = field(default_factory=dict)
@@ -115,6 +121,7 @@ class Sets:
     skipped: Sequence[Content] = ()
     reason: str = ""
     retry_at: float = math.inf
+    gives_way_until: float = math.inf
 
     @cached_property
     def by_amplifier(self) -> dict[str, list[Layer]]:
@@ -152,12 +159,14 @@ class Layers:
         """Makes the sets."""
         has_endings = capabilities.envelope_support.ending_knots > 0
         self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
+        # A limit of slew lengthens ramps.
+        self._course_knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf
         """When [s] the next content is to be renewed, gets its ending, or has ended by itself."""
         self.ending_due = math.inf
-        """When [s] the next content gets its ending."""
+        """When [s] the next content gets its ending, or the next piece of its course."""
         self.may_play: frozenset[int] = frozenset()
         """Layers that may play, since all were silent."""
         self.is_silent = False
@@ -219,12 +228,20 @@ class Layers:
         """Return the sets that give endings to what plays, where that is due at a time [s].
 
         By a set of its own, so that no touch waits for them. What a ledger refuses fades. What
-        gives way to another content falls.
+        gives way to another content falls. With these go the next pieces of courses, while sources
+        confirm the contacts.
         """
         layers: dict[int, PlateLayer] = {}
         endings: dict[int, answer.Layer] = {}
+        due = [one for one in self.contents.values() if one.ending_due <= now]
+        urgent = min([one.course_until for one in due if one.content.course], default=math.inf)
         for number, one in self.contents.items():
-            if one.ending_due <= now and one.is_falling:
+            if one.ending_due <= now and (led := one.content.course) is not None:
+                if now < self._confirmed_until(one.content):
+                    layers[number], endings[number] = self._piece(
+                        number, one.content, *led, now, among=len(due), until=one.course_until
+                    )
+            elif one.ending_due <= now and one.is_falling:
                 layers[number] = self.builder.build_fall(
                     number, one.layer.excitation, ramp=CROSSFADE, playing=self._drive_of(number)
                 )
@@ -238,7 +255,7 @@ class Layers:
                     playing=self._drive_of(number),
                     valid_for=self._lasts(content, _all_left(content, now), now),
                 )
-        sets = Sets(layers, endings=endings)
+        sets = Sets(layers, endings=endings, gives_way_until=urgent - HELD / 2)
         if layers and (refusal := self.check(sets.by_amplifier)) is not None:
             self.not_renewed(sets, refusal)
             return Sets()
@@ -270,10 +287,11 @@ class Layers:
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
         """Note that layers are not prolonged; one refused for good lets them end."""
+        due = math.inf if refusal.until is None else refusal.until
         for number in renewal.endings:
-            self._change(number, ending_due=math.inf)
+            has_course = self.contents[number].content.course is not None
+            self._change(number, ending_due=due if has_course else math.inf)
         for number in renewal.layers.keys() - renewal.endings.keys():
-            due = math.inf if refusal.until is None else refusal.until
             self._change(number, renewal_due=due)
 
     def have_settled(self, now: float) -> bool:
@@ -290,14 +308,18 @@ class Layers:
         self.may_play = self.may_play.difference(sets.layers).union(going_on)
         for number in going_on:
             one, lasts = self.contents[number], _shortest(played, number)
-            if number in sets.started:
+            since = max(now, one.course_until)  # a piece waits for the one before
+            if (led := one.content.course) is not None:
+                starts = max(played.starts_at, one.course_until)
+                self._confirm_piece(number, sets, led[1], starts, now)
+            elif number in sets.started:
                 drive = tones_by_era(played.layers, self._rig, number)
                 settled_at = now + one.settled_after
                 due = settled_at + _SURELY_SETTLED
                 has_ending = one.is_shaped and due < now + lasts and self._may_follow
                 due = due if has_ending else math.inf
                 self._change(number, drive=drive, settled_at=settled_at, ending_due=due)
-            if number in sets.endings:
+            elif number in sets.endings:
                 layer = replace(one.layer, ending=sets.endings[number].ending)
                 self._change(number, layer=layer, ending_due=math.inf)
             self._change(
@@ -305,8 +327,28 @@ class Layers:
                 confirmed_until=self._confirmed_until(one.content),
                 renewal_due=math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2,
                 renewable_until=now + lasts - _MARGIN / 2,
-                ends_at=now + lasts,
+                ends_at=since + lasts,
             )
+
+    def _confirm_piece(
+        self, number: int, sets: Sets, pulse: Pulse, since: float, now: float
+    ) -> None:
+        """Note that a layer plays a piece of the course of a pulse from a time [s] on.
+
+        The next one follows the first at once, and is sent when half of any other has been played.
+        """
+        one = self.contents[number]
+        played = sets.endings.get(number, one.layer)
+        until = since + replace(one, layer=played).settled_after
+        due = now + _MIN_LEFT if number in sets.started else (since + until) / 2
+        due = due if played.onset else until
+        is_over = until > pulse.end - _MIN_LEFT
+        self._change(
+            number,
+            drive=full_drive(one.content.layer.excitation, self._rig),
+            course_until=until,
+            ending_due=math.inf if is_over else due,
+        )
 
     def forget(self) -> None:
         """Discard what plays, which is unknown; fingers keep their layers."""
@@ -404,6 +446,12 @@ class Layers:
         settled = [0.0]
         for number in starting:
             content = numbers[number]
+            if (led := content.course) is not None:
+                among = len(starting)
+                layers[number], played = self._piece(number, content, *led, now, among=among)
+                playing[number] = LayerContent(content, played)
+                settled.append(playing[number].settled_after)
+                continue
             left, fade = _all_left(content, now), self._fade_of(number, content)
             layers[number], played = self.builder.build_pattern(
                 number,
@@ -428,6 +476,42 @@ class Layers:
             layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
             settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+
+    def _piece(
+        self,
+        number: int,
+        content: Content,
+        course: Course,
+        pulse: Pulse,
+        now: float,
+        *,
+        among: int,
+        until: float | None = None,
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set of the piece of a course that is played next, and its layer.
+
+        From where the pulse is at a time [s] on, or until [s] the piece before ends, if that has
+        not ended yet.
+        """
+        is_after, knots = until is not None and now < until, self._course_knots
+        starts = until if until is not None and is_after else now
+        if until is None:
+            knots = min(knots, self.builder.support.onset_knots)
+        piece = piece_of(
+            course,
+            pulse,
+            0.0 if pulse.started_at is None else starts - pulse.started_at,
+            knots=max(knots // among, 1) if knots else 0,
+            is_first=until is None,
+        )
+        return self.builder.build_piece(
+            number,
+            content.layer,
+            piece,
+            playing=self._drive_of(number),
+            valid_for=piece.duration + HELD,
+            is_after=is_after and piece.has_knots,
+        )
 
     def _fade_of(self, number: int, content: Content) -> float:
         """How long [s] a content is led to from what its finger feels; 0 where it begins."""

@@ -15,6 +15,7 @@ from itertools import islice
 import numpy as np
 
 from controller.play.capabilities import EnvelopeSupport
+from controller.play.pieces import Piece
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
@@ -146,6 +147,45 @@ class SetBuilder:
         )
         return layers, layer
 
+    def build_piece(
+        self,
+        number: int,
+        layer: answer.Layer,
+        piece: Piece,
+        *,
+        playing: Drive,
+        valid_for: float,
+        is_after: bool,
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Build the set of a piece of a course in a layer; returns it and what is played.
+
+        It leads there from wherever its tones are, is_after: when the piece before has ended.
+        playing: as of a pattern; valid_for [s]: from its start on.
+        """
+        tones, ramp = layer.excitation, min(FADE_RAMP, self.ramp_max)
+        onset: dict[str, BaseEnvelope] | None = None
+        if piece.has_knots:
+            onset = {}
+            for name, tone in tones.items():
+                knots = tuple([share * tone.phasor for share in piece.shares])
+                onset[name] = BaseEnvelope(tone.frequency, 0.0, knots, piece.step)
+        layers = route(
+            {
+                n: replace(tone, amplitude=piece.shares[-1] * tone.amplitude)
+                for n, tone in tones.items()
+            },
+            self.rig,
+            ramp=ramp if onset else min(piece.step, self.ramp_max),
+            number=number,
+            playing=playing,
+            restarted=frozenset(),
+            valid_for=valid_for,
+            onset=onset,
+        )
+        ramp = next(iter(layers.values())).ramp
+        after = {name: replace(each, after=is_after) for name, each in layers.items()}
+        return after, replace(layer, ramp=ramp, onset=onset, ending=None)
+
     def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
         """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
         layer = Layer(number, ramp=ramp, valid_for=valid_for, renew=True)
@@ -263,6 +303,17 @@ def tones_by_era(
         )
         for name, channel in rig.wiring.items()
         if (command := playing.get((channel.amplifier, channel.number))) is not None
+    }
+
+
+def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, Tone]:
+    """Return what each ERA plays of an excitation at the share 1 of its course, by name."""
+    layers = route(excitation, rig, ramp=0.0)
+    return {
+        name: tone
+        for name, channel in rig.wiring.items()
+        for tone in layers[channel.amplifier].tones
+        if tone.channel == channel.number and name in excitation
     }
 
 

@@ -110,7 +110,10 @@ def _of_any_level(targets: Targets) -> set[Target]:
 
 
 def _of_any_course(targets: Targets) -> set[Target]:
-    return {replace(target, pulse=None, modulation_hz=None) for target in _of_any_level(targets)}
+    return {
+        replace(target, pulse=None, modulation_hz=None, course=None)
+        for target in _of_any_level(targets)
+    }
 
 
 class Selector:
@@ -276,6 +279,8 @@ class Selector:
         if lasting:
             takes_long = not is_alone(lasting, intended.protected)
         is_rested = is_due and is_kept and takes_long
+        if is_rested and any(target.course for _, target in lasting):  # which no cross-fade follows
+            is_rested = False
         if is_rested:
             velocities = [each.motion.velocity(now) for each in intended.contacts]
             if new or self._playing(now) or any(map(any, velocities)):

@@ -24,7 +24,8 @@ _NONE: Sequence[LayerSet] = ()
 class _Course(NamedTuple):
     """A voice, and the amplitudes from which it may set out.
 
-    sets: of its layer, unless it has ended; is_new: it is led by one, is_late: that waits.
+    sets: of its layer, unless it has ended; is_new: it is led by one, is_late: that waits, goes_on:
+    as one voice with what the layer plays of its frequency.
     """
 
     voice: Voice
@@ -32,6 +33,7 @@ class _Course(NamedTuple):
     sets: Sequence[LayerSet] = ()
     is_new: bool = True
     is_late: bool = False
+    goes_on: bool = False
 
 
 class Bounds:
@@ -59,7 +61,11 @@ class Bounds:
             played = voices_after(earlier, one.layer, commands, self._middle, ramp, half)
             for channel, voices in enumerate(played):
                 if one.after:
-                    self._courses[channel] += [self._late(each, before[channel]) for each in voices]
+                    goes_on = bool(voices) and commands[channel].keep_phase and not is_over
+                    self._courses[channel] += [
+                        self._late(each, before[channel])._replace(goes_on=goes_on)
+                        for each in voices
+                    ]
                 else:
                     after[channel] = (*after[channel], *voices) if is_over else voices
         for courses, olds, voices in zip(self._courses, before, after, strict=True):
@@ -93,12 +99,19 @@ class Bounds:
         where all go the same way; else each may be at either end.
         """
         steady, ways = [0.0] * len(self._courses), []
+        going_on = dict[tuple[int, int, float], float]()
         for channel, courses in enumerate(self._courses):
             for course in courses:
+                voice = course.voice
+                name = channel, voice.layer, voice.frequency
                 if course.is_new and not course.is_late:
                     ways.append((channel, _magnitudes(course)))
+                elif course.goes_on or not (course.is_late or voice.has_ended):
+                    going_on[name] = max(going_on.get(name, 0.0), voice.peak(self._since))
                 else:
-                    steady[channel] += course.voice.peak(self._since)
+                    steady[channel] += voice.peak(self._since)
+        for (channel, _, _), peak in going_on.items():
+            steady[channel] += peak
         moments = {way.start + way.step * at for _, way in ways for at in range(len(way.knots) + 2)}
         times = sorted(moments | {self._middle})
         levels = [[level] * len(times) for level in steady]

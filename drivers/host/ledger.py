@@ -32,6 +32,7 @@ from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]
 _RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_FREQUENCY = QUANTITIES["frequency"]
 _STEPS = 2  # of levels, by which a status may differ
 _MEASURING_ERROR = 0.002  # of full level, where an amplifier measures its levels
 _WEAK = 0.25  # largest measuring error, relative to a weak level
@@ -317,16 +318,24 @@ class Ledger:
 
         Of one layer, a tone that rises along the ramp and the one that falls along it meanwhile are
         together at most the larger of both, unless the new one has an ending, which may come amid.
+        One that waits and keeps its phase goes on as the voice that it waits for.
         """
         playback, full = self.playback, _LEVEL.per_unit
         levels, rising = [0.0] * playback.channels, dict[tuple[int, int], float]()
+        going_on = dict[tuple[int, int, float], int]()
         for one in (*layers, *playback.waiting):
             is_at_once = not one.after and until < playback.next_due
+            is_kept = one.after and until < playback.end_of(one.layer)
             for command in one.commands:
                 peak = command.level
                 for shape in (command.onset, command.ending):
                     if shape is not None and shape.knots:  # as `Envelope.peak`, without a call
                         peak = max(peak, max(shape.knots)[0])
+                if is_kept and command.keep_phase:
+                    name = one.layer, command.channel, _FREQUENCY.from_wire(command.frequency)
+                    before = going_on.get(name, 0)
+                    going_on[name] = max(before, peak)
+                    peak -= min(before, peak)
                 levels[command.channel] += peak / full
                 if is_at_once and command.onset is None and command.ending is None:
                     rising[one.layer, command.channel] = command.level / full
@@ -338,6 +347,9 @@ class Ledger:
                     largest = max(largest, abs(way.first), *map(abs, way.knots))
                 if ending is not None and ending.knots:
                     largest = max(largest, max(ending.knots)[0] / full)
+                if going_on and not voice.has_ended:
+                    name = voice.layer, channel, voice.frequency
+                    largest = max(largest - going_on.pop(name, 0) / full, 0.0)
                 if not voice.has_ended and way.last:
                     largest = max(largest - rising.pop((voice.layer, channel), 0.0), 0.0)
                 levels[channel] += largest

@@ -23,6 +23,8 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+_MAX_NAME = 100  # characters; what is longer is no misspelt word
+
 SectionT = TypeVar("SectionT", bound=Section)
 PartT = TypeVar("PartT", bound=Section)
 
@@ -204,7 +206,7 @@ def _in_quotes(details: ErrorDetails) -> str:
 def _no_choice(details: ErrorDetails, expected: str) -> str:
     """Message for a value that is not among the choices, `'x', 'y' or 'z'` of pydantic."""
     choices = expected.replace("'", "")
-    meant = did_you_mean(str(details["input"]), re.findall(r"'([^']+)'", expected))
+    meant = did_you_mean(str(details["input"])[:_MAX_NAME], re.findall(r"'([^']+)'", expected))
     return f"must be {choices}, got {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
 
 

@@ -17,11 +17,13 @@ from controller.check.layout_check import CheckedEffect, check_layout
 from controller.check.representative import strongest_target
 from controller.cli.commands import app
 from controller.cli.main import run as run_era
+from controller.content.pattern import Pattern
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.detents import Detents
 from controller.effects.dial import Dial
 from controller.effects.effect import Effect
+from controller.effects.file import File
 from controller.effects.kinds import BUILT_IN
 from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_file import load_layout
@@ -142,6 +144,11 @@ def test_check_names_a_frequency_that_the_table_does_not_have() -> None:
         assert layout.band_problems(table().frequencies) == [f"button: {problem}"]
 
 
+# At the level of intensity 1 from its beginning to its end.
+STEADY = File.of(
+    Pattern(0.5, ((0.0, 1.0), (0.5, 1.0)), ((0.0, 0.5),)), name="steady", level_db_sl=20.0
+)
+
 STRONGEST: list[tuple[Effect, float, float | None]] = [
     (Click(), 20.0, 0.040),
     (Buzz(), 20.0, None),
@@ -149,6 +156,7 @@ STRONGEST: list[tuple[Effect, float, float | None]] = [
     (Texture(fast=0.5), 20.0, None),
     (Detents(spacing=0.05), 20.0, 0.030),
     (Dial(), 20.0, 0.030),
+    (STEADY, 20.0, 0.5),
 ]
 """An effect of each kind, its level and the duration of its pulses."""
 
@@ -292,6 +300,7 @@ CASES = {
     "ramp": Case(Ramp(start_level=14.0, duration=0.4), 0.08, since=0.32, held=0.42),
     "detents": Case(Detents(), 0.030, way=step, held=0.2),
     "dial": Case(Dial(), 0.030, way=step, held=0.2),
+    "file": Case(STEADY, 0.1, since=0.3, held=0.42),
 }
 
 

@@ -1,0 +1,103 @@
+"""WAV files of sines, whose level and frequency are known."""
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import wavfile
+
+from controller.content.pattern import Pattern
+from model.arrays import FloatArray
+from model.errors import InputError
+
+Read = Callable[..., Pattern]
+TIME = np.arange(44_100) / 44_100
+
+
+def wav(signal: Any, rate: int = 44_100) -> bytes:
+    """A file of samples."""
+    file = io.BytesIO()
+    wavfile.write(file, rate, signal)
+    return file.getvalue()
+
+
+def sine(amplitude: float, frequency: float) -> FloatArray:
+    """A second of it."""
+    return np.asarray(amplitude * np.sin(2 * np.pi * frequency * TIME))
+
+
+def course(pattern: Pattern) -> tuple[FloatArray, FloatArray]:
+    """Intensity and sharpness each 10 ms, without the ends."""
+    at = np.arange(0.1, 0.9, 0.01)
+    intensity, sharpness = (np.array(c).T for c in (pattern.intensity, pattern.sharpness))
+    return np.interp(at, *intensity), np.interp(at, *sharpness)
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "kind"),
+    [
+        (127, 128, np.uint8),
+        (32767, 0, np.int16),
+        (2**31 - 256, 0, np.int32),
+        (1, 0, np.float32),
+        (1, 0, np.float64),
+    ],
+)
+def test_intensity_is_the_amplitude_of_full_scale(
+    read: Read, scale: int, shift: int, kind: type
+) -> None:
+    """A sine of half of it at 150 Hz has intensity 0.5 and sharpness (150 - 65) / 235."""
+    samples = (sine(0.5, 150) * scale + shift).astype(kind)
+    pattern = read("wav", wav(np.stack([samples * 0 + kind(shift), samples], axis=1)), channel=2)
+    intensity, sharpness = course(pattern)
+    assert intensity == pytest.approx(0.5, abs=0.01)
+    assert sharpness == pytest.approx(85 / 235, abs=0.01)
+    assert pattern.duration == 1
+    assert pattern.remarks[0] == "channel 2 of 2 read"
+
+
+def test_two_bands_and_what_lies_outside(read: Read) -> None:
+    """0.6 and 0.3 are 0.67 at the frequency of the stronger; of 1 kHz the energy is said.
+
+    That of 0.67 at 1 kHz is half of all, -3 dB.
+    """
+    felt = sine(0.6, 90) + sine(0.3, 250)
+    pattern = read("wav", wav((felt + sine(0.45**0.5, 1000)).astype(np.float32)))
+    intensity, sharpness = course(pattern)
+    assert intensity == pytest.approx(0.45**0.5, abs=0.01)
+    assert sharpness == pytest.approx(25 / 235, abs=0.01)
+    assert pattern.remarks == (
+        "50% of its energy (-3.0 dB) lies outside 65 to 300 Hz and is left out",
+    )
+
+
+def test_burst_begins_and_ends_in_time(read: Read) -> None:
+    """Half of its intensity is passed within 10 ms of both; silence is 0."""
+    signal = np.where((TIME > 0.3) & (TIME < 0.5), sine(0.8, 180), 0)
+    times, values = np.array(read("wav", wav(signal.astype(np.float32))).intensity).T
+    at = np.arange(0, 1, 0.001)
+    is_on = np.interp(at, times, values) > 0.4
+    assert at[is_on.argmax()] == pytest.approx(0.3, abs=0.01)
+    assert at[len(at) - is_on[::-1].argmax()] == pytest.approx(0.5, abs=0.01)
+    assert not values[(times < 0.25) | (times > 0.55)].any()
+
+
+@pytest.mark.parametrize(
+    ("content", "channel", "words"),
+    [
+        (b"RIFF", None, "is no WAV file of PCM or float"),
+        (wav(TIME.astype(np.float32))[:-100], None, "is no WAV file of PCM or float"),
+        (wav(np.zeros((9, 3), np.int16)), None, "must have 1 or 2 channels, got 3"),
+        (wav(np.zeros(9, np.int16)), 2, "channel must be 1 to 1, got 2"),
+        (wav(np.zeros(0, np.int16)), None, "has no samples"),
+        (wav(np.zeros(9, np.int16), 500), None, "sample rate must be 1000 to 192000 Hz, got 500"),
+        (wav(np.zeros(61_000, np.int16), 1000), None, "must end within 60 s, got 61 s"),
+        (wav(np.array([0, np.nan], np.float32)), None, "sample 1 must be -1 to 1"),
+    ],
+)
+def test_refusal(read: Read, content: bytes, channel: int | None, words: str) -> None:
+    """A damaged file, and what is beyond the bounds."""
+    with pytest.raises(InputError, match=words):
+        read("wav", content, channel)

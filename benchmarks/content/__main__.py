@@ -5,9 +5,9 @@
 Share of the time in which the level at the skin is within 3 dB of what a file asks, where that is
 within 20 dB of its highest, as by `era content check`; with the one delay of at most 10 ms that all
 files share. Once of all that the files ask, and once without the taps that are no clicks because
-they are too close to stronger ones. Without --files, the named contents that come with the project. Of a
-folder the first so many files, in order of name, that can be read and ask for anything; of equal
-ones the first. Exits with status 1 unless half of the files keep 95 % and nine of ten 80 %.
+they are too close to stronger ones. Without --files, the named contents that come with the project.
+Of a folder the first so many files, in order of name, that can be read and ask for anything; of
+equal ones the first. Exits with status 1 unless half of the files keep 95 % and nine of ten 80 %.
 """
 
 import argparse
@@ -65,7 +65,8 @@ def main() -> None:
     late = int(np.median(by_delay, axis=0)[0].argmax())
     count = sum(len(each.transients) for each in patterns)
     print(
-        f"{len(patterns)} files, {1000 * delays[late]:.0f} ms late, {lost} of {count} taps too close"
+        f"{len(patterns)} files, {1000 * delays[late]:.0f} ms late; "
+        f"{lost} of {count} taps too close"
     )
     print("| kept within 3 dB | median | worst tenth | goal |")
     print("|---|---|---|---|")

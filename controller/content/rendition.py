@@ -1,6 +1,6 @@
 """Renditions: what a pattern becomes on a plate at a level, before anybody else's is known.
 
-Its reasons are in docs/how-to/play-a-file.md.
+The reasons are in docs/how-to/play-content.md.
 """
 
 from bisect import bisect_left

@@ -24,6 +24,7 @@ NAMES = [
     "bring-your-own-method",
     "drive-a-signal-generator",
     "design-a-layout",
+    "play-content",
     "your-own-application",
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]

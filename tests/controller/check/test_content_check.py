@@ -94,12 +94,12 @@ def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_ask
     assert kept_shares(wanted, given, 5).argmax() == 3
 
 
-def test_taps_too_close_to_be_clicks_are_lost_in_part() -> None:
+def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:
     """Of two equal taps 50 ms apart the second is in what lasts, from 30 ms after the first on."""
     taps = Transient(0.1, 1.0, 0.5), Transient(0.15, 1.0, 0.5)
     found = check_content(Pattern(0.3, transients=taps), table(), 20.0, at=AT)
     assert [each.stimulus.course is None for each in found.parts] == [False, True]
-    assert 0.5 < found.kept_share < 0.95
+    assert found.kept_share > 0.9
     assert "1 of 2 taps" in found.lost[0]
 
 

@@ -12,10 +12,13 @@ from model.errors import InputError
 MAX_GIVEN = 500
 """Most points, and most taps: the bound of OpenXR; Android guarantees 16."""
 
-_Given: TypeAlias = tuple[float, float, float]
+Given: TypeAlias = Sequence[Sequence[float]]
+"""`[time_s, intensity, sharpness]` of each, in order of time."""
+
+_Row: TypeAlias = tuple[float, float, float]
 
 
-def pattern_of_points(points: Sequence[_Given], taps: Sequence[_Given] = ()) -> Pattern:
+def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
     """Return the pattern of points, between which straight lines last, and of taps beside them.
 
     Raises InputError, with the index of one, for what is none.
@@ -33,7 +36,7 @@ def pattern_of_points(points: Sequence[_Given], taps: Sequence[_Given] = ()) -> 
     )
 
 
-def points_of(pattern: Pattern) -> tuple[list[_Given], list[_Given]]:
+def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
     """Return the points and taps of a pattern: at even distances where it has too many points.
 
     Raises InputError for too many taps.
@@ -56,10 +59,14 @@ def points_of(pattern: Pattern) -> tuple[list[_Given], list[_Given]]:
     return [*zip(moments.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
 
 
-def _checked(what: str, given: Sequence[_Given]) -> Iterator[_Given]:
+def _checked(what: str, given: Given) -> Iterator[_Row]:
     """Yield each of what is given; raises InputError for what is none."""
     before = 0.0
     for index, each in enumerate(given):
+        if len(each) != 3:
+            raise InputError(
+                f"{what}[{index}] must be [time_s, intensity, sharpness], got {len(each)} values"
+            )
         time, intensity, sharpness = each
         if not before <= time <= MAX_DURATION:
             raise InputError(

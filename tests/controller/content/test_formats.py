@@ -123,6 +123,7 @@ def test_points_and_taps_of_a_program() -> None:
     for points, words in (
         ([], "points or taps must be 1 to 500, got 0"),
         ([(0, 0, 0)] * 501, "points or taps must be 1 to 500, got 501"),
+        ([(0, 0)], r"points\[0\] must be \[time_s, intensity, sharpness\], got 2 values"),
         ([(1, 0, 0), (0, 0, 0)], r"points\[1\] time_s must be 1 to 60, got 0"),
         ([(0, float("nan"), 0)], r"points\[0\] intensity must be 0 to 1, got nan"),
     ):

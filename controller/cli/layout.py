@@ -50,7 +50,7 @@ def check(
     if picture is not None:
         check_picture_name(picture)
     table = load_table(table_file)
-    layout = load_layout(layout_file, table.plate)
+    layout = load_layout(layout_file, table.plate).for_table(table.frequencies)
     started = time.perf_counter()
     with progress_bar("effects") as progress:
         checked = check_layout(layout, table, progress=progress)

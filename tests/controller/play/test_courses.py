@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 
 from chain import Chain
-from controller.play.intent import HapticIntent, Pulse, Target
+from controller.content.pattern import Pattern, Transient
+from controller.effects.file import File
+from controller.effects.layout import SurfaceLayout
+from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact
 from model.answer.course import Course
 from model.vibration.excitation import Tone
 from set_chain import FINGER, OTHER, set_running
+from several_fingers import LEFT, fingers_on, table
 from virtual_loop import in_virtual_time
 
 FULL = 0.2  # the level that the table's pattern has
@@ -195,3 +199,35 @@ async def test_all_actuators_have_one_course_times_their_weights() -> None:
             levels = chain.levels()
             assert levels["side"][1] == pytest.approx(levels["main"][0] / 2, abs=ROUNDING)
             await asyncio.sleep(0.001)
+
+
+@in_virtual_time
+async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
+    """In a layer of its own, 0.3 s after the start of the other, within 10 ms.
+
+    What lasts is silent then: by hand, 30 ms before and after the 40 of the click.
+    """
+    pattern = Pattern(0.8, ((0.0, 1.0), (0.8, 1.0)), ((0.0, 0.5),), (Transient(0.3, 1.0, 0.5),))
+    file = File.of(pattern, name="it", level_db_sl=14.0).for_table(table().frequencies)
+    layout = SurfaceLayout(effects={"it": file}, elsewhere="it")
+    async with fingers_on(table(), layout, at={1: LEFT}, held=1.2) as fingers:
+        began = fingers.applied[0].time
+        (short,) = {
+            one.content.targets[0][1].pulse
+            for report in fingers.applied
+            for one in report.contents.values()
+            if one.content.key[1] == CLICK
+        }
+        assert short is not None
+        assert short.started_at - began == pytest.approx(0.3, abs=0.01)
+        onsets = [
+            (time, layer.commands[0].onset)
+            for time, _, layers in fingers.committed
+            for layer in layers
+            if layer.commands and layer.commands[0].onset
+        ]
+        shares = [level for _, onset in onsets for level, _ in onset.knots]
+        highest = max(shares)
+        silent = [number for number, each in enumerate(shares) if each < 0.01 * highest]
+        # Knots at 0.30 to 0.34 s, and the end: the piece has no knot at its end, 0.16 s.
+        assert silent

@@ -18,7 +18,7 @@ SUMMARIES = {
     "layout": "Use one of the daemon's layouts. Of resting fingers, what ends by itself and what a program plays goes on to its end; what lasts follows the new layout at once.",
     "reload": "Read the daemon's files again, and apply their layouts if nothing else has changed.",
     "effects": "List the effects.",
-    "play": "Play an effect at a finger; only while armed.",
+    "play": "Play an effect, or points, at a finger; only while armed.",
     "strength": "Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms.",
     "subscribe": "Receive notifications of topics.",
     "unsubscribe": "Receive no more notifications of topics.",

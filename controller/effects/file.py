@@ -24,7 +24,7 @@ _FREQUENCIES = tuple(float(each) for each in range(40, 501, 10))  # Hz; until a 
 
 
 class File(Effect):
-    """A file beside the layout, or a named content, once or over and over."""
+    """A file beside the layout, or a content by its name, once or over and over."""
 
     kind: ClassVar[str] = "file"
     is_for_motion: ClassVar[bool] = False

@@ -16,7 +16,7 @@ from typing import Any
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
 from controller.play.intent import CLICK, FADED_AFTER, Pulse
-from controller.play.pieces import HELD, piece_of
+from controller.play.pieces import HELD, PLAIN_STEP, piece_of
 from controller.play.routing import (
     BESIDE_CLICK,
     FADE_RAMP,
@@ -161,6 +161,9 @@ class Layers:
         self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
         # A limit of slew lengthens ramps.
         self._course_knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
+        if not self._course_knots:
+            why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
+            _logger.info("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf

@@ -26,7 +26,7 @@ export interface Methods {
   reload: { params: Empty; result: ReloadResult };
   /** List the effects. */
   effects: { params: Empty; result: EffectsResult };
-  /** Play an effect at a finger; only while armed. */
+  /** Play an effect, or points, at a finger; only while armed. */
   play: { params: PlayParams; result: Empty };
   /** Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms. */
   strength: { params: StrengthParams; result: StrengthResult };
@@ -244,14 +244,19 @@ export interface EffectsResult {
   effects: Array<EffectDescription>;
 }
 
-/** Play an effect once at the finger nearest to a position; it ends when the finger lifts. */
+/** Play an effect, or points, at the finger nearest to a position; they end when it lifts. */
 export interface PlayParams {
-  effect: string;
+  /** of the layout, or a named content; null where points are given */
+  effect?: string | null;
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
-  /** from -20; at most, and by default, the effect's own */
+  /** from -20; at most, and by default, the effect's own; of points by default 20, at most the highest of the layout */
   level_db_sl?: number | null;
+  /** `[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1 */
+  points?: Array<[number, number, number]> | null;
+  /** whether points or a file begin anew at their end */
+  loop?: boolean;
 }
 
 /** A touch source or client and its gain; without a gain nothing is set. */

@@ -184,6 +184,8 @@ async def test_an_amplifier_without_knots_follows_along_ramps() -> None:
         times, levels = await looked_at(chain, 1.4, FINGER)
         assert furthest(times - felt.started_at, levels, 0.05, 0.06) < ROUNDING
         assert max(levels) > 0.8 * FULL
+        ramps = [each for each in chain.far_end.sent()[1:] if not each.is_silent]
+        assert len(ramps) == pytest.approx(1.2 / 0.05, abs=2)
 
 
 @in_virtual_time
@@ -220,14 +222,18 @@ async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
         }
         assert short is not None
         assert short.started_at - began == pytest.approx(0.3, abs=0.01)
-        onsets = [
-            (time, layer.commands[0].onset)
-            for time, _, layers in fingers.committed
-            for layer in layers
-            if layer.commands and layer.commands[0].onset
-        ]
-        shares = [level for _, onset in onsets for level, _ in onset.knots]
-        highest = max(shares)
-        silent = [number for number, each in enumerate(shares) if each < 0.01 * highest]
-        # Knots at 0.30 to 0.34 s, and the end: the piece has no knot at its end, 0.16 s.
-        assert silent
+        (lasting,) = {
+            layer.layer for _, _, layers in fingers.committed for layer in layers if layer.after
+        }
+        times, levels = list[float](), list[int]()
+        for time, _, layers in fingers.committed:
+            for layer in layers:
+                onset = layer.commands[0].onset if layer.commands else None
+                if layer.layer == lasting and onset is not None:
+                    since = times[-1] if layer.after else time
+                    steps = 1e-4 * onset.step * np.arange(1, len(onset.knots) + 2)
+                    times += (since + steps).tolist()
+                    levels += [each for each, _ in onset.knots] + [layer.commands[0].level]
+        due = {0.20: 1.0, 0.26: 1.0, 0.29: 1 / 3, 0.31: 0.0, 0.33: 0.0, 0.35: 1 / 3, 0.4: 1.0}
+        played = np.interp([*due], np.array(times) - times[0] + 0.01, levels) / max(levels)
+        assert played == pytest.approx([*due.values()], abs=0.01)

@@ -144,6 +144,7 @@ def sudden(level: float) -> Layer:
     return Layer(0, (HIGH(level=level, onset=shape),), ramp=0.06)
 
 
+PIECE = tone(level=0.9, keep_phase=True, onset=Envelope(1000, ((9000, 0),)))
 LOUD_END = tone(0, 1.0, 200.0, ending=Envelope(100, ((10000, 0),) * 10))
 COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     # 0.6 in one layer leaves 0.4 for another; once it has faded, 0.9 is admitted.
@@ -178,6 +179,18 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
             plays(0.01, Layer(0, (ENDING,), after=True)),
             refused(0.02, Layer(1, (HIGH(level=0.3),))),
             Asked(0.02, Layer(1, (HIGH(level=0.15),))),
+        ],
+    ),
+    # 0.9 follows 0.9: one voice, unless its phase is new; 0.1 is left beside both.
+    "what waits goes on as one voice": (
+        WIDE,
+        [
+            plays(0.0, Layer(0, (PIECE,))),
+            refused(0.05, Layer(0, (replace(PIECE, keep_phase=False),), after=True)),
+            refused(0.05, Layer(0, (replace(PIECE, frequency=200.0),), after=True)),
+            plays(0.05, Layer(0, (PIECE,), after=True)),
+            refused(0.06, Layer(1, (HIGH(level=0.11),))),
+            Asked(0.06, Layer(1, (HIGH(level=0.1),))),
         ],
     ),
     # Gains of a raised cosine add up to one, in power to less than one.

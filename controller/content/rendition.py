@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from controller.content.format import MAX_HZ, MIN_HZ
 from controller.content.pattern import Pattern, Transient, along
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
@@ -23,9 +24,6 @@ Band: TypeAlias = tuple[float, float]
 
 LEAST_DB_SL = 10.0
 """Level of the faintest intensity, the least that Android's builder of envelopes guarantees."""
-
-DULLEST_HZ, SHARPEST_HZ = 65.0, 300.0
-"""Frequencies of sharpness 0 and 1, as the MPEG reference encoder reads AHAP."""
 
 CLICK_DURATION, DUCKING = 0.040, 0.030
 """Of a transient [s], and while what lasts fades before it and returns after it."""
@@ -129,7 +127,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
             f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * _APART:.0f} ms from "
             "a stronger one: left to what lasts"
         )
-    course, band, modulation = None, _band(DULLEST_HZ, frequencies), None
+    course, band, modulation = None, _band(MIN_HZ, frequencies), None
     if highest := float(shares.max()):
         course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
         of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
@@ -167,7 +165,7 @@ def _with_taps(
 
 def sharpness_hz(sharpness: FloatArray) -> FloatArray:
     """Frequencies [Hz] of sharpness, 0 to 1."""
-    return DULLEST_HZ + sharpness * (SHARPEST_HZ - DULLEST_HZ)
+    return MIN_HZ + sharpness * (MAX_HZ - MIN_HZ)
 
 
 def _band(hertz: float, frequencies: FloatArray) -> Band:
@@ -220,7 +218,7 @@ def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
 
 def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     """The frequency [Hz] about whose band most of the energy is: its mean there."""
-    tried = np.geomspace(DULLEST_HZ, SHARPEST_HZ, 60)
+    tried = np.geomspace(MIN_HZ, MAX_HZ, 60)
     is_near = np.abs(hertz / tried[:, None] - 1) <= _BAND
     best = is_near[best_of(is_near @ energy)]
     return float(np.average(hertz[best], weights=energy[best]))

@@ -124,7 +124,7 @@ class AsyncClient(AsyncCalls):
         effect: its name, or points: time [s], intensity and sharpness, 0 to 1.
         """
         x, y = as_position(position)
-        played = {"effect": effect} if isinstance(effect, str) else {"points": [*effect]}
+        played = {"effect": effect} if isinstance(effect, str) else {"points": [*map(list, effect)]}
         more = {"level_db_sl": level_db_sl, "loop": loop}
         await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
 

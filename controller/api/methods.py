@@ -209,6 +209,9 @@ class EffectsResult(Message):
     effects: list[EffectDescription]
 
 
+_Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
 class PlayParams(Message):
     """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
@@ -222,7 +225,7 @@ class PlayParams(Message):
         description="from -20; at most, and by default, the effect's own; of points by default 20, "
         "at most the highest of the layout",
     )
-    points: Annotated[list[tuple[float, float, float]], Field(max_length=MAX_GIVEN)] | None = Field(
+    points: Annotated[list[_Point], Field(max_length=MAX_GIVEN)] | None = Field(
         None,
         description="`[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1",
     )

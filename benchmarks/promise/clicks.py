@@ -93,7 +93,7 @@ def given(
     """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
     import numpy as np
 
-    from model.answer.over_duration import RingingUnderFingers
+    from model.answer.over_duration import DriveEnvelope, RingingUnderFingers
     from model.finger.fingertip import fingertip_points, fingertip_weights
     from model.study.exact_plates import draw_plates
     from model.table.following import table_following
@@ -141,7 +141,8 @@ def given(
                 name: Tone(tone.frequency, abs(z := tone.phasor * gains[name]), float(np.angle(z)))
                 for name, tone in layer.excitation.items()
             }
-            ringing = RingingUnderFingers(other, contacts, (), DURATION, layer.ramp)
+            envelope = DriveEnvelope.of_pulse(DURATION, layer.ramp)
+            ringing = RingingUnderFingers(other, contacts, (), envelope)
             hertz, bases = base_amplitudes(tones, eras)
             pulse = ringing.over(zip(hertz.tolist(), bases, strict=True))
             frequencies, amplitudes = other.amplitudes(

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Self
 
@@ -11,6 +12,11 @@ from model.arrays import FloatArray
 from model.errors import InputError
 
 MAX_POINTS = 20_000
+
+STRONGEST = 0.040
+"""Time [s] of the strongest moments of a course, by which it is felt."""
+
+_STEP = 0.0025  # s; between samples
 
 
 @dataclass(frozen=True)
@@ -38,11 +44,20 @@ class Course:
                 f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
                 f"{max(self.shares):g}"
             )
+        if not any(self.shares):
+            raise InputError("a course must have a share above 0, got 0 throughout")
 
     @property
     def duration(self) -> float:
         """Its last time [s]."""
         return self.times[-1]
+
+    @cached_property
+    def strongest_db(self) -> float:
+        """Root mean square of its strongest moments [dB], relative to a share of 1."""
+        squares = self.at(_STEP * np.arange(self.duration / _STEP + 1)) ** 2
+        count = round(STRONGEST / _STEP)
+        return float(10 * np.log10(np.convolve(squares, np.full(count, 1 / count)).max()))
 
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""

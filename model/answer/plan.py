@@ -348,6 +348,8 @@ class _Answering:
             duration, limit, course = None, None, None
             if stimulus is not None:
                 duration, course = stimulus.duration, stimulus.course
+                if course is not None:
+                    level += course.strongest_db
                 if stimulus.is_limit:
                     level, limit = min(level, FELT_DB_SL), level
             of_stimulus = duration, limit, course

@@ -18,7 +18,7 @@ import numpy as np
 from model.answer.course import STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
 from model.answer.search import Contents
-from model.arrays import ComplexArray, FloatArray, Point
+from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.drive_modes.forms import Drive, Forms
 from model.finger.perception import detection_threshold
 from model.structure.attachments import fingertip_loads
@@ -230,14 +230,20 @@ class RingingUnderFingers:
                 found.append((row, np.asarray(factor * weights, dtype=np.complex64)))
         return found
 
-    def forms(self, steady: Forms) -> Forms:
-        """Forms over the envelope from steady ones at all of the table's frequencies."""
-        shares = self.shares.astype(np.float32)
+    def forms(self, steady: Forms, some: IntArray) -> Forms:
+        """Forms over the envelope at some of the table's frequencies, from steady ones at all."""
+        shares, own = self.shares[some].astype(np.float32), np.sqrt(self.shares[some, some])
         size = (np.abs(steady.targets) ** 2).sum(axis=(0, 2))
-        gain = np.sqrt(shares @ size / np.maximum(size, _TINY))
-        quiet = (shares @ steady.quiet.reshape(len(shares), -1)).reshape(steady.quiet.shape)
-        targets = steady.targets * gain[:, None]
-        return replace(steady, targets=targets, quiet=quiet, level_margin=0.0, few=None, fine=None)
+        gain = np.sqrt(shares @ size / np.maximum(size[some], _TINY))
+        found, by_carrier = steady.at(some), own.astype(np.float32)[:, None, None, None]
+        return replace(
+            found,
+            targets=found.targets * gain[:, None],
+            quiet=(shares @ steady.quiet.reshape(len(steady.quiet), -1)).reshape(found.quiet.shape),
+            level_margin=0.0,
+            few=None if found.few is None else found.few * by_carrier,
+            fine=None if found.fine is None else found.fine * by_carrier,
+        )
 
     def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
         """What fingers feel at their fine points of tones together.

@@ -30,6 +30,8 @@ from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
+import os
+BY_POINT=int(os.environ.get("BYP","8"))
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
 
@@ -122,7 +124,7 @@ def _candidates(
     """
     count, hertz = len(contents.streams), fingers.table.frequencies
     every = np.arange(len(hertz)) if any(ringing) else rows
-    formed = fingers.forms(every, with_fine=None in ringing)
+    formed = fingers.forms(every, with_fine=True)
     apart_hz = contents.apart_hz if count > 1 else 0.0
     found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
@@ -134,21 +136,26 @@ def _candidates(
             here = np.flatnonzero(np.isin(every, rows) & (every >= low) & (every < end))
             of = formed if over else formed.at(here)
             rest = None if contents.background is None or others else contents.background[of.rows]
-            asked = of.of(stream.targets, others, level, rest)
+            asked = steady = of.of(stream.targets, others, level, rest)
             if over is not None:
-                asked, of = over.forms(asked).at(here), formed.at(here)
+                asked = over.forms(steady, here)
             groups = [asked.among(each) for each in _groups(fingers.table)]
             searches = [(each, *search_to_level(each)) for each in groups]
             reaching = [each for each in searches if each[2] is each[0]]
             for own, searched, forms in reaching or searches:
                 is_limited |= len(searched.level_limited) > 0 or forms is not own
-                ways = [searched]
-                by_point = over is None and 1 <= len(others) <= MAX_FINGERS_BY_POINT
-                if by_point and searched.score.any():
-                    ways.append(search(of.by_point(forms, others)))
-                for way in ways:
-                    for each in _apart(way.score, hertz[of.rows], contents.candidates, apart_hz):
-                        drive = [(int(of.rows[each]), way.weights[each])]
+                ways = [(here, searched)]
+                if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
+                    if over is None:
+                        ways.append((here, search(of.by_point(forms, others))))
+                    else:
+                        best = here[np.sort(best_first(searched.score)[:BY_POINT])]
+                        bp = over.forms(of.by_point(replace(steady, driven=own.driven), others), best)
+                        ways.append((best, search(replace(bp, wanted=forms.wanted))))
+                for at, way in ways:
+                    rows_here = every[at]
+                    for each in _apart(way.score, hertz[rows_here], contents.candidates, apart_hz):
+                        drive = [(int(rows_here[each]), way.weights[each])]
                         found.append((number, band, float(way.score[each]), drive))
     streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
@@ -174,7 +181,7 @@ def _switched_candidates(
     rest = None if contents.background is None else contents.background[every]
     forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
     if over is not None:
-        forms = over.forms(forms).at(rows)
+        forms = over.forms(forms, rows)
     if by_point:
         forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
     groups = _groups(fingers.table)

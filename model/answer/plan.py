@@ -43,7 +43,7 @@ from model.choice import NEARLY, best_by, best_of
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
-from model.table.table import EFFECT_DURATIONS, SAME_FREQUENCY, LocalizationTable
+from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
 """Fingers that may share, up to which each has a vibration of its own at first.
@@ -106,20 +106,12 @@ def query(
     return answer(table, fingers, drive_mode=drive_mode)
 
 
-def prepare_answers(
-    table: LocalizationTable, drive_mode: str | None = None, *, with_ringing: bool = True
-) -> None:
-    """Compute ahead what the first answer of a table in a drive mode needs.
-
-    with_ringing: of short stimuli, too, which takes the longest.
-    """
+def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> None:
+    """Compute ahead what the first answer of a table in a drive mode needs."""
     centre = (table.plate.length / 2, table.plate.width / 2)
     for quiet in ((), ((0.0, 0.0),)):
         placed = Placement((centre,), quiet)
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
-    if (drive_mode or table.drive_mode) == UNRESTRICTED:
-        for duration in EFFECT_DURATIONS if with_ringing else ():
-            table.ringing(duration)
 
 
 def _changed(found: Answer) -> list[str]:

@@ -30,8 +30,9 @@ from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
-import os
-BY_POINT=int(os.environ.get("BYP","8"))
+MAX_BY_POINT = 8
+"""Frequencies at which weights over a duration are searched by the points of fingertips, too."""
+
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
 
@@ -129,16 +130,13 @@ def _candidates(
     found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
-        others = contents.others(number)
+        others, over = contents.others(number), ringing[number]
         level = stream.level_db_sl + float(decibels(count))
-        over = ringing[number]
+        rest = None if contents.background is None or others else contents.background[every]
+        lasting = formed.of(stream.targets, others, level, rest)
         for band, (low, end) in enumerate(stream.bands):
             here = np.flatnonzero(np.isin(every, rows) & (every >= low) & (every < end))
-            of = formed if over else formed.at(here)
-            rest = None if contents.background is None or others else contents.background[of.rows]
-            asked = steady = of.of(stream.targets, others, level, rest)
-            if over is not None:
-                asked = over.forms(steady, here)
+            asked = _at(here, lasting, over)
             groups = [asked.among(each) for each in _groups(fingers.table)]
             searches = [(each, *search_to_level(each)) for each in groups]
             reaching = [each for each in searches if each[2] is each[0]]
@@ -146,19 +144,24 @@ def _candidates(
                 is_limited |= len(searched.level_limited) > 0 or forms is not own
                 ways = [(here, searched)]
                 if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
-                    if over is None:
-                        ways.append((here, search(of.by_point(forms, others))))
-                    else:
-                        best = here[np.sort(best_first(searched.score)[:BY_POINT])]
-                        bp = over.forms(of.by_point(replace(steady, driven=own.driven), others), best)
-                        ways.append((best, search(replace(bp, wanted=forms.wanted))))
-                for at, way in ways:
-                    rows_here = every[at]
-                    for each in _apart(way.score, hertz[rows_here], contents.candidates, apart_hz):
-                        drive = [(int(rows_here[each]), way.weights[each])]
+                    best = np.sort(best_first(searched.score)[:MAX_BY_POINT])
+                    some = here if over is None else here[best]
+                    tried = replace(lasting, wanted=forms.wanted, driven=forms.driven)
+                    tried = replace(tried, level_margin=forms.level_margin)
+                    by_point = formed.by_point(tried, others)
+                    ways.append((some, search(_at(some, by_point, over))))
+                for some, way in ways:
+                    at = every[some]
+                    for each in _apart(way.score, hertz[at], contents.candidates, apart_hz):
+                        drive = [(int(at[each]), way.weights[each])]
                         found.append((number, band, float(way.score[each]), drive))
     streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> Forms:
+    """Forms at some frequencies, by index, of a stimulus that lasts or goes over a duration."""
+    return lasting.at(some) if over is None else over.forms(lasting, some)
 
 
 def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
@@ -176,14 +179,12 @@ def _switched_candidates(
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
-    every = rows if over is None else np.arange(len(fingers.table.frequencies))
+    every = np.arange(len(fingers.table.frequencies))
     formed = fingers.forms(every, with_fine=by_point)
-    rest = None if contents.background is None else contents.background[every]
-    forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
-    if over is not None:
-        forms = over.forms(forms, rows)
+    lasting = formed.of(stream.targets, quiet, stream.level_db_sl, contents.background)
     if by_point:
-        forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
+        lasting = formed.by_point(lasting, quiet, CENTRE_AND_FOUR)
+    forms = _at(rows, lasting, over)
     groups = _groups(fingers.table)
     among = [forms.among(each) for each in groups]
     searches = [find_switched(each) for each in among]

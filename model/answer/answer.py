@@ -244,7 +244,8 @@ class Answer:
                 every = (excitation, *sides)
                 excitation = {name: tone for each in every for name, tone in each.items()}
                 sides = []
-            duration = None if self.contents.is_shaped else stream.duration
+            is_plain = not self.contents.is_shaped and stream.course is None
+            duration = stream.duration if is_plain else None
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(

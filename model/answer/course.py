@@ -16,7 +16,11 @@ MAX_POINTS = 20_000
 STRONGEST = 0.040
 """Time [s] of the strongest moments of a course, by which it is felt."""
 
-_STEP = 0.0025  # s; between samples
+STEP = 0.0025
+"""Time [s] between samples of courses."""
+
+SILENCE = 1e-6
+"""Share that stands for 0: of a silence levels are finite."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,6 @@ class Course:
                 f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
                 f"{max(self.shares):g}"
             )
-        if not any(self.shares):
-            raise InputError("a course must have a share above 0, got 0 throughout")
 
     @property
     def duration(self) -> float:
@@ -55,9 +57,9 @@ class Course:
     @cached_property
     def strongest_db(self) -> float:
         """Root mean square of its strongest moments [dB], relative to a share of 1."""
-        squares = self.at(_STEP * np.arange(self.duration / _STEP + 1)) ** 2
-        count = round(STRONGEST / _STEP)
-        return float(10 * np.log10(np.convolve(squares, np.full(count, 1 / count)).max()))
+        samples = np.maximum(self.at(STEP * np.arange(self.duration / STEP + 1)), SILENCE)
+        count = round(STRONGEST / STEP)
+        return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
 
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from model.answer.course import STRONGEST, Course
+from model.answer.course import SILENCE, STEP, STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
 from model.answer.search import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
@@ -44,8 +44,8 @@ rang after was up to 7 dB stronger on four ERAs, 18 dB on a large table.
 _BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
 """Distance of the frequencies beside its own that count of a drive, and the least share of one."""
 
-_PULSE_STEP, _MAX_PULSE_STEPS, _COURSE_STEP = 0.001, 48, 0.0025
-"""Steps [s] of envelopes, and how many a pulse has at most within its duration."""
+_PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
+"""Steps [s] of pulses, and how many one has at most within its duration."""
 
 _RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
 _TINY = 1e-30
@@ -100,20 +100,20 @@ class DriveEnvelope:
         length = min(duration, SHAPED_FROM)  # the rest is steady
         count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
         step = length / count
-        times = step * (np.arange(count + math.ceil(RINGING / step)) + 0.5)
-        values = rise(times, ramp) - rise(times - length, ramp)
-        return cls(values, step, count, length / duration)
+        every = count + math.ceil(RINGING / step)
+        times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
+        values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
+        return cls(np.asarray(values), step, count, length / duration)
 
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
         """Along a course, or a plain ramp where it starts or ends above 0."""
-        step = _COURSE_STEP
-        times = step * np.arange(math.ceil((course.duration + RINGING) / step))
-        ends = course.shares[0], course.shares[-1] * (times > course.duration)
-        jumps = ends[0] * (1 - rise(times, ONSET_RAMP))
-        falls = ends[1] * (1 - rise(times - course.duration, ONSET_RAMP))
-        values = np.maximum(course.at(times) - jumps, 0) + falls
-        return cls(values, step, round(STRONGEST / step), is_course=True)
+        count = math.ceil((course.duration + RINGING) / STEP)
+        times = np.asarray(STEP * np.arange(count), dtype=float)
+        after, (first, *_, last) = np.asarray(times - course.duration), course.shares
+        values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
+        values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
+        return cls(np.maximum(values, SILENCE), STEP, round(STRONGEST / STEP), is_course=True)
 
     def moments(self, squares: FloatArray) -> FloatArray:
         """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
@@ -186,13 +186,14 @@ class RingingUnderFingers:
         """One for each content that has a duration, None for those that last or are shaped."""
         found: list[RingingUnderFingers | None] = []
         for stream in contents.streams:
-            envelope = None
+            envelope: DriveEnvelope | None = None
             if stream.course is not None:
                 envelope = DriveEnvelope.of_course(stream.course)
             elif stream.duration is not None and not contents.is_shaped:
                 ramp = max(pulse_ramp(stream.duration), contents.least_ramp)
                 envelope = DriveEnvelope.of_pulse(stream.duration, ramp)
-            found.append(envelope and cls(table, contents.places, contents.loads, envelope))
+            fingers = table, contents.places, contents.loads
+            found.append(None if envelope is None else cls(*fingers, envelope))
         return found
 
     @cached_property

@@ -121,7 +121,7 @@ def _changed(found: Answer) -> list[str]:
         first = stream.targets[0]
         stimulus = found.asked[first].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
-        if is_modulated and not found.pauses(number):
+        if is_modulated and list(found.tones.owners).count(number) == 1:
             steady.append(f"vibration of {_at(found.asked[first])} is steady")
         lasts = stream.duration is None
         is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL

@@ -130,7 +130,8 @@ def _candidates(
     found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
-        others, over = contents.others(number), ringing[number]
+        others = contents.others(number)
+        over = ringing[number] if others else None  # alone it may be as what lasts
         level = stream.level_db_sl + float(decibels(count))
         rest = None if contents.background is None or others else contents.background[every]
         lasting = formed.of(stream.targets, others, level, rest)
@@ -184,7 +185,7 @@ def _switched_candidates(
     lasting = formed.of(stream.targets, quiet, stream.level_db_sl, contents.background)
     if by_point:
         lasting = formed.by_point(lasting, quiet, CENTRE_AND_FOUR)
-    forms = _at(rows, lasting, over)
+    forms = _at(rows, lasting, over if quiet else None)
     groups = _groups(fingers.table)
     among = [forms.among(each) for each in groups]
     searches = [find_switched(each) for each in among]

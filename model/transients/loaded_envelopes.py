@@ -49,7 +49,7 @@ def enveloped_accelerations(
     lines = np.sort(nu)
     if 1 / (count * step) < _RESOLUTION:
         lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
-    s = 2j * math.pi * (frequency + np.append(lines, 0.0))
+    s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
     s[:-1] += _DAMPING / (count * step)
     found = _held_by(plate, s, bases, frequency, points, fingers)
     steady = found[-1]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from model.transients.ringing import ramped_ringing
 from scipy.optimize import minimize
 
 from model.errors import InputError
@@ -33,7 +34,6 @@ from model.transients.knots import (
     while_ending,
 )
 from model.transients.measures import Transients
-from model.transients.ringing import ramped_ringing
 from model.transients.shaping import responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration.excitation import Tone

@@ -16,7 +16,7 @@ MAX_POINTS = 20_000
 STRONGEST = 0.040
 """Time [s] of the strongest moments of a course, by which it is felt."""
 
-STEP = 0.0025
+STEP = 0.005
 """Time [s] between samples of courses."""
 
 SILENCE = 1e-6

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy import fft
 
 from model.answer.course import SILENCE, STEP, STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
@@ -117,7 +118,7 @@ class DriveEnvelope:
 
     def moments(self, squares: FloatArray) -> FloatArray:
         """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
-        sums = np.cumsum(squares, axis=0)
+        sums = np.cumsum(squares, axis=0, dtype=float)
         sums[self.within :] -= sums[: -self.within].copy()
         return np.asarray(sums[self.within - 1 :] / self.within)
 
@@ -139,14 +140,15 @@ class DriveEnvelope:
         moments of each. Of two tones each has more of what is nearer to it: beside the drive's own,
         at which a null may be, as its square.
         """
-        count = max(len(self.values) + self.within, math.ceil(1 / _RESOLUTION / self.step))
-        transform, nu = np.fft.fft(self.values, count), np.fft.fftfreq(count, self.step)
+        count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
+        count = fft.next_fast_len(count)
+        transform, nu = fft.fft(self.values, count), fft.fftfreq(count, self.step)
         near = np.array([np.interp(nu, off, each) for each in np.eye(len(off))])
         own = int(np.argmin(np.abs(off)))
         is_beside = near[own] > 0
         near[:, is_beside] **= 2
         near[own, is_beside] += 1 - near[:, is_beside].sum(axis=0)
-        squares = np.abs(np.fft.ifft(transform * np.sqrt(near))) ** 2
+        squares = np.abs(fft.ifft((transform * np.sqrt(near)).astype(np.complex64))) ** 2
         if self.is_course:
             power, all_ = self.moments(squares.T).max(axis=0), self.moments(self.values**2).max()
             return np.asarray(power * (all_ / power.sum()))

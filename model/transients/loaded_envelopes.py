@@ -60,8 +60,10 @@ def enveloped_accelerations(
     between = share[:, None] * transient[after - 1] + (1 - share[:, None]) * transient[after]
     every = np.zeros((count, len(steady)), dtype=np.complex64)
     every[is_near] = transform[is_near, None].astype(np.complex64) * between
-    found = growth[:, None] * fft.ifft(every, axis=0) + envelope[:, None] * steady
-    return np.concatenate([found, steady[None]])
+    found = np.append(fft.ifft(every, axis=0), steady[None], axis=0)
+    found[:-1] *= growth[:, None].astype(np.float32)
+    found[:-1] += envelope[:, None].astype(np.float32) * found[-1]
+    return found
 
 
 def _held_by(

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy import fft
 
-from model.answer.course import SILENCE, STEP, STRONGEST, Course
+from model.answer.course import SILENCE, STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
 from model.answer.search import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
@@ -109,12 +109,13 @@ class DriveEnvelope:
     @classmethod
     def of_course(cls, course: Course) -> "DriveEnvelope":
         """Along a course, or a plain ramp where it starts or ends above 0."""
-        count = math.ceil((course.duration + RINGING) / STEP)
-        times = np.asarray(STEP * np.arange(count), dtype=float)
+        count = math.ceil((course.duration + RINGING) / course.step)
+        times = np.asarray(course.step * np.arange(count), dtype=float)
         after, (first, *_, last) = np.asarray(times - course.duration), course.shares
         values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
         values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
-        return cls(np.maximum(values, SILENCE), STEP, round(STRONGEST / STEP), is_course=True)
+        within = round(STRONGEST / course.step)
+        return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
 
     def moments(self, squares: FloatArray) -> FloatArray:
         """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
@@ -208,17 +209,18 @@ class RingingUnderFingers:
         ends = (hertz <= hertz[0] + _BESIDE_HZ).sum(), (hertz >= hertz[-1] - _BESIDE_HZ).sum()
         beyond = int(max(ends)) - 1
         wide = np.pad(hertz, beyond, mode="reflect", reflect_type="odd")
-        found = np.zeros((len(hertz), len(wide)))
-        for row, at in enumerate(hertz.tolist()):
+        # Tones beyond the table count as those as far within it.
+        rows = np.pad(np.arange(len(hertz)), beyond, mode="reflect")
+        found = np.zeros((len(hertz), len(hertz)))
+        for own, at in enumerate(hertz.tolist()):
             off = np.round(wide - at, 6)
             near = np.abs(off) <= _BESIDE_HZ
             key = tuple(off[near].tolist())
             if key not in known:
                 known[key] = self.envelope.shares_at(off[near])
-            found[row, near] = known[key]
-        total, found = found.sum(axis=1), found[:, beyond : beyond + len(hertz)]
+            np.add.at(found[own], rows[near], known[key])
         found[found < _LEAST_SHARE] = 0.0
-        return np.asarray(found * (total / found.sum(axis=1))[:, None])
+        return found
 
     def spectrum(self, drive: Drive) -> Drive:
         """Tones for the tones of a drive, near the frequency of each.

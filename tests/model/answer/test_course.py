@@ -31,7 +31,7 @@ def along(duration: float, shares: FloatArray) -> Course:
 
 
 def rising(count: int) -> FloatArray:
-    """A raised cosine of 40 ms up to 1, at knots 5 ms apart, and what remains of a count of them."""
+    """A raised cosine of 40 ms up to 1, and on from there, at knots 5 ms apart."""
     return rise(0.005 * np.arange(count), 0.040)
 
 
@@ -58,26 +58,28 @@ def test_a_course_goes_on_from_amid_it() -> None:
     assert left == Course((0.0, 1.0, 2.0), (0.5, 1.0, 0.2))
 
 
+def beats(frequency: float) -> Course:
+    """Beats of a frequency [Hz] that come and go along a raised cosine of 8 s."""
+    times = np.linspace(0, 8.0, 1601)
+    slow = (1 - np.cos(2 * np.pi * times / 8.0)) / 2
+    return along(8.0, slow * (1 - np.cos(2 * np.pi * frequency * times)) / 2)
+
+
 def test_a_sinusoidal_modulation_has_three_tones() -> None:
-    """Of (1 + cos) / 2 at 20 Hz the side tones have a quarter of the power of the carrier each."""
-    beats = along(4.0, (1 + np.cos(2 * np.pi * 20 * np.linspace(0, 4.0, 801))) / 2)
+    """Each side tone has half of the amplitude of the carrier, a quarter of its power."""
     off = np.arange(-60.0, 61.0, 10.0)
-    shares = DriveEnvelope.of_course(replace(beats, shares=beats.shares)).shares_at(off)
-    by_off = dict(zip(off.tolist(), (shares / shares.max()).tolist(), strict=True))
-    for each, share in by_off.items():
-        expected = {0.0: 1.0, 20.0: 0.25, -20.0: 0.25}.get(each, 0.0)
-        assert share == pytest.approx(expected, abs=0.03), each
+    shares = DriveEnvelope.of_course(beats(20.0)).shares_at(off)
+    expected = 0.25 * (np.abs(off) == 20) + (off == 0)
+    assert shares / shares.max() == pytest.approx(expected, abs=0.01)
 
 
 def test_next_to_a_null_little_is_felt_of_slow_changes() -> None:
-    """Beats of 2 Hz are a fifth of the way to the next tone: its power there has a share of 1/25.
+    """Side bands at 2 Hz are a fifth of the way to the next tone, of whose power they cause 1/25.
 
-    Each side band has 1/4 of the power of the carrier, and both are 10 Hz from the next tones.
+    At the top of a beat the carrier has half of the amplitude, each side band a quarter.
     """
-    beats = along(8.0, (1 + np.cos(2 * np.pi * 2 * np.linspace(0, 8.0, 1601))) / 2)
-    shares = DriveEnvelope.of_course(beats).shares_at(np.array([-10.0, 0.0, 10.0]))
-    power = 0.25 * 0.25 / 25  # of the carrier, of a side band, of what is felt of it next to a null
-    assert shares[[0, 2]] == pytest.approx(power, rel=0.3)
+    shares = DriveEnvelope.of_course(beats(2.0)).shares_at(np.array([-10.0, 0.0, 10.0]))
+    assert shares[[0, 2]] == pytest.approx(0.25**2 / 25, rel=0.1)
 
 
 @pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
@@ -113,7 +115,10 @@ def test_a_course_is_felt_as_on_the_plate_in_time(
 
 
 def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
-    """Along its raised cosines, at the level of its 40 ms: the same contrasts within 1 dB."""
+    """Along its raised cosines, at the level of its 40 ms: at its frequency, with its contrast.
+
+    Up to 1.5 dB more: of a click the first 40 ms count at the target, of a course the strongest.
+    """
     table, times = smooth_table(), np.linspace(0, 0.05, 51)
     ramp = pulse_ramp(0.04)
     click = along(0.05, rise(times, ramp) - rise(np.asarray(times - 0.04), ramp))
@@ -123,35 +128,35 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
         level = 20.0 - click.strongest_db
         other = query(table, placed, level, course=click, drive_mode="phased")
         contrasts = [each.fingers[0].promised_contrast_db or 0.0 for each in (one, other)]
-        assert contrasts[0] == pytest.approx(contrasts[1], abs=1.0)
+        assert contrasts[0] - 0.1 <= contrasts[1] <= contrasts[0] + 1.5
         assert other.fingers[0].level_db_sl == pytest.approx(level, abs=0.01)
         assert one.layers[0].frequency == other.layers[0].frequency
 
 
 def test_promise_over_a_course_is_kept() -> None:
-    """By nine of ten of 240 plates in time, beside a quiet finger and beside a steady content."""
+    """By nine of ten of 120 plates in time, beside a quiet finger and beside a steady content."""
     table, rig, stimulus = smooth_table(), smooth_rig(), Stimulus(20.0, course=strokes())
     steady = Stimulus(14.0)
     for has_other, first in ((False, stimulus), (True, stimulus), (True, steady)):
         answers = []
-        for places in contact_sets(12, fingers=2, seed=3):
+        for places in contact_sets(10, fingers=2, seed=3):
             second = (steady if first is stimulus else stimulus) if has_other else None
             fingers = [Finger(places[0], first), Finger(places[1], second)]
             answers.append(answer(table, fingers, drive_mode="phased", min_contrast_db=-99.0))
         promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
-        found = given(table, rig, answers, 20, seed=4)
+        found = given(table, rig, answers, 12, seed=4)
         assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.95, (has_other, first)
 
 
 def test_side_bands_of_a_course_are_promised_too() -> None:
-    """A texture of 20 Hz along a course leaks more than the course alone, and its promise is kept."""
+    """A texture of 20 Hz along a course: on nine of ten plates in time."""
     table, rig, answers = smooth_table(), smooth_rig(), []
-    for places in contact_sets(8, fingers=2, seed=5):
+    for places in contact_sets(6, fingers=2, seed=5):
         fingers = [Finger(places[0], Stimulus(20.0, course=strokes(), modulation_hz=20.0))]
         answers.append(answer(table, fingers, quiet=places[1:], drive_mode="phased"))
-    assert sum(bool(each.layers[0].side_bands) for each in answers) >= 6
+    assert sum(bool(each.layers[0].side_bands) for each in answers) >= 3
     promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
-    found = given(table, rig, answers, 15, seed=6)
+    found = given(table, rig, answers, 10, seed=6)
     assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.97
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import re
 import sys
+import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,6 +13,9 @@ from typing import Any
 import pytest
 
 from controller.cli.main import run
+from controller.content.ahap import Ahap
+from controller.content.format import ContentFormat
+from controller.content.formats import content_format, content_formats, read_content
 from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
 from controller.effects.kinds import effect_kind, effect_kinds
@@ -71,6 +75,12 @@ def play_effect(kind: type[Effect]) -> None:
     EffectPlayer(layout).intent([Contact(ContactKey("s", 1), 0.1, 0.1, 0.0)], 0.0)
 
 
+def read_file(kind: type[ContentFormat]) -> None:
+    """Read a file of this format."""
+    with tempfile.NamedTemporaryFile(suffix=f".{kind.ending}") as file:
+        read_content(Path(file.name))
+
+
 KINDS = [
     Kind(
         "materials",
@@ -103,6 +113,25 @@ KINDS = [
         "    def start(self, contact, now, *, level_db_sl):\n"
         "        return 7\n",
         use=play_effect,
+    ),
+    Kind(
+        "content_formats",
+        "format of content",
+        "from era_haptics.plugins.content_formats import ContentFormat\n"
+        "class THING(ContentFormat):\n"
+        "    ending = 'fine'\n"
+        "    def read(self, content, source, channel):\n"
+        "        pass\n",
+        "a class derived from ContentFormat",
+        content_format,
+        ("ahap", Ahap),
+        content_formats,
+        fails="from era_haptics.plugins.content_formats import ContentFormat\n"
+        "class THING(ContentFormat):\n"
+        "    ending = 'fine'\n"
+        "    def read(self, content, source, channel):\n"
+        "        return 7\n",
+        use=read_file,
     ),
     Kind(
         "wires",

@@ -38,5 +38,5 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     tones.set_xlim(0, checked.duration)
     tones.set_xlabel("time / s")
     tones.set_ylabel("frequency / Hz")
-    levels.legend(loc="upper right", fontsize=8)
+    levels.legend(loc="lower right", fontsize=8)
     return figure

@@ -17,12 +17,15 @@ from model.errors import InputError
 from registry.plugins import PluginRegistry, WrongResultError
 from registry.suggestions import did_you_mean
 
+BUILT_IN: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
+"""The formats of the project itself."""
+
 _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     "format of content",
     "era_haptics.content_formats",
     ContentFormat,
     error=InputError,
-    own={each.ending: each for each in (Ahap, Haptic, Hjif, Wav)},
+    own={each.ending: each for each in BUILT_IN},
     called=attrgetter("ending"),
     hint="; one of a package needs it installed, with an entry point in "
     "era_haptics.content_formats",

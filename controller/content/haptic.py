@@ -95,6 +95,7 @@ class Haptic(ContentFormat):
                     f"must be at least the amplitude there, {each.amplitude:g}, "
                     f"got {each.emphasis.amplitude:g}",
                 )
+                break
         validation.finish()
         return Pattern(
             envelopes.amplitude[-1].time,
@@ -114,12 +115,13 @@ def _check_order(
     path: KeyPath,
     times: list[float],
 ) -> None:
-    """Check that times do not go back, and that there is not too much."""
+    """Check that no time is before the one ahead of it, and that there is not too much."""
     before = 0.0
     for index, time in enumerate(times):
         if time < before:
             message = f"must be at least that of the point before, {before:g}, got {time:g}"
             validation.add((*path, index, "time"), message)
+            return
         before = time
     if problem := too_much(before, len(times)):
         validation.add((*path, len(times) - 1), problem)

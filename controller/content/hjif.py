@@ -146,7 +146,7 @@ class _Reading:
         self._remarks: tuple[str, ...] = ()
 
     def add(self, band: _Band, path: KeyPath) -> None:
-        """Take a band; adds what is wrong with it to the problems of the file."""
+        """Take a band; adds the first that is wrong with it to the problems of the file."""
         if band.band_type == "WaveletWave":
             self._validation.add(
                 (*path, "band_type"),
@@ -165,17 +165,18 @@ class _Reading:
                     else "composite effects are not read; write the file with basis effects"
                 )
                 self._validation.add((*where, "id" if effect is None else "effect_type"), message)
-                continue
+                return
             ticks = [each.relative_position for each in effect.keyframes]
             times = [round((placed.position + each) * self._tick, 9) for each in ticks]
             self._count += len(times)
             self._end = max([self._end, *times])
             if ticks != sorted(ticks):
                 self._validation.add((*where, "keyframes"), "must be in order of their positions")
-            elif problem := too_much(self._end, self._count):
+                return
+            if problem := too_much(self._end, self._count):
                 self._validation.add(where, problem)
                 return
-            elif times:
+            if times:
                 self._play(band, effect, times)
 
     def _play(self, band: _Band, effect: _Effect, times: list[float]) -> None:

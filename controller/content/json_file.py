@@ -4,7 +4,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -53,18 +53,14 @@ class ContentSection(Section):
 class JsonDocument(Document):
     """The content of a JSON file; lines are found when asked for."""
 
-    _scanned: dict[int, dict[str | int, tuple[int, int]]] = field(default_factory=dict)
-
     def line_of(self, path: KeyPath) -> int:
         """The line of a key or list entry, or of the nearest one above it if it is missing."""
         begin = value = _skipped(self.text, 0)
         for key in path:
-            if value not in self._scanned:
-                found = {name: (at, inner) for name, at, inner in _entries(self.text, value)}
-                self._scanned[value] = found
-            if key not in self._scanned[value]:
+            found = (where for name, *where in _entries(self.text, value) if name == key)
+            begin, value = next(found, (begin, -1))
+            if value < 0:
                 break
-            begin, value = self._scanned[value][key]
         return _line(self.text, begin)
 
 

@@ -1,6 +1,6 @@
 """Renditions: what a pattern becomes on a plate at a level, before anybody else's is known.
 
-Its reasons are in docs/how-to/play-a-file.md.
+The reasons are in docs/how-to/play-content.md.
 """
 
 from bisect import bisect_left
@@ -95,13 +95,8 @@ def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> Flo
     """
     taps = [each for each in pattern.transients if each.intensity > 0]
     starts = np.array([each.time for each in taps])
-    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     level = _lasting(pattern, level_db_sl, times) + decibels(_beside(starts, times))
-    first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
-    number = np.repeat(np.arange(len(taps)), last - first)
-    during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
-    np.maximum.at(level, during, levels[number])
-    return level
+    return _with_taps(level, taps, level_db_sl, times)
 
 
 def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> Rendition:
@@ -109,7 +104,8 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
 
     Intensity i is 10 + i (level - 10) dB SL, 0 is silent; sharpness is a frequency in a band of
     10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
-    energy is; transients are clicks, of those too close together the strongest.
+    energy is; transients are clicks, of those too close together the strongest: the others are left
+    to what lasts.
     """
     pattern = _as_tap(pattern)
     taps = _apart(pattern)
@@ -123,17 +119,21 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     duration = max(pattern.duration, *((starts + CLICK_DURATION).tolist()), KNOT_STEP)
     times = np.linspace(0, duration, int(np.ceil(duration / KNOT_STEP - _ROUNDING)) + 1)
     level = _lasting(pattern, level_db_sl, times)
+    kept = {*taps}
+    close = [each for each in pattern.transients if each.intensity > 0 and each not in kept]
+    level = _with_taps(level, close, level_db_sl, times)
     shares = 10 ** ((level - level.max(initial=-1e3)) / 20) * _beside(starts, times)
     remarks = list(pattern.remarks)
-    if merged := sum(each.intensity > 0 for each in pattern.transients) - len(taps):
+    if close:
         remarks.append(
-            f"{merged} of {merged + len(taps)} taps, less than {1000 * _APART:.0f} ms from a "
-            "stronger one"
+            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * _APART:.0f} ms from "
+            "a stronger one: left to what lasts"
         )
     course, band, modulation = None, _band(DULLEST_HZ, frequencies), None
     if highest := float(shares.max()):
         course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
-        hertz = sharpness_hz(along(pattern.sharpness, times))
+        of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
+        hertz = sharpness_hz(along(pattern.sharpness or of_taps, times))
         band = _band(_carrier(hertz, shares**2), frequencies)
         modulation = _modulation(times, shares)
         remarks += _lost(hertz, shares, band, clicks)
@@ -150,6 +150,19 @@ def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] of what lasts at times [s]."""
     return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
+
+
+def _with_taps(
+    level: FloatArray, taps: Sequence[Transient], level_db_sl: float, times: FloatArray
+) -> FloatArray:
+    """Levels [dB SL] at times [s], or those of taps, 40 ms each, where they are higher."""
+    starts = np.array([each.time for each in taps])
+    levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
+    first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
+    number = np.repeat(np.arange(len(taps)), last - first)
+    during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
+    np.maximum.at(level, during, levels[number])
+    return level
 
 
 def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:

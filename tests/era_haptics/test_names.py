@@ -59,6 +59,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
                 ("SolvedPlate", "matplotlib controller"),
                 ("draw_map", "matplotlib.pyplot"),
                 ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
+                ("plugins.content_formats", "sim scipy matplotlib drivers"),
                 ("plugins.effects", "sim scipy matplotlib drivers.backend"),
                 ("plugins.materials", "sim controller drivers numpy"),
             )

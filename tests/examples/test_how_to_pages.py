@@ -17,12 +17,14 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "how-to"
 PIP = ROOT / "tests" / "support" / "built_pip.py"
 NAMES = [
+    "add-a-content-format",
     "add-a-material",
     "add-a-touch-source",
     "add-an-effect",
     "bring-your-own-method",
     "drive-a-signal-generator",
     "design-a-layout",
+    "play-content",
     "your-own-application",
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]

@@ -1,0 +1,141 @@
+"""What of files of content is felt at a finger that is alone, and what beside it at another.
+
+    python -m benchmarks.content [--files FOLDER] [--count 40] [--pairs 0] [--workers 2]
+
+Alone on the paper's plate: share of the time in which the level at the skin is within 3 dB of what
+a file asks, where that is within 20 dB of its highest, as by `era content check`; with the one
+delay of at most 10 ms that all files share. Once of all that the files ask, and once without the
+taps that are no clicks because they are too close to stronger ones. With --pairs also beside so
+many other fingers, anywhere 5 cm apart, over the wire, on plates, drives and fingers drawn within
+the rig's uncertainty, another for each: contrast of the strongest 40 ms, promised and felt.
+
+Without --files, the named contents that come with the project. Of a folder the first so many files,
+in order of name, that can be read and ask for anything; of equal ones the first. Exits with status
+1 unless half of the files keep 95 % and nine of ten 80 %, and of the promises 86 to 94 %.
+"""
+
+import argparse
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.setting import use_one_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from controller.content.pattern import Pattern
+
+AT = (0.11, 0.13)
+LEVEL_DB_SL = 20.0
+MEDIAN, WORST_TENTH, PROMISED_DB = 0.95, 0.80, 16.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.content",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--files", type=Path, help="folder; default: the named contents")
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--pairs", type=int, default=0, help="fingers beside each file")
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    use_one_thread()
+    patterns = [*dict.fromkeys(_patterns(options.files))][: options.count]
+    is_kept = _print_alone(patterns)
+    if options.pairs:
+        is_kept = _print_beside(patterns, options.pairs, options.workers) and is_kept
+    sys.exit(not is_kept)
+
+
+def _print_alone(patterns: "Sequence[Pattern]") -> bool:
+    """Print what is kept; returns whether that is enough."""
+    import numpy as np
+
+    from benchmarks.content.session import CASE
+    from controller.check.content_check import MAX_DELAY, check_content
+    from controller.content.rendition import rendered
+
+    table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
+    shares, lost = [], 0
+    for asked in patterns:
+        clicks = {each.time for each in rendered(asked, LEVEL_DB_SL, table.frequencies).clicks}
+        taps = [each for each in asked.transients if each.time in clicks]
+        lost += len(asked.transients) - len(taps)
+        found = [
+            check_content(each, table, LEVEL_DB_SL, at=AT)
+            for each in (asked, replace(asked, transients=tuple(taps)))
+        ]
+        shares.append(
+            [np.interp(delays, each.step * np.arange(len(each.kept)), each.kept) for each in found]
+        )
+    by_delay = np.array(shares)  # files, both, delays
+    late = int(np.median(by_delay, axis=0)[0].argmax())
+    count = sum(len(each.transients) for each in patterns)
+    print(
+        f"{len(patterns)} files, {1000 * delays[late]:.0f} ms late; "
+        f"{lost} of {count} taps too close"
+    )
+    print("| kept within 3 dB | median | worst tenth | goal |")
+    print("|---|---|---|---|")
+    kept = np.percentile(by_delay[:, :, late], [50, 10], axis=0).T
+    for name, (median, tenth) in zip(
+        ("of all that is asked", "without taps too close"), kept, strict=True
+    ):
+        print(
+            f"| {name} | {100 * median:.0f} % | {100 * tenth:.0f} % | "
+            f"{100 * MEDIAN:.0f} %, {100 * WORST_TENTH:.0f} % |"
+        )
+    return bool((kept[0] >= (MEDIAN, WORST_TENTH)).all())
+
+
+def _print_beside(patterns: "Sequence[Pattern]", pairs: int, workers: int) -> bool:
+    """Print what is promised and felt beside other fingers; returns whether enough is kept."""
+    import numpy as np
+
+    from benchmarks.content.session import outcome
+
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        running = [
+            pool.submit(outcome, each, LEVEL_DB_SL, pair, len(patterns) * pair + number)
+            for pair in range(pairs)
+            for number, each in enumerate(patterns)
+        ]
+        found = []
+        for job in running:
+            found.append(job.result())
+            print(".", end="", flush=True, file=sys.stderr)
+    promised, felt = np.array(found).T
+    kept = float((felt >= promised).mean())
+    print("\n| beside another finger | promised [dB] | felt [dB] | promise kept | goal |")
+    print("|---|---|---|---|---|")
+    print(
+        f"| {len(found)} of {pairs} pairs | {np.median(promised):.1f} | {np.median(felt):.1f} | "
+        f"{100 * kept:.0f} % | {PROMISED_DB:g} dB, 86 to 94 % |"
+    )
+    return 0.86 <= kept <= 0.94
+
+
+def _patterns(folder: Path | None) -> "Iterator[Pattern]":
+    """What can be read of a folder in order of name, or the named contents."""
+    from controller.content.formats import named_content, named_contents, read_content
+    from model.errors import InputError
+
+    paths = [named_content(each) for each in named_contents()]
+    for path in paths if folder is None else sorted(folder.iterdir()):
+        try:
+            pattern = read_content(path)
+        except InputError as error:
+            print(f"skipped: {error}", file=sys.stderr)
+            continue
+        if pattern.transients or any(value > 0 for _, value in pattern.intensity):
+            yield pattern
+
+
+if __name__ == "__main__":
+    main()

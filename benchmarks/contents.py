@@ -82,7 +82,7 @@ def main() -> None:
                 drive_mode="phased",
                 frequencies=np.arange(40.0, 501.0 if options.distortion else 321.0, 10.0),
             )
-            prepare_answers(table, with_ringing=False)
+            prepare_answers(table)
             if options.sharing:
                 _print_sharing((name, label), table, count=options.sets)
                 continue
@@ -175,7 +175,7 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
     patient = replace(table)
-    prepare_answers(patient, with_ringing=False)  # kernels read the numbers once for a table
+    prepare_answers(patient)  # kernels read the numbers once for a table
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = chosen
     for targets in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20):
         lost: dict[float, list[float]] = {20.0: [], 60.0: []}

@@ -12,6 +12,7 @@ of them give [dB].
 
 import argparse
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ from benchmarks.setting import use_one_thread
 
 if TYPE_CHECKING:
     from model.answer.answer import Answer
-    from model.arrays import FloatArray
+    from model.arrays import ComplexArray, FloatArray
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 
@@ -88,16 +89,32 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
 
 
 def given(
-    table: "LocalizationTable", rig: "Rig", clicks: Clicks, plates: int, seed: int
+    table: "LocalizationTable", rig: "Rig", answers: Sequence["Answer"], plates: int, seed: int
 ) -> "FloatArray":
-    """Contrast [dB] over clicks on plates that differ from a rig's within its uncertainty."""
+    """Contrast [dB] of the first finger on plates that differ from a rig's within its uncertainty.
+
+    Of each answer (a, plates): its level above the others' content at it, or of an only content
+    above what is felt of it at the loudest other finger.
+    """
     import numpy as np
 
-    from model.answer.over_duration import RingingUnderFingers
-    from model.finger.fingertip import fingertip_points, fingertip_weights
+    found = np.empty((len(answers), plates))
+    for number, drawn in enumerate(_drawn_plates(table, rig, plates, seed)):
+        for row, each in enumerate(answers):
+            own, *others = (_felt_on(*drawn, each, layer) for layer in range(len(each.layers)))
+            heard = sum(power[0] for _, power in others) if others else own[1][1:].max()
+            found[row, number] = 10 * math.log10(own[0] / heard)
+    return found
+
+
+def _drawn_plates(
+    table: "LocalizationTable", rig: "Rig", plates: int, seed: int
+) -> Iterator[tuple["LocalizationTable", "ComplexArray", "ComplexArray"]]:
+    """The table of each plate, and gains and second harmonics of its drives (eras,)."""
+    import numpy as np
+
     from model.study.exact_plates import draw_plates
     from model.table.following import table_following
-    from model.vibration.excitation import Tone, base_amplitudes
 
     drawn = draw_plates(
         np.random.default_rng(seed),
@@ -106,7 +123,6 @@ def given(
         era_count=len(rig.eras),
         contact_count=1,
     )
-    found = np.empty((len(clicks), plates))
     for number in range(plates):
         factor, finger = float(drawn.thickness[number]), rig.fingertip
         eras = tuple(
@@ -130,31 +146,50 @@ def given(
             loss_factor=float(drawn.loss[number]) * rig.plate.loss_factor,
         )
         load = float(drawn.load[number, 0])
-        other = table_following(
-            table,
-            replace(rig, plate=plate, eras=eras, fingertip=finger and finger.multiplied(load)),
-        )
-        gains = dict(zip((era.name for era in eras), drawn.gain[number], strict=True))
-        for row, click in enumerate(clicks):
-            (layer,), contacts = click.layers, click.contents.places
-            tones = {
-                name: Tone(tone.frequency, abs(z := tone.phasor * gains[name]), float(np.angle(z)))
-                for name, tone in layer.excitation.items()
-            }
-            ringing = RingingUnderFingers(other, contacts, (), DURATION, layer.ramp)
-            hertz, bases = base_amplitudes(tones, eras)
-            pulse = ringing.over(zip(hertz.tolist(), bases, strict=True))
-            frequencies, amplitudes = other.amplitudes(
-                tones, fingertip_points(*contacts[0], plate), contacts=contacts
-            )
-            threshold = other.thresholds[other.rows_of(frequencies)]
-            steady = np.linalg.norm(amplitudes / threshold[:, None], axis=0)
-            level = 20 * math.log10(float(steady @ fingertip_weights(*contacts[0], plate)))
-            distorted = bases * drawn.harmonic[number]
-            harmonics = ringing.over(zip((2 * hertz).tolist(), distorted, strict=True))
-            quiet = 10 * math.log10(float((pulse.heard + harmonics.heard)[1:].max()))
-            found[row, number] = level + 20 * math.log10(float(pulse.gains[0])) - quiet
-    return found
+        other = replace(rig, plate=plate, eras=eras, fingertip=finger and finger.multiplied(load))
+        yield table_following(table, other), drawn.gain[number], drawn.harmonic[number]
+
+
+def _felt_on(
+    table: "LocalizationTable",
+    gains: "ComplexArray",
+    harmonic: "ComplexArray",
+    answer: "Answer",
+    number: int,
+) -> tuple[float, "FloatArray"]:
+    """Power to threshold of a layer at its first finger, and at the loudest points of all (k,).
+
+    In time: over a duration, or at the strongest moments of a course; of what lasts the steady one.
+    """
+    import numpy as np
+
+    from model.answer.over_duration import DriveEnvelope, RingingUnderFingers
+    from model.finger.fingertip import fingertip_points, fingertip_weights
+    from model.vibration.excitation import Tone, base_amplitudes
+
+    contents, power = answer.contents, 0.0
+    steady = RingingUnderFingers(
+        table, contents.places, contents.loads, DriveEnvelope(np.ones(2), 1e-3, 1, share=0.0)
+    )
+    over = RingingUnderFingers.of_streams(table, contents)[number] or steady
+    target, heard = contents.streams[number].targets[0], np.zeros(len(contents.places))
+    points = fingertip_points(*contents.places[target], table.plate)
+    weights = fingertip_weights(*contents.places[target], table.plate)
+    by_name = dict(zip((era.name for era in table.eras), gains.tolist(), strict=True))
+    for excitation in answer.layers[number].excitations:
+        tones = {
+            name: Tone.from_phasor(tone.frequency, tone.phasor * by_name[name])
+            for name, tone in excitation.items()
+        }
+        hertz, bases = base_amplitudes(tones, table.eras)
+        frequencies, amplitudes = table.amplitudes(tones, points, contacts=contents.places)
+        thresholds = table.thresholds[table.rows_of(frequencies), None]
+        level = float(np.linalg.norm(amplitudes / thresholds, axis=0) @ weights)
+        played = over.over(zip(hertz.tolist(), bases, strict=True))
+        harmonics = over.over(zip((2 * hertz).tolist(), bases * harmonic, strict=True))
+        power += (level * float(played.gains[target])) ** 2
+        heard += (played.heard + harmonics.heard).max(axis=1)
+    return power, heard
 
 
 if __name__ == "__main__":

@@ -126,8 +126,8 @@ class AsyncClient(AsyncCalls):
         the same of short ones beside them.
         """
         x, y = as_position(position)
-        played = {"effect": effect} if isinstance(effect, str) else {"points": [*effect]}
-        more = {"level_db_sl": level_db_sl, "taps": [*taps], "loop": loop}
+        played = {"effect": effect} if isinstance(effect, str) else {"points": [*map(list, effect)]}
+        more = {"level_db_sl": level_db_sl, "taps": [*map(list, taps)], "loop": loop}
         await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
 
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:

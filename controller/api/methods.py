@@ -209,7 +209,8 @@ class EffectsResult(Message):
     effects: list[EffectDescription]
 
 
-GivenPoints = Annotated[list[tuple[float, float, float]], Field(max_length=MAX_GIVEN), FailFast()]
+_Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+_Points = Annotated[list[_Point], Field(max_length=MAX_GIVEN), FailFast()]
 
 
 class PlayParams(Message):
@@ -225,12 +226,12 @@ class PlayParams(Message):
         description="from -20; at most, and by default, the effect's own; of points by default 20, "
         "at most the highest of the layout",
     )
-    points: GivenPoints = Field(
+    points: _Points = Field(
         [],
-        description="of what lasts: `[time_s, intensity, sharpness]`, in order of time; "
-        "0 to 60 s, 0 to 1",
+        description="of what lasts: `[time_s, intensity, sharpness]` in order of time, 0 to 60 s, "
+        "0 to 1",
     )
-    taps: GivenPoints = Field([], description="short ones beside it, in the same way")
+    taps: _Points = Field([], description="short ones beside it, in the same way")
     loop: bool = Field(False, description="whether points or a file begin anew at their end")
 
 

@@ -28,8 +28,6 @@ class AnswersInUse:
         fingerprint = self._base[0].fingerprint
         if answers.base != fingerprint:
             raise InputError(f"answers must be those of table {fingerprint}, got {answers.base}")
-        if not answers.is_complete:
-            answers.table.inherit_ringing(self.table)
         self._use(answers.table, self._timing.following(answers.table))
 
     def reset(self) -> None:

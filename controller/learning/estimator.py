@@ -134,7 +134,7 @@ class Estimator:
     def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:
         # Of its own, not the one that the next correction starts from.
         table = replace(table)
-        prepare_answers(table, self._start.drive_mode, with_ringing=whole)
+        prepare_answers(table, self._start.drive_mode)
         _ = table.in_time
         return Answers(self._base, table, whole)
 

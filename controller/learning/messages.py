@@ -38,8 +38,8 @@ class Start:
 class Answers:
     """A table in place of the one that it corrects, prepared for its first touch.
 
-    base: fingerprint of the table that it corrects; is_complete: whether the ringing of short
-    effects is that of this plate, too.
+    base: fingerprint of the table that it corrects; is_complete: whether onsets and endings are
+    shaped anew for it, too.
     """
 
     base: str

@@ -254,7 +254,7 @@ export interface PlayParams {
   /** from -20; at most, and by default, the effect's own; of points by default 20, at most the highest of the layout */
   level_db_sl?: number | null;
   /** `[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1 */
-  points?: Array<[number, number, number]> | null;
+  points?: Array<Array<number>> | null;
   /** whether points or a file begin anew at their end */
   loop?: boolean;
 }

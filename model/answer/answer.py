@@ -197,7 +197,7 @@ class Answer:
             lowered, pauses = self.lowered_db(number), self.pauses(number)
             for finger in stream.targets:
                 contrast, median, promised, of_others = known[finger]
-                level, promised_level = tones.level_db_sl[finger]
+                level, promised_level = self.levels_db_sl(number, finger)
                 found[finger] = Sensation(
                     self.asked[finger],
                     SHARED
@@ -244,7 +244,8 @@ class Answer:
                 every = (excitation, *sides)
                 excitation = {name: tone for each in every for name, tone in each.items()}
                 sides = []
-            duration = None if self.contents.is_shaped else stream.duration
+            is_plain = not self.contents.is_shaped and stream.course is None
+            duration = stream.duration if is_plain else None
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(
@@ -272,6 +273,13 @@ class Answer:
                 loads.append(finger.load)
         return Placement(tuple(own), tuple(others), tuple(loads))
 
+    def levels_db_sl(self, number: int, finger: int) -> tuple[float, float]:
+        """Level of a layer at a finger, both by number, and the promised one; of a course at 1."""
+        course = self.contents.streams[number].course
+        level, promised = self.tones.level_db_sl[finger]
+        strongest_db = 0.0 if course is None else course.strongest_db
+        return level - strongest_db, promised - strongest_db
+
     def lowered_db(self, number: int) -> float:
         """By how much a layer, by its number, is weaker than its stimulus asks [dB]."""
         stream = self.contents.streams[number]
@@ -279,7 +287,7 @@ class Answer:
         for finger in stream.targets:
             stimulus = self.asked[finger].stimulus
             if stimulus is not None:
-                given = self.tones.level_db_sl[stream.targets[0]][lasts]
+                given = self.levels_db_sl(number, stream.targets[0])[lasts]
                 short = max(short, stimulus.level_db_sl - given)
         return short if short > SAME_LEVEL else 0.0
 

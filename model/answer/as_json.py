@@ -219,7 +219,7 @@ def _envelopes_as_json(
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
     """Answer one question, of the keys of a batch's line. Raises InputError."""
     asked, timing = _parsed(values, {}), Timing(table)
-    prepare_answers(table, asked.mode or (UNRESTRICTED if asked.own else None), with_ringing=False)
+    prepare_answers(table, asked.mode or (UNRESTRICTED if asked.own else None))
     timing.prepare(table.frequencies.tolist())
     return answer_as_json(table, asked, timing)
 
@@ -233,7 +233,7 @@ def query_batch(
 
     defaults: of keys that lines leave out.
     """
-    prepare_answers(table, with_ringing=False)
+    prepare_answers(table)
     timing = Timing(table)
     timing.prepare(table.frequencies.tolist())
     for number, line in enumerate(lines, start=1):

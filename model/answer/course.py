@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Self
 
@@ -11,6 +12,14 @@ from model.arrays import FloatArray
 from model.errors import InputError
 
 MAX_POINTS = 20_000
+
+STRONGEST = 0.040
+"""Time [s] of the strongest moments of a course, by which it is felt."""
+
+_STEP, _SHORT = 0.005, 1.0  # s; between samples of courses, half as much of short ones
+
+SILENCE = 1e-6
+"""Share that stands for 0: of a silence levels are finite."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,18 @@ class Course:
     def duration(self) -> float:
         """Its last time [s]."""
         return self.times[-1]
+
+    @property
+    def step(self) -> float:
+        """Time [s] between its samples."""
+        return _STEP if self.duration > _SHORT else _STEP / 2
+
+    @cached_property
+    def strongest_db(self) -> float:
+        """Root mean square of its strongest moments [dB], relative to a share of 1."""
+        times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
+        samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
+        return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
 
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""

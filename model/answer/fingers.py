@@ -68,7 +68,7 @@ class Stimulus:
     modulation_hz: float | None = None
     is_limit: bool = False
     name: str | None = None
-    course: Course | None = field(default=None, repr=False)
+    course: Course | None = field(default=None, hash=False, repr=False)  # long
 
     def __post_init__(self) -> None:
         """Check everything that does not depend on the table."""

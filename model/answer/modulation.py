@@ -113,12 +113,13 @@ def _fits(
 def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
     """Finds a content's tone at a row of the table's frequencies, all other fingers quiet."""
     stream, contents = found.contents.streams[number], found.contents
-    (finger,) = stream.targets
+    (finger,), course = stream.targets, stream.course
+    level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
     others = tuple(n for n in range(len(contents.places)) if n != finger)
     background = None if others else table.background([contents.places[finger]])
 
     def alone(row: int) -> Tones:
-        one = Stream((finger,), stream.level_db_sl, ((row, row + 1),))
+        one = Stream((finger,), level_db_sl, ((row, row + 1),))
         asked = replace(contents, streams=(one,), quiet=others, background=background)
         return choose_tones(table, asked)
 

@@ -3,34 +3,30 @@
 A plate follows its drive late: over 40 ms the root mean square at a finger is several decibels
 below, on a sharp resonance ten decibels below, that of the steady vibration, and it rings on. A
 target counts by the mean of its demodulated acceleration over the duration, another fingertip by
-its power, that after the end included. The best drives are solved in time, with the fingers'
-weight.
+its power, that after the end included; of a course both by its strongest moments. Tones near the
+frequency of a drive stand for its envelope, whichever it is (`DriveEnvelope.shares_at`): by these
+weights are searched and drawn plates judged.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy import fft
 
+from model.answer.course import SILENCE, STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
-from model.answer.fingers_on_plate import FingerForms
 from model.answer.search import Contents
-from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
+from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.drive_modes.forms import Drive, Forms
-from model.ensemble.touched_plate import gram
 from model.finger.perception import detection_threshold
-from model.structure.attachments import Fingertip, fingertip_loads
-from model.table.raster import FingertipShapes
+from model.structure.attachments import fingertip_loads
 from model.table.table import LocalizationTable, read_fingertips
+from model.transients.base_motion import rise
 from model.transients.knots import RISE
-from model.transients.loaded_ramps import (
-    ramped_accelerations,
-    ramped_responses,
-    response_count,
-    time_count,
-)
-from model.transients.ringing import RINGING_TIMES, RampedRinging
+from model.transients.loaded_envelopes import enveloped_accelerations
 
 ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
@@ -46,9 +42,14 @@ Weights keep them quiet as long as they are followed, and no longer: where that 
 rang after was up to 7 dB stronger on four ERAs, 18 dB on a large table.
 """
 
-_BESIDE = 1.7
-"""Distance of the frequencies beside its own that count of a short drive, by the reciprocal of its
-duration: beyond it are 1.4 % of its energy."""
+_BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
+"""Distance of the frequencies beside its own that count of a drive, and the least share of one."""
+
+_PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
+"""Steps [s] of pulses, and how many one has at most within its duration."""
+
+_RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
+_TINY = 1e-30
 
 
 def pulse_ramp(duration: float) -> float:
@@ -68,25 +69,6 @@ def shaped_gain(duration: float) -> float:
     return math.sqrt(1 - 5 / 8 * min(RISE, duration) / duration)
 
 
-@dataclass(frozen=True)
-class FollowedPart:
-    """Part of an effect that is followed: its duration and what is followed after it [s].
-
-    after: None where the effect goes on; share: of the part in the duration.
-    """
-
-    duration: float
-    after: float | None
-    share: float
-
-    @classmethod
-    def of(cls, duration: float) -> "FollowedPart":
-        """Short ones to beyond their end, where a quiet finger may feel most."""
-        length = min(duration, SHAPED_FROM)  # the rest is steady
-        after = RINGING if duration <= SHAPED_FROM else None
-        return cls(length, after, length / duration)
-
-
 @dataclass(frozen=True, eq=False)
 class OverDuration:
     """What k fingers feel of a drive over a duration on the nominal plate.
@@ -98,21 +80,82 @@ class OverDuration:
     gains: FloatArray
     heard: FloatArray
 
-    @classmethod
-    def of(
-        cls, squares: FloatArray, weights: FloatArray, *, count: int, share: float
-    ) -> "OverDuration":
-        """From squared amplitudes to threshold (n + 1, k, p), the last of them lasting.
 
-        weights (k, p): of the points in the mean; count: times within the part that is followed;
-        share: of it in the duration, the rest of which is steady.
+@dataclass(frozen=True, eq=False)
+class DriveEnvelope:
+    """Envelope (n,) of a drive at even steps [s], as long as it is followed.
+
+    within: steps over which it is felt, of a course the strongest, else the first; share: of the
+    followed part in the duration, the rest of which is steady.
+    """
+
+    values: FloatArray
+    step: float
+    within: int
+    share: float = 1.0
+    is_course: bool = False
+
+    @classmethod
+    def of_pulse(cls, duration: float, ramp: float) -> "DriveEnvelope":
+        """Along plain ramps [s], to beyond the end, where a quiet finger may feel most."""
+        length = min(duration, SHAPED_FROM)  # the rest is steady
+        count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
+        step = length / count
+        every = count + math.ceil(RINGING / step)
+        times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
+        values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
+        return cls(np.asarray(values), step, count, length / duration)
+
+    @classmethod
+    def of_course(cls, course: Course) -> "DriveEnvelope":
+        """Along a course, or a plain ramp where it starts or ends above 0."""
+        count = math.ceil((course.duration + RINGING) / course.step)
+        times = np.asarray(course.step * np.arange(count), dtype=float)
+        after, (first, *_, last) = np.asarray(times - course.duration), course.shares
+        values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
+        values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
+        within = round(STRONGEST / course.step)
+        return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
+
+    def moments(self, squares: FloatArray) -> FloatArray:
+        """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
+        sums = np.cumsum(squares, axis=0, dtype=float)
+        sums[self.within :] -= sums[: -self.within].copy()
+        return np.asarray(sums[self.within - 1 :] / self.within)
+
+    def felt(self, squares: FloatArray, weights: FloatArray) -> OverDuration:
+        """From squared amplitudes to threshold (n + 1, k, p), the last of them steady.
+
+        weights (k, p): of the points in the mean.
         """
-        lasting, sums = squares[-1], np.cumsum(squares[:-1], axis=0)
-        sums[count:] -= sums[:-count].copy()
-        power = share * sums[count - 1 :] / count + (1 - share) * lasting
-        felt = (np.sqrt(power[0]) * weights).sum(axis=1)
-        steady = (np.sqrt(lasting) * weights).sum(axis=1)
-        return cls(felt / np.maximum(steady, 1e-30), power.max(axis=0))
+        power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]
+        own = power if self.is_course else power[:1]
+        felt = (np.sqrt(own) * weights).sum(axis=2).max(axis=0)
+        steady = (np.sqrt(squares[-1]) * weights).sum(axis=1)
+        return OverDuration(felt / np.maximum(steady, 1e-30), power.max(axis=0))
+
+    def shares_at(self, off: FloatArray) -> FloatArray:
+        """Shares (b,) of the steady power of tones that are off its frequency (b,) [Hz].
+
+        With the energy of the drive on any plate (Parseval); of a course that of the strongest
+        moments of each. Of two tones each has more of what is nearer to it: beside the drive's own,
+        at which a null may be, as its square.
+        """
+        count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
+        count = fft.next_fast_len(count)
+        transform, nu = fft.fft(self.values, count), fft.fftfreq(count, self.step)
+        near = np.array([np.interp(nu, off, each) for each in np.eye(len(off))])
+        own = int(np.argmin(np.abs(off)))
+        is_beside = near[own] > 0
+        near[:, is_beside] **= 2
+        near[own, is_beside] += 1 - near[:, is_beside].sum(axis=0)
+        squares = np.abs(fft.ifft((transform * np.sqrt(near)).astype(np.complex64))) ** 2
+        if self.is_course:
+            power, all_ = self.moments(squares.T).max(axis=0), self.moments(self.values**2).max()
+            return np.asarray(power * (all_ / power.sum()))
+        power = self.share * squares.sum(axis=1) / self.within
+        power[own] += 1 - self.share
+        return np.asarray(power)
 
 
 def on_drawn_plates(
@@ -127,82 +170,9 @@ def on_drawn_plates(
     return np.asarray(np.maximum(heard[..., None] + added, 0.0))
 
 
-def forms_over(
-    steady: Forms,
-    formed: FingerForms,
-    targets: Sequence[int],
-    others: Sequence[int],
-    ringing: RampedRinging,
-) -> Forms:
-    """Forms over an effect from steady ones; ringing is that of the plate without fingers."""
-    fields, few = formed.contacts.fields, formed.fingers.tips.few
-    (f, k, p, n), at = fields.shape, few.reshape(-1, few.shape[2])
-    real, imaginary = ringing.parts[:, formed.rows].reshape(2, -1, at.shape[1]) @ at.T
-    parts = (real + 1j * imaginary).reshape(f, n, -1, k, p).transpose(0, 3, 2, 4, 1)
-    over = parts + ringing.envelope[:, None, None] * fields[:, :, None]
-    return forms_of(steady, formed, targets, others, over, RINGING_TIMES)
-
-
-def forms_of(
-    steady: Forms,
-    formed: FingerForms,
-    targets: Sequence[int],
-    others: Sequence[int],
-    over: Complex64Array,
-    count: int,
-) -> Forms:
-    """Forms from fields over an effect (f, k, times, p, n); count: times until its end."""
-    targets, others = [*targets], [*others]
-    weights, (f, _, _, _, n) = formed.fingers.tips.few_weights, over.shape
-    at = over[:, targets, :count].mean(axis=2)
-    scale = np.sqrt(weights[others])[:, None, :, None]
-    lasting, during = (
-        (each[:, others] * scale / np.float32(math.sqrt(length))).reshape(f, len(others), -1, n)
-        for each, length in ((formed.contacts.fields[:, :, None], 1), (over, count))
-    )
-    return replace(
-        steady,
-        targets=(at * weights[targets, :, None]).sum(axis=2).swapaxes(0, 1),
-        quiet=np.ascontiguousarray(steady.quiet + gram(during) - gram(lasting)),
-        level_margin=0.0,
-        few=None,
-        fine=None,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class PulseResponses:
-    """Accelerations at k fingertips over a duration of each ERA alone at full stroke.
-
-    rows (f,): of the table's frequencies; values (f, eras, n + 1, k, p) [m/s²]: demodulated, the
-    last of the steady vibration; threshold (f,) [m/s²]; weights (k, p), count and share as for
-    `OverDuration`.
-    """
-
-    rows: IntArray
-    values: ComplexArray
-    threshold: FloatArray
-    weights: FloatArray
-    count: int
-    share: float
-
-    def over(self, drive: Drive) -> OverDuration:
-        """What fingers feel of a drive at full level, whose frequencies are rows of the table."""
-        squares = np.zeros(self.values.shape[2:])
-        for row, weights in drive:
-            at = int(np.searchsorted(self.rows, row))
-            field = np.tensordot(weights, self.values[at], axes=1)
-            squares += (field.real**2 + field.imag**2) / self.threshold[at] ** 2
-        return OverDuration.of(squares, self.weights, count=self.count, share=self.share)
-
-    def fields(self) -> Complex64Array:
-        """Fields over the duration (f, k, times, p, eras), as forms need them."""
-        return self.values[:, :, :-1].transpose(0, 3, 2, 4, 1).astype(np.complex64)
-
-
 @dataclass(frozen=True, eq=False)
 class RingingUnderFingers:
-    """Drives of a duration [s] along plain ramps [s], under fingers at places [m] of a plate.
+    """Drives along an envelope, under fingers at places [m] of a plate.
 
     loads: of each relative to the rig's fingertip, empty for 1.
     """
@@ -210,75 +180,74 @@ class RingingUnderFingers:
     table: LocalizationTable
     places: tuple[Point, ...]
     loads: tuple[float, ...]
-    duration: float
-    ramp: float
-    _solved: dict[tuple[int, ...], PulseResponses] = field(default_factory=dict)
+    envelope: DriveEnvelope
 
     @classmethod
     def of_streams(
         cls, table: LocalizationTable, contents: Contents
     ) -> list["RingingUnderFingers | None"]:
-        """One for each content that has a duration, None for those that last."""
-        fingers = contents.places, contents.loads
-        return [
-            None
-            if each is None
-            else cls(table, *fingers, each, max(pulse_ramp(each), contents.least_ramp))
-            for each in contents.durations
-        ]
+        """One for each content that has a duration, None for those that last or are shaped."""
+        found: list[RingingUnderFingers | None] = []
+        for stream in contents.streams:
+            envelope: DriveEnvelope | None = None
+            if stream.course is not None:
+                envelope = DriveEnvelope.of_course(stream.course)
+            elif stream.duration is not None and not contents.is_shaped:
+                ramp = max(pulse_ramp(stream.duration), contents.least_ramp)
+                envelope = DriveEnvelope.of_pulse(stream.duration, ramp)
+            fingers = table, contents.places, contents.loads
+            found.append(None if envelope is None else cls(*fingers, envelope))
+        return found
 
-    def spectrum(self, row: int) -> tuple[IntArray, FloatArray]:
-        """Rows of the table's frequencies near its own (b,), and factors (b,) on weights.
+    @cached_property
+    def shares(self) -> FloatArray:
+        """Shares (f, f) of the power at its own frequency, of tones at all of the table's.
 
-        Tones with these have together the energy of the drive on any plate (Parseval), but for what
-        its ramps excite far beside: of a duration T along raised cosines of r the amplitude is
-        sinc(f T) cos(pi f r) / (1 - 4 f² r²), each for what is nearest to it. Above the threshold
-        at its own frequency.
+        A row for each of the table's frequencies that a drive may have.
         """
-        table, ramp = self.table, self.ramp
-        off = table.frequencies - table.frequencies[row]
-        rows = np.flatnonzero(np.abs(off) * self.duration < _BESIDE)
-        off = off[rows]
-        edges = np.sinc(off * ramp - 0.5) + np.sinc(off * ramp + 0.5)
-        widths = np.gradient(table.frequencies)[rows] if len(table.frequencies) > 1 else 1.0
-        amplitudes = np.sinc(off * self.duration) * edges * np.sqrt(widths)
-        thresholds = table.thresholds[rows] / table.thresholds[row]
-        return rows, thresholds * amplitudes / np.linalg.norm(amplitudes)
+        hertz, known = self.table.frequencies, dict[tuple[float, ...], FloatArray]()
+        ends = (hertz <= hertz[0] + _BESIDE_HZ).sum(), (hertz >= hertz[-1] - _BESIDE_HZ).sum()
+        beyond = int(max(ends)) - 1
+        wide = np.pad(hertz, beyond, mode="reflect", reflect_type="odd")
+        # Tones beyond the table count as those as far within it.
+        rows = np.pad(np.arange(len(hertz)), beyond, mode="reflect")
+        found = np.zeros((len(hertz), len(hertz)))
+        for own, at in enumerate(hertz.tolist()):
+            off = np.round(wide - at, 6)
+            near = np.abs(off) <= _BESIDE_HZ
+            key = tuple(off[near].tolist())
+            if key not in known:
+                known[key] = self.envelope.shares_at(off[near])
+            np.add.at(found[own], rows[near], known[key])
+        found[found < _LEAST_SHARE] = 0.0
+        return found
 
-    def responses(self, rows: IntArray) -> PulseResponses:
-        """Responses at ascending rows of the table's frequencies, solved once.
+    def spectrum(self, drive: Drive) -> Drive:
+        """Tones for the tones of a drive, near the frequency of each.
 
-        At the few points of each fingertip by which drives are searched.
+        They have together the energy of the drive on any plate (Parseval), but for what it excites
+        far beside. Above the threshold at its own frequency.
         """
-        key = tuple(rows.tolist())
-        if key not in self._solved:
-            self._solved[key] = self._responses(rows)
-        return self._solved[key]
+        found, thresholds = [], self.table.thresholds
+        for own, weights in drive:
+            for row in np.flatnonzero(self.shares[own]).tolist():
+                factor = math.sqrt(self.shares[own, row]) * thresholds[row] / thresholds[own]
+                found.append((row, np.asarray(factor * weights, dtype=np.complex64)))
+        return found
 
-    def _responses(self, rows: IntArray) -> PulseResponses:
-        table, part = self.table, FollowedPart.of(self.duration)
-        tips = self._tips
-        k, p, r = tips.few.shape
-        frequencies = table.frequencies[rows]
-        values = [
-            ramped_responses(
-                table.in_time,
-                frequency,
-                points=tips.few.reshape(-1, r).astype(float),
-                fingers=self._fingers(tips.few),
-                ramp=self.ramp,
-                duration=part.duration,
-                after=part.after,
-            )
-            for frequency in frequencies.tolist()
-        ]
-        return PulseResponses(
-            rows,
-            np.array(values).reshape(len(rows), len(table.eras), -1, k, p),
-            detection_threshold(frequencies, table.threshold),
-            tips.few_weights.astype(float),
-            response_count(part.duration),
-            part.share,
+    def forms(self, steady: Forms, some: IntArray) -> Forms:
+        """Forms over the envelope at some of the table's frequencies, from steady ones at all."""
+        shares, own = self.shares[some].astype(np.float32), np.sqrt(self.shares[some, some])
+        size = (np.abs(steady.targets) ** 2).sum(axis=(0, 2))
+        gain = np.sqrt(shares @ size / np.maximum(size[some], _TINY))
+        found, by_carrier = steady.at(some), own.astype(np.float32)[:, None, None, None]
+        return replace(
+            found,
+            targets=found.targets * gain[:, None],
+            quiet=(shares @ steady.quiet.reshape(len(steady.quiet), -1)).reshape(found.quiet.shape),
+            level_margin=0.0,
+            few=None if found.few is None else found.few * by_carrier,
+            fine=None if found.fine is None else found.fine * by_carrier,
         )
 
     def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
@@ -286,35 +255,22 @@ class RingingUnderFingers:
 
         Of each its frequency [Hz] and the motions of the bases (eras,) [m].
         """
-        table, part, tips = self.table, FollowedPart.of(self.duration), self._tips
+        table, tips = self.table, read_fingertips(self.table, self.places)
         k, p, r = tips.fine.shape
+        loads = fingertip_loads(table.fingertip, self.places, self.loads)
+        centres = tips.fine[: len(loads), 0].astype(float)
+        fingers = [(at, load.fingertip) for at, load in zip(centres, loads, strict=True)]
         squares = np.zeros(())
         for frequency, bases in tones:
-            found = ramped_accelerations(
+            found = enveloped_accelerations(
                 table.in_time,
                 bases,
                 float(frequency),
                 points=tips.fine.reshape(-1, r).astype(float),
-                fingers=self._fingers(tips.fine),
-                ramp=self.ramp,
-                duration=part.duration,
-                after=part.after,
+                fingers=fingers,
+                envelope=self.envelope.values,
+                step=self.envelope.step,
             )
             threshold = detection_threshold(np.array(frequency), table.threshold)
             squares = squares + (found.real**2 + found.imag**2) / threshold**2
-        return OverDuration.of(
-            squares.reshape(-1, k, p),
-            tips.fine_weights.astype(float),
-            count=time_count(part.duration),
-            share=part.share,
-        )
-
-    @property
-    def _tips(self) -> FingertipShapes:
-        return read_fingertips(self.table, self.places)
-
-    def _fingers(self, tips: Float32Array) -> Sequence[tuple[FloatArray, Fingertip]]:
-        """Shapes (r,) of the plate under the fingers on it, from (k, p, r), and their loads."""
-        loads = fingertip_loads(self.table.fingertip, self.places, self.loads)
-        centres = tips[: len(loads), 0].astype(float)
-        return [(centre, load.fingertip) for centre, load in zip(centres, loads, strict=True)]
+        return self.envelope.felt(squares.reshape(-1, k, p), tips.fine_weights.astype(float))

@@ -43,7 +43,7 @@ from model.choice import NEARLY, best_by, best_of
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
-from model.table.table import EFFECT_DURATIONS, SAME_FREQUENCY, LocalizationTable
+from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5
 """Fingers that may share, up to which each has a vibration of its own at first.
@@ -106,20 +106,12 @@ def query(
     return answer(table, fingers, drive_mode=drive_mode)
 
 
-def prepare_answers(
-    table: LocalizationTable, drive_mode: str | None = None, *, with_ringing: bool = True
-) -> None:
-    """Compute ahead what the first answer of a table in a drive mode needs.
-
-    with_ringing: of short stimuli, too, which takes the longest.
-    """
+def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> None:
+    """Compute ahead what the first answer of a table in a drive mode needs."""
     centre = (table.plate.length / 2, table.plate.width / 2)
     for quiet in ((), ((0.0, 0.0),)):
         placed = Placement((centre,), quiet)
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
-    if (drive_mode or table.drive_mode) == UNRESTRICTED:
-        for duration in EFFECT_DURATIONS if with_ringing else ():
-            table.ringing(duration)
 
 
 def _changed(found: Answer) -> list[str]:
@@ -129,7 +121,7 @@ def _changed(found: Answer) -> list[str]:
         first = stream.targets[0]
         stimulus = found.asked[first].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
-        if is_modulated and not found.pauses(number):
+        if is_modulated and list(found.tones.owners).count(number) == 1:
             steady.append(f"vibration of {_at(found.asked[first])} is steady")
         lasts = stream.duration is None
         is_reached = found.tones.level_db_sl[first][lasts] >= stream.level_db_sl - SAME_LEVEL
@@ -348,6 +340,8 @@ class _Answering:
             duration, limit, course = None, None, None
             if stimulus is not None:
                 duration, course = stimulus.duration, stimulus.course
+                if course is not None:
+                    level += course.strongest_db
                 if stimulus.is_limit:
                     level, limit = min(level, FELT_DB_SL), level
             of_stimulus = duration, limit, course

@@ -166,9 +166,8 @@ def _over_durations(
             continue
         frequency, own = float(table.frequencies[rows[tone]]), [*stream.targets]
         felt = over.over([(frequency, weights[tone] * strokes)])
-        near, factors = over.spectrum(int(rows[tone]))
-        beside = np.asarray(factors[:, None] * weights[tone], dtype=np.complex64)
-        energy = fingers.powers(PROMISED_DRAWS, near, beside).sum(axis=0)
+        near, beside = zip(*over.spectrum([(int(rows[tone]), weights[tone])]), strict=True)
+        energy = fingers.powers(PROMISED_DRAWS, np.array(near), np.array(beside)).sum(axis=0)
         lasting, nominal = (
             (shares[own] * np.sqrt(each[own, :, 0])).sum(axis=1) for each in (steady[tone], energy)
         )

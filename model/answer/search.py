@@ -111,11 +111,6 @@ class Contents:
         return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
 
     @property
-    def durations(self) -> list[float | None]:
-        """Of each content along a plain ramp [s], None for those that last or are shaped."""
-        return [None if self.is_shaped else stream.duration for stream in self.streams]
-
-    @property
     def candidates(self) -> int:
         """Candidates of each content in each of its bands, and as many by points."""
         count, bands = len(self.streams), len(self.streams[0].bands)

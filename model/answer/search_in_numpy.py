@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from model.answer.fingers_on_plate import (
     CENTRE_AND_FOUR,
     MAX_FINGERS_BY_POINT,
-    FingerForms,
     FingersOnPlate,
 )
-from model.answer.over_duration import RingingUnderFingers, forms_of, forms_over, on_drawn_plates
+from model.answer.over_duration import RingingUnderFingers
 from model.answer.promised import promised
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
@@ -21,7 +20,6 @@ from model.choice import best_few, best_first, best_of
 from model.drive_modes import UNRESTRICTED
 from model.drive_modes.coherent import (
     NEARLY_HIGHEST,
-    CoherentResult,
     search,
     search_all,
     search_to_level,
@@ -32,8 +30,8 @@ from model.ensemble.draws import JUDGING_DRAWS, percentile
 from model.finger.perception import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
-MAX_DURING_EFFECT, MAX_ALONE = 3, 4
-"""Candidates of a short effect, and as many at their frequencies; without a quiet finger."""
+MAX_BY_POINT = 8
+"""Frequencies at which weights over a duration are searched by the points of fingertips, too."""
 
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
@@ -126,94 +124,51 @@ def _candidates(
     Of all ERAs together, or of each group whose clocks are held together.
     """
     count, hertz = len(contents.streams), fingers.table.frequencies
-    formed = fingers.forms(rows, with_fine=None in ringing)
+    every = np.arange(len(hertz)) if any(ringing) else rows
+    formed = fingers.forms(every, with_fine=True)
     apart_hz = contents.apart_hz if count > 1 else 0.0
     found: list[tuple[int, int, float, Drive]] = []
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
+        over = ringing[number] if others else None  # alone it may be as what lasts
         level = stream.level_db_sl + float(decibels(count))
+        rest = None if contents.background is None or others else contents.background[every]
+        lasting = formed.of(stream.targets, others, level, rest)
         for band, (low, end) in enumerate(stream.bands):
-            here = formed.at(np.flatnonzero((rows >= low) & (rows < end)))
-            rest = None if contents.background is None or others else contents.background[here.rows]
-            asked = here.of(stream.targets, others, level, rest)
-            if (over := ringing[number]) is not None:
-                short = _short_candidates(asked, here, stream.targets, others, over)
-                found += [(number, band, score, drive) for score, drive in short]
-                continue
+            here = np.flatnonzero(np.isin(every, rows) & (every >= low) & (every < end))
+            asked = _at(here, lasting, over)
             groups = [asked.among(each) for each in _groups(fingers.table)]
             searches = [(each, *search_to_level(each)) for each in groups]
             reaching = [each for each in searches if each[2] is each[0]]
             for own, searched, forms in reaching or searches:
                 is_limited |= len(searched.level_limited) > 0 or forms is not own
-                ways = [searched]
+                ways = [(here, searched)]
                 if 1 <= len(others) <= MAX_FINGERS_BY_POINT and searched.score.any():
-                    ways.append(search(here.by_point(forms, others)))
-                for way in ways:
-                    for each in _apart(way.score, hertz[here.rows], contents.candidates, apart_hz):
-                        drive = [(int(here.rows[each]), way.weights[each])]
+                    best = np.sort(best_first(searched.score)[:MAX_BY_POINT])
+                    some = here if over is None else here[best]
+                    tried = replace(lasting, wanted=forms.wanted, driven=forms.driven)
+                    tried = replace(tried, level_margin=forms.level_margin)
+                    by_point = formed.by_point(tried, others)
+                    ways.append((some, search(_at(some, by_point, over))))
+                for some, way in ways:
+                    at = every[some]
+                    for each in _apart(way.score, hertz[at], contents.candidates, apart_hz):
+                        drive = [(int(at[each]), way.weights[each])]
                         found.append((number, band, float(way.score[each]), drive))
     streams, bands, scores, drives = zip(*found, strict=True) if found else ((),) * 4
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
+
+
+def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> Forms:
+    """Forms at some frequencies, by index, of a stimulus that lasts or goes over a duration."""
+    return lasting.at(some) if over is None else over.forms(lasting, some)
 
 
 def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
     """Which ERAs may play one content together (n,), for each group of them."""
     groups = np.array(table.clocks.groups or [0] * len(table.eras))
     return [groups == each for each in np.unique(groups)]
-
-
-def _short_candidates(
-    steady: Forms,
-    formed: FingerForms,
-    targets: Sequence[int],
-    others: Sequence[int],
-    over: RingingUnderFingers,
-) -> list[tuple[float, Drive]]:
-    """The best tones over a duration, and at their frequencies those with the fingers' weight.
-
-    Ringing under the fingers takes too long to solve at every frequency. steady: forms to search
-    for a vibration that lasts.
-    """
-    count = MAX_DURING_EFFECT if others else MAX_ALONE
-    forms, best = _forms_over(steady, formed, targets, others, over), []
-    for is_driven in _groups(formed.fingers.table):
-        found, _ = search_to_level(forms.among(is_driven))
-        best += _drives_of(found, formed.rows, best_first(found.score)[:count])
-    if not others:
-        return best
-    rows = np.unique([row for _, ((row, _),) in best])
-    some, responses = np.searchsorted(formed.rows, rows), over.responses(rows)
-    during = forms_of(
-        steady.at(some), formed.at(some), targets, others, responses.fields(), responses.count
-    )
-    for is_driven in _groups(formed.fingers.table):
-        found = search_all(during.among(is_driven))
-        best += _drives_of(found, rows, np.arange(len(rows)))
-    return best
-
-
-def _forms_over(
-    steady: Forms,
-    formed: FingerForms,
-    targets: Sequence[int],
-    others: Sequence[int],
-    over: RingingUnderFingers | None,
-) -> Forms:
-    """Forms over a duration where there is one, and a finger that is to be quiet."""
-    if over is None or not others:
-        return steady
-    ringing = formed.fingers.table.ringing(over.duration)
-    return steady if ringing is None else forms_over(steady, formed, targets, others, ringing)
-
-
-def _drives_of(found: CoherentResult, rows: IntArray, some: IntArray) -> list[tuple[float, Drive]]:
-    """Tones at rows (f,) that reach the level, of some by index, with their scores."""
-    return [
-        (float(found.score[each]), [(int(rows[each]), found.weights[each])])
-        for each in some.tolist()
-        if found.score[each] > 0
-    ]
 
 
 def _switched_candidates(
@@ -225,12 +180,12 @@ def _switched_candidates(
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
-    formed = fingers.forms(rows, with_fine=by_point)
-    rest = None if contents.background is None else contents.background[rows]
-    forms = formed.of(stream.targets, quiet, stream.level_db_sl, rest)
-    forms = _forms_over(forms, formed, stream.targets, quiet, over)
+    every = np.arange(len(fingers.table.frequencies))
+    formed = fingers.forms(every, with_fine=by_point)
+    lasting = formed.of(stream.targets, quiet, stream.level_db_sl, contents.background)
     if by_point:
-        forms = formed.by_point(forms, quiet, CENTRE_AND_FOUR)
+        lasting = formed.by_point(lasting, quiet, CENTRE_AND_FOUR)
+    forms = _at(rows, lasting, over if quiet else None)
     groups = _groups(fingers.table)
     among = [forms.among(each) for each in groups]
     searches = [find_switched(each) for each in among]
@@ -276,9 +231,13 @@ def _judged(
     Over a duration that on the nominal plate. Also the amplitude (m, d) at its targets, and the
     squared one (m, k, d) at loudest points, those of several contents at the contents' levels.
     """
+    drives = [
+        drive if (over := ringing[stream]) is None else over.spectrum(drive)
+        for stream, drive in zip(found.streams.tolist(), found.drives, strict=True)
+    ]
     parts = [
-        fingers.felt(JUDGING_DRAWS, *tones_of(found.drives[first:][:_BATCH]))
-        for first in range(0, len(found.drives), _BATCH)
+        fingers.felt(JUDGING_DRAWS, *tones_of(drives[first:][:_BATCH]))
+        for first in range(0, len(drives), _BATCH)
     ]
     means = np.concatenate([part for part, _ in parts])
     loudest = np.concatenate([part for _, part in parts], dtype=float)
@@ -286,17 +245,7 @@ def _judged(
     for number, stream in enumerate(contents.streams):
         of, targets = np.flatnonzero(found.streams == number), [*stream.targets]
         own[of] = means[of][:, targets].min(axis=1)
-        if (over := ringing[number]) is None:
-            least[of] = percentile(own[of, 1:])
-        elif len(of):
-            drives = [found.drives[each] for each in of.tolist()]
-            responses = over.responses(np.unique([row for drive in drives for row, _ in drive]))
-            during = [responses.over(drive) for drive in drives]
-            gains = np.array([each.gains[targets].min() for each in during])
-            heard = np.array([each.heard.max(axis=1) for each in during])
-            loudest[of] = on_drawn_plates(loudest[of], heard, gains[:, None, None] ** 2)
-            own[of] *= gains[:, None]
-            least[of] = own[of, 0]
+        least[of] = percentile(own[of, 1:]) if ringing[number] is None else own[of, 0]
         if len(contents.streams) > 1:
             gain = contents.levels[number] / np.maximum(least[of], _TINY)
             own[of] *= gain[:, None]

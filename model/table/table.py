@@ -60,7 +60,6 @@ from model.structure.attachments import (
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
-from model.transients.ringing import RampedRinging, ramped_ringing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
@@ -70,9 +69,6 @@ DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 
 Steps of 2 Hz would promise 0.1 to 0.2 dB more and take twice as long (docs/decisions, 0037).
 """
-
-EFFECT_DURATIONS = (0.02, 0.04, 0.08, 0.16)
-"""Durations [s] of short effects for which the plate's ringing is kept; the nearest is taken."""
 
 PAPER_GRID = Grid(12, 9)
 
@@ -153,10 +149,6 @@ class LocalizationTable:
         """Number of `switched` patterns of one or two ERAs."""
         eras, f = len(self.eras), len(self.frequencies)
         return eras * f + math.comb(eras, 2) * f**2
-
-    def inherit_ringing(self, other: "LocalizationTable") -> None:
-        """Take what is prepared of ringing from a table of nearly the same plate."""
-        self._ringings.update(other._ringings)
 
     def with_clocks(self, clocks: ClockErrors) -> "LocalizationTable":
         """The table for amplifiers whose clocks are off; takes no time, all is shared."""
@@ -272,22 +264,6 @@ class LocalizationTable:
             contacts=fingers,
             attachment_shapes=np.vstack([self.attachment_shapes, shapes]),
         )
-
-    def ringing(self, duration: float) -> RampedRinging | None:
-        """Ringing over an effect of about a duration [s]; None where too few ERAs support it."""
-        nearest = min(EFFECT_DURATIONS, key=lambda each: abs(math.log(each / duration)))
-        if nearest not in self._ringings:
-            try:
-                self._ringings[nearest] = ramped_ringing(
-                    self.in_time, self.frequencies, ramp=nearest / 4, duration=nearest
-                )
-            except InputError:
-                self._ringings[nearest] = None
-        return self._ringings[nearest]
-
-    @cached_property
-    def _ringings(self) -> dict[float, RampedRinging | None]:
-        return {}
 
     @cached_property
     def thresholds(self) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.jsonrpc import ErrorCode
+from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
 from controller.effects.layout import default_effects
@@ -263,4 +263,15 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             await era.play("alert", ON_QUIET, level_db_sl=12)
             assert decided  # not with the next heartbeat
             assert await level_of("alert") == pytest.approx(12, abs=0.5)
+            steady = [(0.0, 1.0, 0.5), (30.0, 1.0, 0.5)]
+            for played, loop, level, words in (
+                ([*reversed(steady)], False, None, r"points\[1\] time_s must be 30 to 60, got 0"),
+                ([(0.0, 1.1, 0.5)], False, None, r"points\[0\] intensity must be 0 to 1"),
+                (steady, False, 20.1, "level of effect 'points' must be from -20 to 20"),
+                ("alert", True, None, "loop must be left out"),
+            ):
+                with pytest.raises(RpcError, match=words):
+                    await era.play(played, ON_QUIET, level_db_sl=level, loop=loop)
+            await era.play(steady, ON_QUIET, level_db_sl=12, loop=True)
+            assert await level_of("points") == pytest.approx(12, abs=0.5)
             assert (await era.status()).silence_reason is None

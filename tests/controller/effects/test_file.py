@@ -56,7 +56,9 @@ def test_taps_are_clicks_beside_what_lasts_at_their_times_levels_and_bands() -> 
 
     A click is not raised above what lasts, since its level is that of the file.
     """
-    player = player_of(it=file_of())
+    file = File(file="it.ahap")  # at 20 dB SL by default
+    file._pattern = PATTERN
+    player = player_of(it=file)
     play(player, 3.0)
     clicks = []
     for now in np.arange(3.0, 4.0, 0.005):

@@ -316,7 +316,7 @@ def test_twenty_fingers_take_little_memory(without_kernels):
     """In numpy, whose arrays are counted: less than a table, though the level is out of reach."""
     without_kernels()
     table = smooth_table()
-    prepare_answers(table, with_ringing=False)
+    prepare_answers(table)
     tracemalloc.start()
     answer(table, [wants(at, name="a", level_db_sl=60.0) for at in TWENTY])
     assert tracemalloc.get_traced_memory()[1] < 50e6

@@ -30,6 +30,7 @@ from era_haptics.tables import table as table
 from model.answer.answer import Answer as Answer
 from model.answer.answer import Layer as Layer
 from model.answer.answer import Sensation as Sensation
+from model.answer.course import Course as Course
 from model.answer.fingers import Finger as Finger
 from model.answer.fingers import Stimulus as Stimulus
 from model.answer.measures import Measures as Measures

@@ -246,15 +246,17 @@ export interface EffectsResult {
 
 /** Play an effect, or points, at the finger nearest to a position; they end when it lifts. */
 export interface PlayParams {
-  /** of the layout, or a named content; null where points are given */
+  /** of the layout, or a named content; null where points or taps are given */
   effect?: string | null;
   /** a finger must be within 20 mm of the position */
   x_m: number;
   y_m: number;
   /** from -20; at most, and by default, the effect's own; of points by default 20, at most the highest of the layout */
   level_db_sl?: number | null;
-  /** `[time_s, intensity, sharpness]` in order of time, from 0 to 60 s, 0 to 1 */
-  points?: Array<Array<number>> | null;
+  /** of what lasts: `[time_s, intensity, sharpness]` in order of time, 0 to 60 s, 0 to 1 */
+  points?: Array<Array<number>>;
+  /** short ones beside it, in the same way */
+  taps?: Array<Array<number>>;
   /** whether points or a file begin anew at their end */
   loop?: boolean;
 }

@@ -74,7 +74,7 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.Grid: {"nx": 4, "ny": 3},
     era.Stimulus: {
         "level_db_sl": 20.0, "band_hz": (40.0, 90.0), "duration": 0.04, "modulation_hz": None,
-        "name": "click",
+        "name": "click", "course": None,
     },
     era.Finger: {
         "at": TARGET, "stimulus": era.Stimulus(), "load": 1.0, "priority": 0, "sharing": "never",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
-from controller.play.pieces import LONGEST_STEP
+from controller.play.pieces import MAX_STEP
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
@@ -118,7 +118,7 @@ def playback_capabilities(
         envelope_support=envelope_support(rig, amplifiers),
         ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
         layers=min(one.capabilities["layers"] for one in amplifiers.values()),
-        course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=LONGEST_STEP),
+        course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=MAX_STEP),
     )
 
 
@@ -156,14 +156,14 @@ def _knots(
     return min(max(min(carried, default=0), 0), each)
 
 
-def _knots_of(amplifier: Amplifier, longest: float) -> int:
+def _knots_of(amplifier: Amplifier, max_step: float) -> int:
     """Return how many knots an envelope of an amplifier may have.
 
-    In steps from that of the model to a longest one [s].
+    In steps from that of the model to a longest one, max_step [s].
     """
     can = amplifier.capabilities
     low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
-    return int(can["knots"]) if low <= KNOT_STEP <= longest <= high else 0
+    return int(can["knots"]) if low <= KNOT_STEP <= max_step <= high else 0
 
 
 def _knots_on(line: Line, channels: list[int], within: float) -> int:

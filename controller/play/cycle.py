@@ -160,7 +160,7 @@ class Cycle:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
             played = await self.group.apply(
                 sets.by_amplifier,
-                (lambda: self._wake.is_set() and clock.now() < sets.gives_way_until)
+                (lambda: self._wake.is_set() and clock.now() < sets.preempted_until)
                 if sets.endings
                 else None,
             )

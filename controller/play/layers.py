@@ -109,7 +109,7 @@ class Sets:
     layers: those that change, by number; started: of these, those that play another content;
     endings: of those that play on, which get an ending; silence: ramp [s] along which all layers
     fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents
-    that a ledger does not admit, for a reason; retry_at [s]: when it may. gives_way_until [s]: when
+    that a ledger does not admit, for a reason; retry_at [s]: when it may. preempted_until [s]: when
     endings, among which are pieces of courses, are no longer preempted by a touch.
     """
 
@@ -121,7 +121,7 @@ class Sets:
     skipped: Sequence[Content] = ()
     reason: str = ""
     retry_at: float = math.inf
-    gives_way_until: float = math.inf
+    preempted_until: float = math.inf
 
     @cached_property
     def by_amplifier(self) -> dict[str, list[Layer]]:
@@ -258,7 +258,7 @@ class Layers:
                     playing=self._drive_of(number),
                     valid_for=self._lasts(content, _all_left(content, now), now),
                 )
-        sets = Sets(layers, endings=endings, gives_way_until=urgent - HELD / 2)
+        sets = Sets(layers, endings=endings, preempted_until=urgent - HELD / 2)
         if layers and (refusal := self.check(sets.by_amplifier)) is not None:
             self.not_renewed(sets, refusal)
             return Sets()

@@ -23,7 +23,7 @@ HELD = 0.1
 _AMID = 0.020  # s; between knots of a first piece that leads there from something else
 _FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces, the last one where knots are few
 
-LONGEST_STEP = _SHORTEST / 2
+MAX_STEP = _SHORTEST / 2
 """Time [s] between knots where an envelope has one."""
 
 _ROUNDING = 1e-9  # s

@@ -10,7 +10,7 @@ weights are searched and drawn plates judged.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -50,6 +50,8 @@ _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 
 _RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
 _TINY = 1e-30
+
+_LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
 
 
 def pulse_ramp(duration: float) -> float:
@@ -117,6 +119,11 @@ class DriveEnvelope:
         within = round(STRONGEST / course.step)
         return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
 
+    @property
+    def lasts(self) -> float:
+        """How long it is felt [s], what is steady apart."""
+        return self.within * self.step
+
     def moments(self, squares: FloatArray) -> FloatArray:
         """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
         sums = np.cumsum(squares, axis=0, dtype=float)
@@ -181,6 +188,7 @@ class RingingUnderFingers:
     places: tuple[Point, ...]
     loads: tuple[float, ...]
     envelope: DriveEnvelope
+    _solved: dict[tuple[tuple[int, bytes], ...], OverDuration] = field(default_factory=dict)
 
     @classmethod
     def of_streams(
@@ -249,6 +257,28 @@ class RingingUnderFingers:
             few=None if found.few is None else found.few * by_carrier,
             fine=None if found.fine is None else found.fine * by_carrier,
         )
+
+    def lasting_long_enough(self, some: IntArray) -> IntArray:
+        """Those of some of the table's frequencies whose spectrum does not reach 0; all, if none.
+
+        A drive of fewer periods moves the plate as a whole, which no frequency of a table tells.
+        """
+        hertz, envelope = self.table.frequencies[some], self.envelope
+        long = some if envelope.is_course else some[hertz * envelope.lasts >= _LEAST_PERIODS]
+        return long if len(long) else some
+
+    def over_drive(self, drive: Drive) -> OverDuration:
+        """What fingers feel of a drive, as `over`; solved once."""
+        hertz, strokes = self.table.frequencies, [era.stroke for era in self.table.eras]
+        key = tuple([(row, weights.tobytes()) for row, weights in drive])
+        if key not in self._solved:
+            self._solved[key] = self.over(
+                [
+                    (float(hertz[row]), np.multiply(weights, strokes, dtype=complex))
+                    for row, weights in drive
+                ]
+            )
+        return self._solved[key]
 
     def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
         """What fingers feel at their fine points of tones together.

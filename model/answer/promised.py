@@ -153,8 +153,8 @@ def _over_durations(
 
     By the energy of the tones in their spectrum, on each plate.
     """
-    power, harmonics, table = steady.copy(), harmonics.copy(), fingers.table
-    shares, strokes = fingers.tips.fine_weights, np.array([era.stroke for era in table.eras])
+    power, harmonics = steady.copy(), harmonics.copy()
+    shares = fingers.tips.fine_weights
     for tone, owner in enumerate(owners.tolist()):
         stream, over = contents.streams[owner], ringing[owner]
         if stream.duration is None:
@@ -164,9 +164,9 @@ def _over_durations(
             power[tone] *= factor
             harmonics[tone] *= factor
             continue
-        frequency, own = float(table.frequencies[rows[tone]]), [*stream.targets]
-        felt = over.over([(frequency, weights[tone] * strokes)])
-        near, beside = zip(*over.spectrum([(int(rows[tone]), weights[tone])]), strict=True)
+        own, drive = [*stream.targets], [(int(rows[tone]), weights[tone])]
+        felt = over.over_drive(drive)
+        near, beside = zip(*over.spectrum(drive), strict=True)
         energy = fingers.powers(PROMISED_DRAWS, np.array(near), np.array(beside)).sum(axis=0)
         lasting, nominal = (
             (shares[own] * np.sqrt(each[own, :, 0])).sum(axis=1) for each in (steady[tone], energy)

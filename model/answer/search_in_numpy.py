@@ -1,5 +1,6 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -12,7 +13,7 @@ from model.answer.fingers_on_plate import (
     MAX_FINGERS_BY_POINT,
     FingersOnPlate,
 )
-from model.answer.over_duration import RingingUnderFingers
+from model.answer.over_duration import RingingUnderFingers, on_drawn_plates
 from model.answer.promised import promised
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
@@ -32,6 +33,9 @@ from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_BY_POINT = 8
 """Frequencies at which weights over a duration are searched by the points of fingertips, too."""
+
+IN_TIME = 3
+"""Candidates of a pulse that are solved in time, the best by their energy."""
 
 _TINY = 1e-20
 _BATCH = 64  # candidates that are judged at once
@@ -137,6 +141,7 @@ def _candidates(
         lasting = formed.of(stream.targets, others, level, rest)
         for band, (low, end) in enumerate(stream.bands):
             here = np.flatnonzero(np.isin(every, rows) & (every >= low) & (every < end))
+            here = here if over is None else over.lasting_long_enough(here)
             asked = _at(here, lasting, over)
             groups = [asked.among(each) for each in _groups(fingers.table)]
             searches = [(each, *search_to_level(each)) for each in groups]
@@ -179,6 +184,7 @@ def _switched_candidates(
     Near the highest level where none reaches it; each of ERAs that may play one content together.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
+    rows = rows if over is None or not quiet else over.lasting_long_enough(rows)
     by_point = over is None and 1 <= len(quiet) <= MAX_FINGERS_BY_POINT
     every = np.arange(len(fingers.table.frequencies))
     formed = fingers.forms(every, with_fine=by_point)
@@ -245,7 +251,19 @@ def _judged(
     for number, stream in enumerate(contents.streams):
         of, targets = np.flatnonzero(found.streams == number), [*stream.targets]
         own[of] = means[of][:, targets].min(axis=1)
-        least[of] = percentile(own[of, 1:]) if ringing[number] is None else own[of, 0]
+        over, others = ringing[number], contents.others(number)
+        if over is not None and others and not over.envelope.is_course:
+            by_energy = own[of] / np.sqrt(loudest[of][:, others].max(axis=1))
+            order = of[best_first(percentile(by_energy))]
+            loudest[order[IN_TIME:]], some = math.inf, order[:IN_TIME]
+            tried = [found.drives[each] for each in some.tolist()]
+            lasting = fingers.felt(JUDGING_DRAWS, *tones_of(tried))[0][:, targets, 0].min(axis=1)
+            during = [over.over_drive(drive) for drive in tried]
+            gains = lasting * [each.gains[targets].min() for each in during] / own[some, 0]
+            heard = np.array([each.heard.max(axis=1) for each in during])
+            loudest[some] = on_drawn_plates(loudest[some], heard, gains[:, None, None] ** 2)
+            own[some] *= gains[:, None]
+        least[of] = percentile(own[of, 1:]) if over is None else own[of, 0]
         if len(contents.streams) > 1:
             gain = contents.levels[number] / np.maximum(least[of], _TINY)
             own[of] *= gain[:, None]

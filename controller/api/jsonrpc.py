@@ -17,8 +17,8 @@ from controller.api.schema import AmplifierSilence, Message
 from registry.wording import reworded
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
-MAX_OPENINGS = 80  # [ and { of a request: a touch frame has at most 67; bounds the depth too
-MAX_SEPARATORS = 500  # : and , of a request: a touch frame has at most 400
+MAX_OPENINGS = 510  # [ and { of a request: 500 points have 503; bounds the depth too
+MAX_SEPARATORS = 2100  # : and , of a request: 500 points have up to 2015
 _MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None

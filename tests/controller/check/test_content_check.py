@@ -85,6 +85,14 @@ def test_what_lasts_has_its_level_and_taps_theirs() -> None:
     assert found.delay <= 0.01
 
 
+def test_long_content_that_jumps_has_its_level() -> None:
+    """Five seconds of 20 dB SL, which a jump at their start does not change."""
+    pattern = Pattern(5.0, ((0.0, 0.0), (0.005, 1.0), (5.0, 1.0)))
+    found = check_content(pattern, table(), 20.0, at=AT)
+    assert np.median(found.given[: round(4.5 / found.step)]) == pytest.approx(20.0, abs=1.0)
+    assert found.kept_share > 0.95
+
+
 def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
     """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
     wanted = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])

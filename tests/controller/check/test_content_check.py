@@ -95,10 +95,10 @@ def test_long_content_that_jumps_has_its_level() -> None:
 
 def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
     """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
-    wanted = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
-    given = np.roll(wanted + np.where(np.arange(100) < 10, 4.0, 2.0), 3)
-    assert kept_shares(wanted, given, 5)[3] == pytest.approx(0.75)
-    assert kept_shares(wanted, given, 5).argmax() == 3
+    expected = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
+    given = np.roll(expected + np.where(np.arange(100) < 10, 4.0, 2.0), 3)
+    assert kept_shares(expected, given, 5)[3] == pytest.approx(0.75)
+    assert kept_shares(expected, given, 5).argmax() == 3
 
 
 def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:

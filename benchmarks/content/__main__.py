@@ -63,13 +63,13 @@ def _print_alone(patterns: "Sequence[Pattern]") -> bool:
 
     table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
     shares, lost = [], 0
-    for asked in patterns:
-        clicks = {each.time for each in rendered(asked, LEVEL_DB_SL, table.frequencies).clicks}
-        taps = [each for each in asked.transients if each.time in clicks]
-        lost += len(asked.transients) - len(taps)
+    for pattern in patterns:
+        clicks = {each.time for each in rendered(pattern, LEVEL_DB_SL, table.frequencies).clicks}
+        taps = [each for each in pattern.transients if each.time in clicks]
+        lost += len(pattern.transients) - len(taps)
         found = [
             check_content(each, table, LEVEL_DB_SL, at=AT)
-            for each in (asked, replace(asked, transients=tuple(taps)))
+            for each in (pattern, replace(pattern, transients=tuple(taps)))
         ]
         shares.append(
             [np.interp(delays, each.step * np.arange(len(each.kept)), each.kept) for each in found]

@@ -16,8 +16,8 @@ from controller.content.rendition import (
     SMOOTHING,
     Rendition,
     averaged,
-    level_wanted,
     rendered,
+    requested_level,
 )
 from model.answer.answer import Answer
 from model.answer.fingers import Finger, Stimulus
@@ -33,7 +33,7 @@ from model.transients.from_rest import from_rest
 from model.vibration.excitation import base_amplitudes
 
 TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
-"""What is within so many dB of what is wanted is kept; what is wanted counts within so many dB of
+"""What is within so many dB of what is expected is kept; that counts within so many dB of
 its highest; a plate may be late by so long [s], the same for all of a file."""
 
 _AFTER = 0.1  # s; followed after the end
@@ -75,7 +75,7 @@ class CheckedContent:
     """Content at a finger as it will be felt.
 
     duration [s]; parts: what lasts, if anything does, and the taps; lost: what was changed or left
-    out, in words; wanted, given (n,) [dB SL]: levels every `step` [s], root mean squares over
+    out, in words; expected, given (n,) [dB SL]: levels every `step` [s], root mean squares over
     20 ms; kept: shares of the time in which they agree, for delays of 0, 1, 2 ... steps.
     """
 
@@ -83,7 +83,7 @@ class CheckedContent:
     parts: tuple[Part, ...]
     lost: tuple[str, ...]
     step: float
-    wanted: FloatArray
+    expected: FloatArray
     given: FloatArray
     kept: FloatArray
 
@@ -94,21 +94,21 @@ class CheckedContent:
 
     @property
     def kept_share(self) -> float:
-        """Share of the time in which what is felt is within 3 dB of what is wanted, 0 to 1."""
+        """Share of the time in which what is felt is within 3 dB of what is expected, 0 to 1."""
         return float(self.kept.max())
 
     def as_json(self) -> dict[str, Any]:
         """Return it as `era content check --json` prints it."""
         every = max(round(KNOT_STEP / self.step), 1)
-        wanted, given = (
+        expected, given = (
             [round(each, 2) if np.isfinite(each) else None for each in levels[::every].tolist()]
-            for levels in (self.wanted, self.given)
+            for levels in (self.expected, self.given)
         )
         return {
             "kept_share": self.kept_share,
             "delay_s": self.delay,
             "lost": [*self.lost],
-            "level_db_sl": {"wanted": wanted, "given": given, "step_s": every * self.step},
+            "level_db_sl": {"requested": expected, "given": given, "step_s": every * self.step},
             "parts": [
                 {
                     "time_s": each.start,
@@ -124,10 +124,10 @@ class CheckedContent:
         }
 
 
-def kept_shares(wanted: FloatArray, given: FloatArray, count: int) -> FloatArray:
+def kept_shares(expected: FloatArray, given: FloatArray, count: int) -> FloatArray:
     """Shares of the time in which levels [dB] (n,) agree, for delays of what is given (count,)."""
-    counts = wanted > wanted.max() - RANGE_DB
-    late = [np.roll(given, -each)[counts] - wanted[counts] for each in range(count)]
+    counts = expected > expected.max() - RANGE_DB
+    late = [np.roll(given, -each)[counts] - expected[counts] for each in range(count)]
     return np.asarray(np.mean(np.abs(late) <= TOLERANCE_DB, axis=1))
 
 
@@ -156,11 +156,11 @@ def check_content(
     power = 2 * over_threshold(played.accelerations, rate, table.threshold) ** 2
     over = [averaged(each, 1 / rate, SMOOTHING) for each in power.T]
     given = decibels(fingertip_weights(*at, table.plate) @ np.sqrt(over))
-    power = 10 ** (level_wanted(pattern, level_db_sl, times) / 10)
-    wanted = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
-    kept = kept_shares(wanted, given, int(MAX_DELAY * rate) + 1)
+    power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
+    expected = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
+    kept = kept_shares(expected, given, int(MAX_DELAY * rate) + 1)
     lost = (*played.rendition.remarks, *_weaker(played.parts))
-    return CheckedContent(duration, played.parts, lost, 1 / rate, wanted, given, kept)
+    return CheckedContent(duration, played.parts, lost, 1 / rate, expected, given, kept)
 
 
 def play_content(
@@ -175,16 +175,16 @@ def play_content(
     rendition = rendered(pattern, level_db_sl, table.frequencies)
     if quiet:
         rendition = rendition.smoothed()
-    asked = [
+    stimuli = [
         (each.time, Stimulus(each.level_db_sl, each.band, CLICK_DURATION))
         for each in rendition.clicks
     ]
     if rendition.course is not None:
         lasting = Stimulus(rendition.level_db_sl, rendition.band, course=rendition.course)
-        asked.insert(0, (0.0, lasting))
+        stimuli.insert(0, (0.0, lasting))
     answered = partial(answer, table, quiet=quiet, drive_mode=DRIVE_MODES[-1])
-    found = {stimulus: answered([Finger(at, stimulus)]) for _, stimulus in asked}
-    parts = tuple(Part(start, each, found[each]) for start, each in asked)
+    found = {stimulus: answered([Finger(at, stimulus)]) for _, stimulus in stimuli}
+    parts = tuple(Part(start, each, found[each]) for start, each in stimuli)
     highest = max((each.frequency or 0.0 for each in parts), default=0.0)
     rate = max(_MIN_RATE, _RATE * highest)
     samples = (rendition.duration + _AFTER) * rate

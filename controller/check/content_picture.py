@@ -1,4 +1,4 @@
-"""Picture of checked content: level over time, wanted and felt, and what plays."""
+"""Picture of checked content: level over time, expected and felt, and what plays."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -7,19 +7,19 @@ from controller.check.content_check import RANGE_DB, TOLERANCE_DB, CheckedConten
 from controller.content.pattern import Pattern, along
 from controller.content.rendition import sharpness_hz
 
-_WANTED, _FELT = "#888888", "#0b5cad"
+_REQUESTED, _FELT = "#888888", "#0b5cad"
 
 
 def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
     """Draw level and frequency over time: of the file in grey, what is felt of it in blue."""
     figure = Figure(figsize=(8.0, 4.6), layout="constrained")
     levels, tones = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    times = np.asarray(checked.step * np.arange(len(checked.wanted)), dtype=float)
-    top = float(checked.wanted.max())
-    low, high = checked.wanted - TOLERANCE_DB, checked.wanted + TOLERANCE_DB
-    counts = checked.wanted > top - RANGE_DB
-    levels.fill_between(times, low, high, where=counts, color=_WANTED, alpha=0.3, lw=0)
-    levels.plot(times, checked.wanted, color=_WANTED, lw=1, label="asked, within 3 dB")
+    times = np.asarray(checked.step * np.arange(len(checked.expected)), dtype=float)
+    top = float(checked.expected.max())
+    low, high = checked.expected - TOLERANCE_DB, checked.expected + TOLERANCE_DB
+    counts = checked.expected > top - RANGE_DB
+    levels.fill_between(times, low, high, where=counts, color=_REQUESTED, alpha=0.3, lw=0)
+    levels.plot(times, checked.expected, color=_REQUESTED, lw=1, label="asked, within 3 dB")
     levels.plot(times - checked.delay, checked.given, color=_FELT, lw=1.2, label="felt")
     levels.set_ylim(top - RANGE_DB, top + 2 * TOLERANCE_DB)
     levels.set_ylabel("level / dB SL")
@@ -27,10 +27,10 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
         f"{100 * checked.kept_share:.0f} % kept, felt {1000 * checked.delay:.0f} ms later",
         fontsize=10,
     )
-    tones.plot(times, sharpness_hz(along(pattern.sharpness, times)), color=_WANTED, lw=1)
+    tones.plot(times, sharpness_hz(along(pattern.sharpness, times)), color=_REQUESTED, lw=1)
     sharpness = np.array([each.sharpness for each in pattern.transients])
     starts = [each.time for each in pattern.transients]
-    tones.plot(starts, sharpness_hz(sharpness), "x", color=_WANTED)
+    tones.plot(starts, sharpness_hz(sharpness), "x", color=_REQUESTED)
     for part in checked.parts:
         if part.frequency is not None:
             until = part.start + (part.stimulus.duration or 0.0)

@@ -117,9 +117,9 @@ def _lines(checked: "CheckedContent") -> Iterator[str]:
     late = round(checked.delay / checked.step)
     count = round(checked.duration / checked.step)
     for some in np.array_split(np.arange(count), min(_ROWS, count)):
-        wanted, felt = checked.wanted[some].max(), checked.given[some + late].max()
+        expected, felt = checked.expected[some].max(), checked.given[some + late].max()
         since, until = checked.step * some[0], checked.step * (some[-1] + 1)
-        yield f"{since:6.2f} {until:6.2f} {_level(wanted)} {_level(felt)}"
+        yield f"{since:6.2f} {until:6.2f} {_level(expected)} {_level(felt)}"
     yield f"felt {1000 * checked.delay:.0f} ms later"
     lasting = [each for each in checked.parts if each.stimulus.course is not None]
     taps = [each for each in checked.parts if each.stimulus.course is None]

@@ -85,7 +85,7 @@ class Rendition:
         return replace(self, course=course)
 
 
-def level_wanted(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
+def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
     """Levels [dB SL] that a pattern asks for at times [s] (n,), before anything of it is lost.
 
     level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
@@ -230,10 +230,10 @@ def _lost(
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
-        asked = hertz[shares > 0]
+        sounding = hertz[shares > 0]
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts: {asked.min():.0f} to "
-            f"{asked.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
+            f"sharpness of {100 * lost:.0f} % of what lasts: {sounding.min():.0f} to "
+            f"{sounding.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
             f"{band[1]:.0f} Hz"
         )
     if clicks:

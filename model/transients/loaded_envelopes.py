@@ -23,7 +23,10 @@ from model.arrays import ComplexArray, FloatArray
 from model.structure.attachments import Fingertip, coupled_forces
 from model.transients.time_response import PlateInTime
 
-_DAMPING = 5.0  # sigma times the period
+_DAMPING, _LONG_DAMPING = 5.0, 1.0
+"""Sigma times the period, by which what is late has grown: of what is long, whose spectrum is cut
+off, little, or what rings before a jump at the start would be all that is felt at the end."""
+
 _RESOLUTION, _LONG_BAND = 0.5, 60.0  # Hz; of what is long, to each side
 
 
@@ -44,13 +47,15 @@ def enveloped_accelerations(
     load. At the times of the envelope.
     """
     count = len(envelope)
-    growth = np.exp(_DAMPING / count * np.arange(count))
+    is_long = 1 / (count * step) < _RESOLUTION
+    damping = _LONG_DAMPING if is_long else _DAMPING
+    growth = np.exp(damping / count * np.arange(count))
     transform, nu = np.fft.fft(envelope / growth), np.fft.fftfreq(count, step)
     lines = np.sort(nu)
-    if 1 / (count * step) < _RESOLUTION:
+    if is_long:
         lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
     s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
-    s[:-1] += _DAMPING / (count * step)
+    s[:-1] += damping / (count * step)
     found = _held_by(plate, s, bases, frequency, points, fingers)
     steady = found[-1]
     transient = (found[:-1] - steady).astype(np.complex64)

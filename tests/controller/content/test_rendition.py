@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from controller.content.pattern import Pattern, Transient
-from controller.content.rendition import level_wanted, rendered
+from controller.content.rendition import rendered, requested_level
 
 EVERY_10_HZ = np.arange(40.0, 321.0, 10.0)
 SECOND = Pattern(1.0, ((0.0, 1.0), (1.0, 1.0)), ((0.0, 0.5),))
@@ -138,5 +138,5 @@ def test_wanted_levels_are_of_all_taps_and_of_what_lasts_between() -> None:
     taps = Transient(0.5, 1.0, 0.5), Transient(0.53, 0.5, 0.5)
     pattern = replace(SECOND, intensity=((0.0, 0.5), (1.0, 0.5)), transients=taps)
     times = np.array([0.2, 0.485, 0.5, 0.539, 0.55, 0.585, 1.2])
-    levels = level_wanted(pattern, 20.0, times)
+    levels = requested_level(pattern, 20.0, times)
     assert levels == pytest.approx([15.0, 9.0, 20.0, 20.0, 15.0, 9.0, -np.inf], abs=0.03)

@@ -119,7 +119,7 @@ class _Reading:
         self.count = 0  # points so far
         self._events: list[tuple[_Event, dict[str, float]]] = []
         self._controls: dict[str, list[Curve]] = {name: [] for name in _CONTROL}
-        self._left_out: Counter[str] = Counter()
+        self._skipped: Counter[str] = Counter()
         self._clamped: dict[str, list[float]] = {}
 
     def add(self, entry: _Entry) -> None:
@@ -138,12 +138,12 @@ class _Reading:
     def _add_event(self, event: _Event) -> None:
         self.count += 1
         if event.EventType.startswith("Audio"):
-            self._left_out["audio event"] += 1
+            self._skipped["audio event"] += 1
             return
         values = {name: default for name, (_, _, default) in _EVENT.items()}
         for each in event.EventParameters:
             if each.ParameterID not in _EVENT:
-                self._left_out["unknown parameter"] += 1
+                self._skipped["unknown parameter"] += 1
             elif each.ParameterValue is not None:
                 low, high, _ = _EVENT[each.ParameterID]
                 value = self._in_range(each.ParameterID, each.ParameterValue, low, high)
@@ -156,16 +156,16 @@ class _Reading:
         self.end = max(self.end, values["End"])
 
     def _add_control(
-        self, name: str, begin: float, points: tuple[tuple[float, _Value | _ControlPoint], ...]
+        self, name: str, start: float, points: tuple[tuple[float, _Value | _ControlPoint], ...]
     ) -> None:
         self.count += len(points)
         if name not in _CONTROL:
-            self._left_out["unknown parameter"] += 1
+            self._skipped["unknown parameter"] += 1
             return
         low, high, default = _CONTROL[name]
         curve = [
             (
-                begin + self._in_range("Time", time, 0.0, _MAX_TIME),
+                start + self._in_range("Time", time, 0.0, _MAX_TIME),
                 default
                 if each.ParameterValue is None
                 else self._in_range(name, each.ParameterValue, low, high),
@@ -204,26 +204,26 @@ class _Reading:
 
     def remarks(self) -> tuple[str, ...]:
         """Return in words what was left out and clamped."""
-        left_out = [f"{counted(n, what)} left out" for what, n in self._left_out.items()]
+        skipped = [f"{counted(n, what)} left out" for what, n in self._skipped.items()]
         clamped = [
             f"{name}: {counted(len(values), 'value')} out of range clamped, "
             f"from {min(values):g} to {max(values):g}"
             for name, values in self._clamped.items()
         ]
-        return (*left_out, *clamped)
+        return (*skipped, *clamped)
 
 
 def _segments(values: dict[str, float], controls: dict[str, _Control]) -> list[Segment]:
     """Return attack and plateau or decay, and release, of a continuous event."""
-    begin, end = values["Time"], values["End"]
+    start, end = values["Time"], values["End"]
     attack, decay, release = (
-        _seconds(values[f"{phase}Time"] + _at(controls[f"Haptic{phase}TimeControl"], begin))
+        _seconds(values[f"{phase}Time"] + _at(controls[f"Haptic{phase}TimeControl"], start))
         for phase in ("Attack", "Decay", "Release")
     )
     level, sharpness = values["HapticIntensity"], values["HapticSharpness"]
-    full = min(begin + attack, end)
-    top = level * (full - begin) / attack if attack else level
-    segments = [(begin, full, 0.0, top, sharpness, sharpness)]
+    full = min(start + attack, end)
+    top = level * (full - start) / attack if attack else level
+    segments = [(start, full, 0.0, top, sharpness, sharpness)]
     if values["Sustained"] >= 0.5:
         segments.append((full, end, top, top, sharpness, sharpness))
         segments.append((end, end + release, top, 0.0, sharpness, sharpness))
@@ -243,13 +243,13 @@ def _joined(pieces: list[Curve], default: float) -> _Control:
     """Return one curve of pieces, each of which goes on until the next begins."""
     times, values = [0.0], [default]
     for piece in sorted(pieces, key=lambda each: each[0][0]):
-        begin = piece[0][0]
-        kept = bisect_left(times, begin)
+        start = piece[0][0]
+        kept = bisect_left(times, start)
         before = values[max(kept - 1, 0)]
         if 0 < kept < len(times):
-            share = (begin - times[kept - 1]) / (times[kept] - times[kept - 1])
+            share = (start - times[kept - 1]) / (times[kept] - times[kept - 1])
             before += share * (values[kept] - before)
-        times[kept:] = [begin, *(time for time, _ in piece)]
+        times[kept:] = [start, *(time for time, _ in piece)]
         values[kept:] = [before, *(value for _, value in piece)]
     return times, values
 

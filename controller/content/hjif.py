@@ -118,9 +118,9 @@ class Hjif(ContentFormat):
             reading.add(band, (*path, "bands", index))
         validation.finish()
         others = [each.perception_modality for each in file.perceptions]
-        left_out = sorted({repr(each[:40]) for each in others if each not in _VIBRATION})
+        skipped = sorted({repr(each[:40]) for each in others if each not in _VIBRATION})
         remarks = (f"channel {channel} of {len(found)} read",) * (len(found) > 1)
-        remarks += (f"perceptions of {', '.join(left_out[:5])} left out",) * bool(left_out)
+        remarks += (f"perceptions of {', '.join(skipped[:5])} left out",) * bool(skipped)
         return reading.pattern(source, remarks)
 
 

@@ -55,13 +55,13 @@ class JsonDocument(Document):
 
     def line_of(self, path: KeyPath) -> int:
         """The line of a key or list entry, or of the nearest one above it if it is missing."""
-        begin = value = _skipped(self.text, 0)
+        start = value = _skipped(self.text, 0)
         for key in path:
             found = (where for name, *where in _entries(self.text, value) if name == key)
-            begin, value = next(found, (begin, -1))
+            start, value = next(found, (start, -1))
             if value < 0:
                 break
-        return _line(self.text, begin)
+        return _line(self.text, start)
 
 
 def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> JsonDocument:
@@ -119,11 +119,11 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _repeated(text: str, at: int, path: KeyPath) -> Iterator[tuple[int, KeyPath, int]]:
     """Yield the line, the path and the first line of every repeated key."""
     seen: dict[str | int, int] = {}
-    for key, begin, value in _entries(text, at):
+    for key, start, value in _entries(text, at):
         inner = (*path, key)
         if key in seen:
-            yield _line(text, begin), inner, _line(text, seen[key])
-        seen[key] = begin
+            yield _line(text, start), inner, _line(text, seen[key])
+        seen[key] = start
         yield from _repeated(text, value, inner)
 
 
@@ -148,12 +148,12 @@ def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:
     at = _skipped(text, at + 1)
     index = 0
     while text[at] != closing:
-        begin, key = at, index
+        start, key = at, index
         name: str | int = key
         if closing == "}":
             name, at = json.decoder.scanstring(text, at + 1)  # type: ignore[attr-defined]
             at = _skipped(text, _skipped(text, at) + 1)
-        yield name, begin, at
+        yield name, start, at
         at = _skipped(text, _DECODER.raw_decode(text, at)[1])
         at = _skipped(text, at + 1) if text[at] == "," else at
         index += 1

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cobs import cobs
@@ -395,6 +396,25 @@ def test_set_whose_reply_is_late_is_no_violation(
     assert result.result is Result.PASSED, result.reason
 
 
+@pytest.mark.parametrize(("name", "count"), [("doubled_frames", 22), ("events", 15)])
+def test_message_that_is_held_is_no_violation(
+    name: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of the first so many in turn, and all behind it, comes 100 ms late."""
+    send = JudgedLine._send
+    for held in range(count):
+        numbers = iter(range(10_000))
+
+        def sent(line: JudgedLine, data: bytes, held: int = held, at: Any = numbers) -> None:
+            if next(at) == held:
+                line._due = asyncio.get_running_loop().time() + 0.1
+            send(line, data)
+
+        monkeypatch.setattr(JudgedLine, "_send", sent)
+        (result,) = judged("serial", [name])
+        assert result.result is Result.PASSED, (held, result.reason)
+
+
 async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     """Those that only read; the keys of the report are a contract, and all frames are traced."""
     far, near = pty.openpty()
@@ -430,6 +450,8 @@ def test_report_says_the_worst() -> None:
     """One that failed makes all fail; a violation says what must be, and what was seen."""
     found = Violation("latch", expected=3, seen=4)
     assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
+    for empty in ("", set[int](), b""):
+        assert str(Violation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
     good = CheckResult(states.stop, 2, Result.PASSED)
     assert Report("x", 0.2, (bad, good), 0).overall == "failed"
@@ -583,6 +605,30 @@ def test_one_bad_capability_is_one_failure() -> None:
     not_run = {name for name, each in results.items() if each.result == "not_run"}
     assert not_run == {"onsets", "endings", "voices"}
     assert all("envelope_step_max" in results[name].reason for name in not_run)
+
+
+class _OtherClock(Amplifier):
+    """An amplifier that shows another clock than its own."""
+
+    def __init__(self, other: Callable[[int], int]) -> None:
+        super().__init__("other clock", channels=2)
+        self._other = other
+
+    def status(self, now: float) -> Values:
+        shown = super().status(now)
+        return {**shown, "clock": self._other(shown["clock"])}
+
+
+@pytest.mark.parametrize(
+    "other", [lambda clock: (clock & 0xFFFF) << 16 | clock >> 16, lambda clock: 7]
+)
+def test_clock_that_does_not_go_on_is_one_failure(other: Callable[[int], int]) -> None:
+    """Its words exchanged, or standing still: nothing is driven then, and each check says why."""
+    results = judged("serial", far=_OtherClock(other))
+    assert [each.check.name for each in results if each.result == "failed"] == ["clock_goes_on"]
+    driven = [each for each in results if each.check.drives]
+    assert {each.result for each in driven} == {Result.NOT_RUN}
+    assert all("clock" in each.reason for each in driven)
 
 
 def test_failed_reading_does_not_bar_what_drives() -> None:

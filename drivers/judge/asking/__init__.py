@@ -73,6 +73,7 @@ CHECKS: tuple[Check, ...] = (
     serial_frames.discarded_frames,
     *(modbus_frames.present_areas, modbus_frames.exceptions),
     *(can_frames.numbers, can_node.network_management, can_node.heartbeats),
+    can_node.emergencies,
     *(reading.events, reading.broadcasts, reading.mark, reading.addresses),
     *(sensors.measured, sensors.readings),
 )

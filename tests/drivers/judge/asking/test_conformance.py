@@ -270,6 +270,22 @@ async def test_check_says_that_the_time_of_the_run_is_used_up() -> None:
     assert late.reason.startswith("no verdict since the time of the run is used up: "), late.reason
 
 
+@in_virtual_time
+async def test_machine_that_was_late_once_has_a_verdict_on_voices(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By 1 s, beside replies of 9 ms and ramps of 0.7 s: what it leads by fits into these."""
+    monkeypatch.setattr("judged_line.DELAY", 0.0045)
+    far = varied()
+    far.capabilities.update(ramp_max=700)
+    line = JudgedLine("tcp", far)
+    line.client.lateness = 1.0
+    chosen = [each for each in of_kind("tcp") if each[1].name == "voices"]
+    (result,) = await run_checks(chosen, line.client, level=0.2)
+    line.close()
+    assert result.result is Result.PASSED, result.reason
+
+
 SLOW = {
     "serial": [
         *("lengths", "trips_amid_other_requests", "parts_of_sets", "sets_expire", "valid_for"),

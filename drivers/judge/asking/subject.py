@@ -530,7 +530,7 @@ class Subject(Material):
         end = max(end, clock.now() + min(few, 2 * self._read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
-        while clock.now() < end + few * (seen < 2):
+        while clock.now() < end + max(few, _SETTLING) * (seen < 2):
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)

@@ -10,6 +10,7 @@ from drivers.host.line import Line
 from drivers.ports.port import Port
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
+from drivers.wires.wire import Wire
 from registry.limits import GuardLimits
 
 
@@ -30,9 +31,13 @@ class _Opened:
 
 
 class Lines:
-    """The open lines of a host; amplifiers at one port, connection or bus share a line."""
+    """The open lines of a host; amplifiers at one port, connection or bus share a line.
 
-    def __init__(self) -> None:
+    before: those that it has closed, whose numbers of requests it goes on with.
+    """
+
+    def __init__(self, before: "Lines | None" = None) -> None:
+        self._wires: dict[str, Wire] = {} if before is None else before._wires
         self.is_closing = False
         """Whether their owner is closing them: what it opens meanwhile is opened by others."""
         self._opened: dict[str, _Opened] = {}
@@ -62,7 +67,7 @@ class Lines:
                 await opened.close()
                 opened = None
             if opened is None:
-                opened = await _open(address)
+                opened = await self._open(address)
                 if self._opened is not before:
                     await opened.close()
                     raise LinkError(f"{address.line} was closed while it was being opened")
@@ -80,6 +85,15 @@ class Lines:
             is_output=is_output,
         )
 
+    async def _open(self, address: WireAddress) -> _Opened:
+        line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
+        if (before := self._wires.get(address.line)) is not None:
+            line.wire.follow(before)
+        self._wires[address.line] = line.wire
+        port = await address.open_port(line.received, line.lose)
+        line.open(port)
+        return _Opened(line, port, address.settings)
+
     async def close(self) -> None:
         """Close all lines; disarm before, or vibrations last until the watchdogs trip.
 
@@ -94,10 +108,3 @@ class Lines:
             done, _ = await asyncio.wait(self._closing)
             for closing in done:
                 closing.result()
-
-
-async def _open(address: WireAddress) -> _Opened:
-    line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
-    port = await address.open_port(line.received, line.lose)
-    line.open(port)
-    return _Opened(line, port, address.settings)

@@ -91,7 +91,7 @@ async def measure(rig: Rig) -> list[str]:
     controller = Controller(
         rig,
         table,
-        lines=lambda: MemoryLines(rig, recorder.written),
+        lines=lambda before: MemoryLines(rig, recorder.written),
         intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(_LEVEL))),
         timing=Timing(table),
         watchdog=2.0,

@@ -58,7 +58,7 @@ class Daemon:
         manager: ServiceManager,
         dashboard: str | None,
         observe: Callable[[Observers], None] = lambda loop: None,
-        lines: Callable[[], Lines] = Lines,
+        lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
         self._config = config

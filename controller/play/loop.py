@@ -41,7 +41,7 @@ class Controller:
         rig: Rig,
         table: LocalizationTable,
         *,
-        lines: Callable[[], Lines],
+        lines: Callable[[Lines | None], Lines],
         intent_source: IntentSource,
         timing: Timing,
         urls: Mapping[str, str] | None = None,
@@ -63,6 +63,7 @@ class Controller:
             )
         self._make_lines = lines
         self._lines: Lines | None = None  # also after an attempt to open that has failed
+        self._before: Lines | None = None  # the last ones, also once they are closed
         self._opened: dict[str, Amplifier] = {}  # last, identified or not
         self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
         self._serial_numbers = dict(serial_numbers or {})
@@ -113,7 +114,7 @@ class Controller:
         cycle = self.cycle
         cycle.is_closed = False
         if self._lines is None or self._lines.is_closing:
-            self._lines = self._make_lines()
+            self._lines = self._before = self._make_lines(self._before)
         lines = self._lines
         try:
             async with cycle.sending:  # to those of before

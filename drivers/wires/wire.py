@@ -189,6 +189,13 @@ class Wire(Protocol):
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""
 
+    def follow(self, before: "Wire") -> None:
+        """Number requests on from those of the line as it was open before; before any request.
+
+        By default by numbers of its own, which amplifiers take.
+        """
+        return
+
     def transit(self, words: int) -> float:
         """Return how long a request of so many words takes to arrive [s]."""
 

@@ -47,6 +47,7 @@ def test_no_fault_is_stale() -> None:
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
     done = subprocess.run([*command, *tests], cwd=judge["ROOT"], capture_output=True, text=True)
     assert (done.returncode, done.stderr.splitlines()) == (0, [])
+    assert {*tests} <= {*done.stdout.splitlines()}  # one of several cases has its own name
 
 
 def test_quick_faults_are_found() -> None:

@@ -12,6 +12,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.ports.port import PORT_OPENER, Port
+from drivers.wires.can_bus.frames import unpack_frames
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 from word_wires import WORD_WIRES
@@ -95,6 +96,20 @@ async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
         with pytest.raises(LinkError, match="closed"):
             await each
     assert port.closed == port.opened
+
+
+@in_virtual_time
+async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
+    """An amplifier of a bus discards what has an older number, for 0.1 s: 1 follows 255."""
+    PORT_OPENER.set(SlowPort().open)
+    numbers, lines = list[int](), Lines()
+    for _ in range(2):
+        amplifier = await lines.amplifier("can+slcan:///dev/x#5", LIMITS, name="x")
+        sent = amplifier.line.wire.request(5, "GetStatus", {})
+        numbers.append(unpack_frames(sent)[0].data[0])
+        await lines.close()
+        lines = Lines(lines)
+    assert numbers[1] == numbers[0] % 255 + 1
 
 
 @pytest.mark.real_time

@@ -196,8 +196,10 @@ async def _fails_unheard(subject: Subject) -> None:
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     client.frames.clear()
     due = clock.now() + subject.shown.watchdog + _BEYOND
-    while not client.data_of("emergency") and clock.now() < due:
+    while clock.now() < due:
         await asyncio.sleep(_POLL)
+        if client.data_of("emergency"):
+            break
     client.put(cob_id("nmt"), bytes((CANOPEN["nmt"]["pre_operational"], client.address)))
     heard = client.data_of("emergency")
     state = (await read_object(client, 0x2002, 1))[0]

@@ -220,5 +220,7 @@ def sets_expire(subject: Subject) -> Rows:
         *others,
         # One that is confirmed once more lives no longer.
         *(last, part, last, outlive, send("Commit", token=3, code=_OLD), last),
-        *(partial(begin, others[0]), *others[1:], 0.55 * STAGED_LIFE, first, outlive, last),
+        partial(begin, others[0]),
+        *others[1:],
+        *(0.55 * STAGED_LIFE, first, outlive, last),
     ]

@@ -206,7 +206,7 @@ def sets_expire(subject: Subject) -> Rows:
     first, *others, last = _cut(subject, *long_set(subject), token=3)
     part, began = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1), 0.0
 
-    async def begin(row: Send) -> None:
+    async def start(row: Send) -> None:
         nonlocal began
         await subject.send(row)
         began = (await subject.status()).when.latest
@@ -216,11 +216,11 @@ def sets_expire(subject: Subject) -> Rows:
         await subject.pause(max(1.03 * STAGED_LIFE - lived, 0.0))
 
     return [
-        *(subject.arm, subject.one(), partial(begin, first), part),
+        *(subject.arm, subject.one(), partial(start, first), part),
         *others,
         # One that is confirmed once more lives no longer.
         *(last, part, last, outlive, send("Commit", token=3, code=_OLD), last),
-        partial(begin, others[0]),
+        partial(start, others[0]),
         *others[1:],
         *(0.55 * STAGED_LIFE, first, outlive, last),
     ]

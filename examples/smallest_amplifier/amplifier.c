@@ -341,7 +341,7 @@ static int handle(int type, const uint16_t *in, int bytes, double now, int *chan
     int count = (int)strlen(kind), feeds = kind[0] == 's', is_armed = state == ENABLED, code = 0;
     for (int i = 0; i < count; i++) {
         int word = in[i];
-        if (bytes < 2 * i + 2) return BAD_LENGTH;
+        if (bytes % 2 || bytes < 2 * i + 2) return BAD_LENGTH;
         if (kind[i] == 't' && !word) return BAD_TOKEN;
         if ((kind[i] == 's' && !word) || (kind[i] == 'w' && (word < 100 || word > 2000)) ||
             (kind[i] == 'r' && word > RAMP_MAX) || (kind[i] == 'l' && word > 15)) return BAD_VALUE;

@@ -45,8 +45,9 @@ __all__ = [
 ]
 
 CHECKS: tuple[Check, ...] = (
-    *(reading.identity, reading.capabilities, reading.starts_disarmed, reading.replies_in_time),
-    *(reading.unknown_types, reading.reading_changes_nothing, reading.hello_for_ever),
+    *(reading.identity, reading.capabilities, reading.starts_disarmed, clocks.clock_goes_on),
+    *(reading.replies_in_time, reading.unknown_types, reading.reading_changes_nothing),
+    reading.hello_for_ever,
     *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_node.objects),
     *(reading.lengths, states.stop, states.stop_ramps, states.silence_never_later),
     *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
@@ -72,6 +73,7 @@ CHECKS: tuple[Check, ...] = (
     serial_frames.discarded_frames,
     *(modbus_frames.present_areas, modbus_frames.exceptions),
     *(can_frames.numbers, can_node.network_management, can_node.heartbeats),
+    can_node.emergencies,
     *(reading.events, reading.broadcasts, reading.mark, reading.addresses),
     *(sensors.measured, sensors.readings),
 )

@@ -13,6 +13,8 @@ from drivers.judge.asking.client import (
     expect_equal,
     expect_one_of,
     expect_within,
+    require,
+    require_in_time,
 )
 from drivers.judge.asking.subject import Subject
 from drivers.judge.states import FAULT, OFF, REACTING
@@ -37,6 +39,7 @@ _STILL = "state", "fault", "latch", "token", "channels"
 """Words of a status that stay while nothing is asked of it."""
 _ABORT, _WRITTEN = 0x80, 0x60
 _TRIES, _POLL = 500, 0.001  # s
+_QUICK, _BEYOND = 0.003, 0.05  # s; for an exchange amid a fade; behind what is awaited
 
 
 async def _exchange(client: CanClient, data: bytes) -> bytes:
@@ -175,6 +178,39 @@ async def heartbeats(subject: Subject) -> None:
     cleared = [_EMERGENCY.pack(0, 0, OFF, NO_CHANNEL)]
     expect_equal(client.data_of("emergency"), cleared, "emergencies after Clear")
     await expect_objects(0, OFF)
+
+
+@driving("can.md#network-management", "can")
+async def emergencies(subject: Subject) -> None:
+    """It sends the emergency of a fault while it is PRE-OPERATIONAL, too."""
+    require(
+        subject.exchange_time <= _QUICK,
+        "the line is too slow to take it out of operation in the 5 ms of a fault",
+    )
+    await subject.in_time(partial(_fails_unheard, subject))
+
+
+async def _fails_unheard(subject: Subject) -> None:
+    """Take it out of operation amid the fade of a fault, between two emergencies."""
+    client = can_client(subject)
+    await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
+    client.frames.clear()
+    due = clock.now() + subject.shown.watchdog + _BEYOND
+    while clock.now() < due:
+        await asyncio.sleep(_POLL)
+        if client.data_of("emergency"):
+            break
+    client.put(cob_id("nmt"), bytes((CANOPEN["nmt"]["pre_operational"], client.address)))
+    heard = client.data_of("emergency")
+    state = (await read_object(client, 0x2002, 1))[0]
+    await asyncio.sleep(_BEYOND)
+    heard += client.data_of("emergency")
+    await client.command("start")
+    expect(bool(heard), "emergencies of a fault", expected="two", seen="none")
+    require_in_time(state == REACTING, "it was taken out of operation behind the fade of a fault")
+    states = [each[3] & 0xF for each in heard]
+    expect_equal(states, [REACTING, FAULT], "states in emergencies amid and behind that fade")
+    await subject.run([subject.settle, subject.clear])
 
 
 @reading("can.md#objects", "can")

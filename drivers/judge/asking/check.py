@@ -15,6 +15,7 @@ from drivers.judge.asking.client import (
     Finding,
     Late,
     Optional,
+    Untimed,
     Unusable,
     Violation,
     expect,
@@ -29,7 +30,6 @@ from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
 from registry import clock
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check
-_ARMED = "it is armed, perhaps by another host"
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
 Steps: TypeAlias = Callable[[Any], Awaitable[None] | Rows]
@@ -72,6 +72,11 @@ _RESULTS = {
     Unusable: Result.NOT_RUN,
 }
 """Of checks by what they found; all else has failed."""
+_BARS = {
+    Armed: "it is armed, perhaps by another host",
+    Untimed: "its clock does not go on with time, by which all that it does is judged",
+}
+"""Why nothing is driven once a check has found it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +223,8 @@ async def run_checks(
     for number, check in checks:
         if (took := clock.now() - began) > _MAX_TIME:
             why_none = why_none or f"the time of the run is used up: {took:.0f} s"
-        is_armed = any(isinstance(each.finding, Armed) for each in (*before, *results))
-        if why := _ARMED if check.drives and is_armed else why_none:
+        kinds = [type(each.finding) for each in (*before, *results)] if check.drives else []
+        if why := next((_BARS[each] for each in kinds if each in _BARS), why_none):
             result = CheckResult(check, number, Result.NOT_RUN, why)
         else:
             result, why_none = await _run(number, check, client, level)

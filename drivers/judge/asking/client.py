@@ -8,7 +8,7 @@ contract, nothing to check, or that it came too late.
 import asyncio
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -31,12 +31,17 @@ class Finding(Exception):
     seen = expected = sent = came = ""
 
 
+def _is_empty(value: object) -> bool:
+    return isinstance(value, Sized) and not value
+
+
 class Violation(Finding):
     """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
-        self.expected, self.seen = str(expected), f"{what}: {seen}"
-        super().__init__(f"{what} must be {expected}, got {seen}")
+        must, got = ("none" if _is_empty(each) else str(each) for each in (expected, seen))
+        self.expected, self.seen = must, f"{what}: {got}"
+        super().__init__(f"{what} must be {must}, got {got}")
 
 
 class NoReply(Violation):
@@ -49,6 +54,10 @@ class NoReply(Violation):
 
 class Armed(Violation):
     """It is armed, perhaps by another host: nothing is driven."""
+
+
+class Untimed(Violation):
+    """Its clock does not go on with time: nothing that plays can be judged."""
 
 
 class Optional(Finding):
@@ -345,6 +354,11 @@ class Client(ABC):
         await asyncio.sleep(self.quiet)
         heard, self.heard = self.heard, []
         return heard
+
+    async def reply_to(self, data: bytes) -> Heard | None:
+        """Send frames, and return what is heard first, None if nothing is, however late."""
+        self.write(data)
+        return await self.next(lambda each: True, self.timeout)
 
     def take(self, message: Heard, *, is_event: bool = False) -> None:
         """Keep a message that was heard."""

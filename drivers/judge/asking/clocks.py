@@ -3,8 +3,8 @@
 import asyncio
 from functools import partial
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect, expect_equal, require
+from drivers.judge.asking.check import driving, reading
+from drivers.judge.asking.client import Untimed, Violation, expect, require
 from drivers.judge.asking.material import Rows, send
 from drivers.judge.asking.subject import RATE, Subject
 from drivers.judge.outputs import DRIFT
@@ -24,28 +24,36 @@ def _require_known(subject: Subject) -> None:
     require(subject.can["clock_error"] != CLOCK_UNKNOWN, "it states no clock_error")
 
 
-async def _expect_steady(subject: Subject) -> None:
+async def _expect_steady(subject: Subject, otherwise: type[Violation] = Violation) -> None:
     """Require that its clock was where it must be by all that was read of it."""
     await subject.request("GetStatus")
-    wrong = f"{1e3 * subject.dating.error:.3g} ms"
-    expect_equal(wrong, "0 ms", "by how much readings of its clock contradict each other")
+    if (wrong := f"{1e3 * subject.dating.error:.3g} ms") != "0 ms":
+        what = "by how much readings of its clock contradict each other"
+        raise otherwise(what, expected="0 ms", seen=wrong)
+
+
+async def _read(subject: Subject, otherwise: type[Violation] = Violation) -> None:
+    low = set()
+    for at in range(_READINGS):
+        low.add((await subject.status())["clock"] % HIGH_STEPS)
+        await asyncio.sleep(_APART * (at % 7) / 7)
+    await _expect_steady(subject, otherwise)
+    is_coarse = subject.can["clock_error"] > QUANTITIES["clock_error"].to_wire(HIGH_TIME)
+    expect(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
+
+
+@reading(_PLACE)
+async def clock_goes_on(subject: Subject) -> None:
+    """It shows a clock that goes on by the time between two statuses: all else rests on that."""
+    _require_known(subject)
+    await _read(subject, Untimed)
 
 
 @driving(_PLACE)
-async def clock_readings(subject: Subject) -> None:
-    """It shows its clock as it is between request and reply, armed or not, for ever on."""
+def clock_readings(subject: Subject) -> Rows:
+    """It shows its clock as it is between request and reply, armed too, for ever on."""
     _require_known(subject)
-
-    async def read() -> None:
-        low = set()
-        for at in range(_READINGS):
-            low.add((await subject.status())["clock"] % HIGH_STEPS)
-            await asyncio.sleep(_APART * (at % 7) / 7)
-        is_coarse = subject.can["clock_error"] > QUANTITIES["clock_error"].to_wire(HIGH_TIME)
-        expect(is_coarse or len(low) > 1, "low word of the clock", expected="any", seen=low)
-        await _expect_steady(subject)
-
-    await subject.run([read, subject.arm, subject.one(), read])
+    return [subject.arm, subject.one(), partial(_read, subject)]
 
 
 @driving(_PLACE)

@@ -11,12 +11,13 @@ from drivers.judge.asking.material import Row, Rows, layer, play, send
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.sets import Command, Envelope
-from drivers.protocol.table import has_flag
+from drivers.protocol.table import QUANTITIES, has_flag
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange
 _LONG = 1.0  # s; in which errors of a phase add up
 _MAX_VOICES = 24  # that are tried
+_MOMENTS, _OTHER_SETS = 6, 8  # of sets, amid which the first fade lasts; of those that come beside
 _SHARES = 0.41, 0.1, 0.06  # of the test level, of the voices that are cut
 _LEFT = 0.0035, 0.0008  # s; that a fade has left which counts, and one which does not
 _BIT_15 = 1 << 15  # ms
@@ -78,7 +79,7 @@ def after(subject: Subject) -> Rows:
     """It starts commands with *after* once the onsets of the layer have ended, at once without."""
     first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
-    newer = layer(0, subject.tone(0, 0.75), after=True)
+    newer, over = layer(0, subject.tone(0, 0.75), after=True), _passed(subject, 3)
 
     async def achieved() -> None:
         answer = await subject.request("GetAchieved", layer=0)
@@ -87,10 +88,17 @@ def after(subject: Subject) -> Rows:
     return [
         (first, newer, waiting, send("Arm", watchdog=subject.can["watchdog_max"]), achieved),
         (subject.one(), waiting),
-        (first, waiting, layer(0), 0.2),
-        (first, waiting, subject.one(level=0.75), 0.2),
-        (first, waiting, send("Silence", ramp=0), 0.2),
+        (first, waiting, layer(0), over),
+        (first, waiting, subject.one(level=0.75), over),
+        (first, waiting, send("Silence", ramp=0), over),
     ]
+
+
+def _passed(subject: Subject, sets: int) -> float:
+    """Return how long after so many sets [s] the long onset of the first is over."""
+    onset = subject.long_onset
+    duration = onset.step * (len(onset.knots) + 1) / QUANTITIES["envelope_step"].per_unit
+    return max(duration + 0.02 - sets * subject.exchange_time, 0.0)
 
 
 @driving(_SETS)
@@ -143,7 +151,7 @@ def what_waits_for_an_onset(subject: Subject) -> Rows:
         (half, other, timed, beside),
         (play(half, sooner), play(timed, beside)),
         *([(together, timed)] if is_quarter else []),
-        (ends, replace(timed, valid_for=0), 0.25 * subject.slowness),
+        (ends, replace(timed, valid_for=0), _passed(subject, 2)),
         (replace(half, valid_for=subject.lasting(900)), timed, renewed),
     ]
 
@@ -277,12 +285,12 @@ async def phases(subject: Subject) -> None:
     """It counts phases on its clock: tones of one frequency interfere alike whenever they began."""
     await subject.arm()
     await subject.require_interference()
-    for channel in subject.channels:
-        first = layer(0, subject.tone(channel, 0.5, 30.0))
-        for number in subject.layers[1:]:
-            other = layer(number, subject.tone(channel, 0.5, 30.0 + 40.0 * number))
-            silent = [layer(each) for each in subject.layers[1:] if each != number]
-            await subject.run([play(first, other, *silent)])
+    first = layer(0, *(subject.tone(each, 0.5, 30.0) for each in subject.channels))
+    for number in subject.layers[1:]:
+        angle = 30.0 + 40.0 * number
+        tones = [subject.tone(each, 0.5, angle + 5.0 * each) for each in subject.channels]
+        silent = [layer(each) for each in subject.layers[1:] if each != number]
+        await subject.run([play(first, layer(number, *tones), *silent)])
     for phase, periods in ((0.0, 0.25), (0.0, 0.5), (90.0, 0.75), (180.0, 0.5)):
         time = periods * 20 / max(subject.lowest, _SLOW)
         await subject.in_time(partial(_expect_alike, subject, phase, time))
@@ -316,12 +324,16 @@ async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
 @driving(_PLACE)
 def voices(subject: Subject) -> Rows:
     """It has all its voices on each channel, and cuts no more, by 2 ms, than what fades longest."""
-    channels, others = sorted({0, subject.channels[-1]}), len(subject.layers) - 1
+    channels, last = sorted({0, subject.channels[-1]}), subject.layers[-1]
     count = min(subject.can["voices"], _MAX_VOICES)
-    fades = count - others
+    fades = count - last
     at_once, shape = subject.envelope(0.0001), subject.envelope(0.1, *[_SHARES[1]] * 8)
     pause = 0.004 + at_once.step / 10_000  # s; until a tone is at its level
-    time = (count + 3) * (subject.exchange_time + pause) + 6 * subject.lead
+    first, bulk = len(_SHARES), subject.layers[1:-1]
+    sets = first + max(math.ceil((fades - first) / len(bulk)), 0) + _OTHER_SETS
+    time = sets * (subject.exchange_time + pause)
+    lead = subject.lead(_MOMENTS, subject.can["ramp_max"] / 1000 - time)
+    time += _MOMENTS * lead
     subject.require_ramp(time)
     ramp = min(max(math.ceil(2500 * time), 200), subject.can["ramp_max"])
     ending = shape if shape.step * (len(shape.knots) + 1) >= 10 * ramp / 3 else None
@@ -333,21 +345,28 @@ def voices(subject: Subject) -> Rows:
         return [made(each, ending=ending) for each in channels]
 
     async def fade(number: int) -> None:
-        """Have tones fade before one that lasts: the first the longest, the next by its ending."""
-        for at in range(number + 1):
+        """Have tones fade before some that last: the first the longest, the next by its ending.
+
+        Those behind the few that are cut fade together, in as many layers as there are.
+        """
+        for at in range(min(number, first) + 1):
             await subject.play(layer(0, *tones(at, ending if at == 1 else None), ramp=ramp - at))
             await asyncio.sleep(pause)
             if at == 1 and ending:
                 await subject.play(layer(0))
+        for left in range(number - first, 0, -len(bulk)):
+            several = [(each, last + count + left + each) for each in bulk[:left]]
+            await subject.play(*(layer(each, *tones(at), ramp=ramp) for each, at in several))
+            await asyncio.sleep(pause)
 
     def from_a_moment(at: int) -> Row:
-        return partial(subject.at, layer(0, *tones(at), ramp=ramp))
+        return partial(subject.at, layer(0, *tones(at), ramp=ramp), lead=lead)
 
     async def count_until(left: float) -> None:
         """Begin a tone while the fade that began last has a time left [s]."""
-        apart = math.ceil(2000 * subject.lead)
-        await subject.at(layer(0, *tones(fades - 1), ramp=apart))
-        await subject.at(layer(0, *tones(fades), ramp=ramp), apart=apart / 1000 - left)
+        apart = math.ceil(2000 * lead)
+        await subject.at(layer(0, *tones(fades - 1), ramp=apart), lead=lead)
+        await subject.at(layer(0, *tones(fades), ramp=ramp), lead=lead, apart=apart / 1000 - left)
 
     look = partial(subject.follow, 0.015)
     cuts = [row for at in range(len(_SHARES)) for row in (from_a_moment(fades + at), look)]

@@ -212,6 +212,8 @@ async def events(subject: Subject) -> None:
     async def unasked() -> None:
         count = len(client.order)
         await asyncio.sleep(subject.shown.watchdog + _TRIPPED)
+        if is_stated and len(client.order) == count:
+            await asyncio.sleep(client.timeout)
         if is_stated:
             what = "Events of a watchdog that expires while nothing is asked"
             expect(len(client.order) > count, what, expected="one at least", seen="none")
@@ -312,7 +314,7 @@ async def mark(subject: Subject) -> None:
         await asyncio.sleep(_MARKED)
         when = subject.dating.interval(When(sent, sent + REACTION + client.transit))
         subject.shown.carry_out("Mark", {}, {}, when)
-        await subject.run([subject.ping, 0.1])
+        await subject.run([subject.ping, subject.status])
         expect_equal(len(client.heard), 0, "replies to a Mark for all")
 
 
@@ -340,9 +342,10 @@ async def addresses(subject: Subject) -> None:
     try:
         await subject.request("SetAddress", **right)
         await asyncio.sleep(_MOVED)
-        expect_equal(
-            await _is_at(client, own, tries=1), False, "whether it replies at its old address"
-        )
+        client.timeout, timeout = client.quiet, client.timeout
+        is_there = await _is_at(client, own, tries=1)
+        client.timeout = timeout
+        expect_equal(is_there, False, "whether it replies at its old address")
         if client.kind == "can":
             client.address = free  # at which a node does not listen before a start
             data = client.request(MESSAGES["GetStatus"].number, ())

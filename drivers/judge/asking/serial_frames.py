@@ -190,10 +190,10 @@ async def doubled_frames(subject: Subject) -> None:
     frames = [subject.client.request(_SET, words) for _, words in made]
     for (part, _), data in zip(made, frames, strict=True):
         began = clock.now()
-        await subject.client.send(data)
+        await subject.client.reply_to(data)
         subject.played(part, began)
     for at, pause in ((0, 0.0), (1, 0.25), (1, 0.0)):
-        await subject.client.send(frames[at])
+        await subject.client.reply_to(frames[at])
         await subject.run([subject.ping, pause])
 
 

@@ -204,13 +204,23 @@ def sets_expire(subject: Subject) -> Rows:
     """It discards a set that is not committed, or not complete, 1 s after its first part."""
     _require_quick(subject)
     first, *others, last = _cut(subject, *long_set(subject), token=3)
-    part = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1)
+    part, began = 0.45 * STAGED_LIFE - 3.5 * min(subject.exchange_time, 0.1), 0.0
+
+    async def start(row: Send) -> None:
+        nonlocal began
+        await subject.send(row)
+        began = (await subject.status()).when.latest
+
+    async def outlive() -> None:
+        lived = (await subject.status()).when.latest - began
+        await subject.pause(max(1.03 * STAGED_LIFE - lived, 0.0))
+
     return [
-        *(subject.arm, subject.one(), first, part),
+        *(subject.arm, subject.one(), partial(start, first), part),
         *others,
         # One that is confirmed once more lives no longer.
-        *(last, part, last, 1.03 * STAGED_LIFE - 2 * part),
-        *(send("Commit", token=3, code=_OLD), last),
-        *others,
-        *(0.55 * STAGED_LIFE, first, 0.48 * STAGED_LIFE, last),
+        *(last, part, last, outlive, send("Commit", token=3, code=_OLD), last),
+        partial(start, others[0]),
+        *others[1:],
+        *(0.55 * STAGED_LIFE, first, outlive, last),
     ]

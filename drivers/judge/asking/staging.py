@@ -15,7 +15,7 @@ _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
 _AROUND, _NEAR = 0.015, 0.0005  # s; of a moment, in which statuses are dense; that may be either
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
-_LONG = 0.2  # s; in which a rate of the clock shows
+_LONG, _BEHIND = 0.2, 0.02  # s; in which a rate of the clock shows; what was dropped, that it is
 
 
 @driving(_PLACE)
@@ -147,14 +147,15 @@ def what_waits_for_its_moment(subject: Subject) -> Rows:
         [stage(half), partial(subject.commit_in, left / 2)],
         [stage(half), send("Commit", token=3, code=_OLD), refused],
     ]
+    past = partial(subject.past_moment, _BEHIND)
     trips: Rows = [send("Arm", watchdog=subject.shortest_watchdog), subject.starve, subject.settle]
-    later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, 2 * left]
+    later = [waiting, partial(subject.commit_in, min(3 * left, 0.45)), *trips, past]
     # No status is read as it starts; its end counts from there.
     timed = subject.one(ramp=subject.ramp, valid_for=subject.lasting(100))
     unseen = stage(timed), partial(subject.commit_in, left)
     lefts = [left if len(each) > 1 else 0.6 * left for each in ends]
     courses = [
-        [waiting, partial(subject.commit_in, each), *rows, 1.25 * each]
+        [waiting, partial(subject.commit_in, each), *rows, past]
         for rows, each in zip(ends, lefts, strict=True)
     ]
     return [*courses, later, [*unseen, 1.25 * left]]

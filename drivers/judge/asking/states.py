@@ -172,7 +172,7 @@ def silence_never_later(subject: Subject) -> Rows:
         (subject.whole(), quick, slow),
         (subject.one(), fading, slow),
         # It is what is left of a fade that counts, not how long it was.
-        (subject.whole(), send("Stop", ramp=400), 0.3, send("Stop", ramp=200)),
+        (subject.whole(), send("Stop", ramp=300), 0.2, send("Stop", ramp=150)),
     ]
 
 
@@ -283,7 +283,8 @@ def what_feeds(subject: Subject) -> Rows:
         *(send("Set", **first), send("Set", **last)),  # another part is missing
         *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
     )
-    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (0.02, feed))]
+    apart = max(0.02 - subject.exchange_time, 0.0)  # s; until it shows that it was fed
+    return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (apart, feed))]
 
 
 @driving(_SESSIONS)

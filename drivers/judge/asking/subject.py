@@ -79,7 +79,7 @@ class Subject(Material):
         self.is_starving, self.is_at_rest = True, False
         self.sent_set: list[Sequence[int]] = []
         self.dating = Dating()
-        self._moment = 0  # at which a set started last, a high word of its clock
+        self._moment = 0  # of the Commit that named one last, a high word of its clock
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
         self.heard_at = clock.now()
@@ -400,26 +400,35 @@ class Subject(Material):
 
     async def commit_in(self, duration: float) -> int:
         """Commit the staged set for a moment a time [s] ahead of the last status; return that."""
-        at = self.moment(duration)
-        await self.request("Commit", token=self.token, at=at)
-        return at
+        self._moment = self.moment(duration)
+        await self.request("Commit", token=self.token, at=self._moment)
+        return self._moment
 
-    async def at(self, *layers: LayerSet, apart: float = 0.0) -> None:
+    async def at(self, *layers: LayerSet, lead: float, apart: float = 0.0) -> None:
         """Play a set from a moment of its clock on, a time [s] apart from the last such moment.
 
-        Raises Late where its Commit may have come behind that.
+        lead: how long before its moment its Commit is sent [s], where that is not apart from
+        another. Raises Late where its Commit may have come behind that.
         """
         await self.send(stage(*layers))
-        ahead_by = self._until_moment + apart if apart else self.lead
-        self._moment = await self.commit_in(ahead_by)
+        await self.commit_in(self._until_moment + apart if apart else lead)
         require_in_time(self._until_moment > HIGH_TIME, "a Commit came behind its moment")
-        while self._until_moment >= 0:
+        await self.past_moment()
+
+    async def past_moment(self, duration: float = 0.0) -> None:
+        """Read statuses until a time [s] after the moment of the last Commit that named one."""
+        while self._until_moment >= -duration:
             await self.status()
 
-    @property
-    def lead(self) -> float:
-        """How long before its moment a Commit is sent [s], by how late this run has been."""
-        return 2.5 * self.exchange_time + _LEAD + min(self.client.lateness, _MAX_LATENESS)
+    def lead(self, count: int, duration: float) -> float:
+        """How long before their moments some Commits are sent [s], which have a time [s] in all.
+
+        By how late this run has been, but at least what an exchange takes, so that a machine that
+        was late once leaves no amplifier without a verdict.
+        """
+        late = min(self.client.lateness, _MAX_LATENESS)
+        least = 2.5 * self.exchange_time + _LEAD
+        return max(least, min(least + late, duration / count))
 
     @property
     def _until_moment(self) -> float:
@@ -515,13 +524,13 @@ class Subject(Material):
         Raises Late where this machine was too slow to see what happens.
         """
         began = self.shown.outputs.began
-        end = self.shown.outputs.settled_at(clock.now()) + _SETTLING
+        end = self.shown.outputs.settled_at(began[1]) + _SETTLING
         end = end if duration is None else began[0] + duration
         few = min(2 * self.exchange_time, 2.0)  # of a slow line
-        end = max(end, clock.now() + min(few, 3 * self._read_time))
+        end = max(end, clock.now() + min(few, 2 * self._read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
-        while clock.now() < end + few * (seen < 2):
+        while clock.now() < end + max(few, _SETTLING) * (seen < 2):
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cobs import cobs
@@ -269,6 +270,22 @@ async def test_check_says_that_the_time_of_the_run_is_used_up() -> None:
     assert late.reason.startswith("no verdict since the time of the run is used up: "), late.reason
 
 
+@in_virtual_time
+async def test_machine_that_was_late_once_has_a_verdict_on_voices(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By 1 s, beside replies of 9 ms and ramps of 0.7 s: what it leads by fits into these."""
+    monkeypatch.setattr("judged_line.DELAY", 0.0045)
+    far = varied()
+    far.capabilities.update(ramp_max=700)
+    line = JudgedLine("tcp", far)
+    line.client.lateness = 1.0
+    chosen = [each for each in of_kind("tcp") if each[1].name == "voices"]
+    (result,) = await run_checks(chosen, line.client, level=0.2)
+    line.close()
+    assert result.result is Result.PASSED, result.reason
+
+
 SLOW = {
     "serial": [
         *("lengths", "trips_amid_other_requests", "parts_of_sets", "sets_expire", "valid_for"),
@@ -395,6 +412,25 @@ def test_set_whose_reply_is_late_is_no_violation(
     assert result.result is Result.PASSED, result.reason
 
 
+@pytest.mark.parametrize(("name", "count"), [("doubled_frames", 22), ("events", 15)])
+def test_message_that_is_held_is_no_violation(
+    name: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of the first so many in turn, and all behind it, comes 100 ms late."""
+    send = JudgedLine._send
+    for held in range(count):
+        numbers = iter(range(10_000))
+
+        def sent(line: JudgedLine, data: bytes, held: int = held, at: Any = numbers) -> None:
+            if next(at) == held:
+                line._due = asyncio.get_running_loop().time() + 0.1
+            send(line, data)
+
+        monkeypatch.setattr(JudgedLine, "_send", sent)
+        (result,) = judged("serial", [name])
+        assert result.result is Result.PASSED, (held, result.reason)
+
+
 async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     """Those that only read; the keys of the report are a contract, and all frames are traced."""
     far, near = pty.openpty()
@@ -430,6 +466,8 @@ def test_report_says_the_worst() -> None:
     """One that failed makes all fail; a violation says what must be, and what was seen."""
     found = Violation("latch", expected=3, seen=4)
     assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
+    for empty in ("", set[int](), b""):
+        assert str(Violation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
     good = CheckResult(states.stop, 2, Result.PASSED)
     assert Report("x", 0.2, (bad, good), 0).overall == "failed"
@@ -583,6 +621,30 @@ def test_one_bad_capability_is_one_failure() -> None:
     not_run = {name for name, each in results.items() if each.result == "not_run"}
     assert not_run == {"onsets", "endings", "voices"}
     assert all("envelope_step_max" in results[name].reason for name in not_run)
+
+
+class _OtherClock(Amplifier):
+    """An amplifier that shows another clock than its own."""
+
+    def __init__(self, other: Callable[[int], int]) -> None:
+        super().__init__("other clock", channels=2)
+        self._other = other
+
+    def status(self, now: float) -> Values:
+        shown = super().status(now)
+        return {**shown, "clock": self._other(shown["clock"])}
+
+
+@pytest.mark.parametrize(
+    "other", [lambda clock: (clock & 0xFFFF) << 16 | clock >> 16, lambda clock: 7]
+)
+def test_clock_that_does_not_go_on_is_one_failure(other: Callable[[int], int]) -> None:
+    """Its words exchanged, or standing still: nothing is driven then, and each check says why."""
+    results = judged("serial", far=_OtherClock(other))
+    assert [each.check.name for each in results if each.result == "failed"] == ["clock_goes_on"]
+    driven = [each for each in results if each.check.drives]
+    assert {each.result for each in driven} == {Result.NOT_RUN}
+    assert all("clock" in each.reason for each in driven)
 
 
 def test_failed_reading_does_not_bar_what_drives() -> None:

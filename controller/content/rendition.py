@@ -40,7 +40,7 @@ _TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 
 
 @dataclass(frozen=True)
-class Click:
+class Tap:
     """A transient: when it starts [s], its level [dB SL] and its band [Hz]."""
 
     time: float
@@ -63,7 +63,7 @@ class Rendition:
     level_db_sl: float
     band: Band
     modulation_hz: float | None
-    clicks: tuple[Click, ...]
+    clicks: tuple[Tap, ...]
     remarks: tuple[str, ...]
 
     def smoothed(self) -> "Rendition":
@@ -110,7 +110,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
     clicks = tuple(
-        Click(tap.time, level, _band(frequency, frequencies))
+        Tap(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
     )
     starts = np.array([each.time for each in clicks])
@@ -225,7 +225,7 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 
 
 def _lost(
-    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Tap]
 ) -> Iterator[str]:
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])

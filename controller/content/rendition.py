@@ -230,10 +230,10 @@ def _lost(
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
-        sounding = hertz[shares > 0]
+        of_file = hertz[shares > 0]
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts: {sounding.min():.0f} to "
-            f"{sounding.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
+            f"sharpness of {100 * lost:.0f} % of what lasts: {of_file.min():.0f} to "
+            f"{of_file.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
             f"{band[1]:.0f} Hz"
         )
     if clicks:

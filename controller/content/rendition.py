@@ -71,7 +71,7 @@ class Rendition:
         """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
 
         Its modulation stays. It starts from rest and ends at rest, within its duration. Bands reach
-        a third of an octave to each side: about as much as a finger tells, and 1 to 2 dB of contrast.
+        a third of an octave to each side: about what a finger tells, for 1 dB of contrast.
         """
         clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
         among = replace(self, band=_wider(self.band), clicks=clicks)

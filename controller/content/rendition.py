@@ -33,6 +33,7 @@ SMOOTHING = 0.020
 
 _APART = 0.060  # s; between the starts of clicks at least, as at different fingers
 _BAND = 0.1  # on each side of a frequency
+_WIDER = 2 ** (1 / 3) / (1 + _BAND)  # beside others: to a third of an octave on each side
 _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
 _MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
 _ROUNDING = 1e-9  # of times [s], and of counts of steps
@@ -69,10 +70,13 @@ class Rendition:
     def smoothed(self) -> "Rendition":
         """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
 
-        Its modulation stays. It starts from rest and ends at rest, within its duration.
+        Its modulation stays. It starts from rest and ends at rest, within its duration. Bands reach
+        a third of an octave to each side: about what a finger tells, for 1 dB of contrast.
         """
+        clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
+        among = replace(self, band=_wider(self.band), clicks=clicks)
         if self.course is None:
-            return self
+            return among
         times, shares = np.array(self.course.times), np.array(self.course.shares)
         texture = np.zeros(len(times))
         if self.modulation_hz is not None:
@@ -82,7 +86,7 @@ class Rendition:
         shares = averaged(shares - texture, times[1], SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
         course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
-        return replace(self, course=course)
+        return replace(among, course=course)
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
@@ -177,6 +181,11 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
     )
 
 
+def _wider(band: Band) -> Band:
+    """A band as it is beside others."""
+    return band[0] / _WIDER, band[1] * _WIDER
+
+
 def _as_tap(pattern: Pattern) -> Pattern:
     """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
     moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
@@ -233,8 +242,7 @@ def _lost(
         of_file = hertz[shares > 0]
         yield (
             f"sharpness of {100 * lost:.0f} % of what lasts: {of_file.min():.0f} to "
-            f"{of_file.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
-            f"{band[1]:.0f} Hz"
+            f"{of_file.max():.0f} Hz in the file, here one frequency near {sum(band) / 2:.0f} Hz"
         )
     if clicks:
         yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"

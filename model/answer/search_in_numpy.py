@@ -36,7 +36,7 @@ MAX_BY_POINT = 8
 IN_TIME = 3
 """Candidates of a pulse that are solved in time, the best by their energy."""
 
-_TINY, _LOUD = 1e-20, 1e20  # of powers
+_TINY, _TOO_LOUD = 1e-20, 1e12  # powers; of candidates that are out
 _BATCH = 64  # candidates that are judged at once
 
 
@@ -254,7 +254,7 @@ def _judged(
         if over is not None and others and not over.envelope.is_course:
             by_energy = own[of] / np.sqrt(loudest[of][:, others].max(axis=1))
             order = of[best_first(percentile(by_energy))]
-            loudest[order[IN_TIME:]], some = _LOUD, order[:IN_TIME]
+            loudest[order[IN_TIME:]], some = _TOO_LOUD, order[:IN_TIME]
             tried = [found.drives[each] for each in some.tolist()]
             lasting = fingers.felt(JUDGING_DRAWS, *tones_of(tried))[0][:, targets, 0].min(axis=1)
             during = [over.over_drive(drive) for drive in tried]

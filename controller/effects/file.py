@@ -53,7 +53,10 @@ class File(Effect):
         if self.file in named_contents():
             self._pattern = _named(self.file)
             return
-        path = (folder / self.file).resolve()
+        try:
+            path = (folder / self.file).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # links in a circle, no name of a file
+            raise InputError(f"file must name a file, got {self.file!a}: {error}") from error
         if not path.is_relative_to(folder.resolve()):
             raise InputError(
                 f"file must be in the folder of the layout, got {self.file}; copy it there"

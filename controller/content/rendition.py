@@ -227,10 +227,14 @@ def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
 
 def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     """The frequency [Hz] about whose band most of the energy is: its mean there."""
+    order = np.argsort(hertz, kind="stable")
+    ascending, below = hertz[order], np.append(0.0, np.cumsum(energy[order]))
     tried = np.geomspace(MIN_HZ, MAX_HZ, 60)
-    is_near = np.abs(hertz / tried[:, None] - 1) <= _BAND
-    best = is_near[best_of(is_near @ energy)]
-    return float(np.average(hertz[best], weights=energy[best]))
+    first = np.searchsorted(ascending, (1 - _BAND) * tried)
+    end = np.searchsorted(ascending, (1 + _BAND) * tried, side="right")
+    best = best_of(below[end] - below[first])
+    near = order[first[best] : end[best]]
+    return float(np.average(hertz[near], weights=energy[near]))
 
 
 def _lost(

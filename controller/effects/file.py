@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
-from controller.content.rendition import CLICK_DURATION, Tap, Rendition, rendered
+from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.play.intent import Pulse
 from controller.play.joint_answer import MAX_DB_SL

@@ -127,7 +127,6 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
     Of two frequencies that are nearly as good a click has the better one in time.
     """
     table, times = smooth_table(), np.linspace(0, 0.05, 51)
-    alike = []
     ramp = pulse_ramp(0.04)
     click = along(0.05, rise(times, ramp) - rise(np.asarray(times - 0.04), ramp))
     for target, *quiet in contact_sets(6, fingers=3, seed=8):

@@ -10,6 +10,7 @@ from controller.cli.play import pattern_of
 from model.commands.options import JsonOption, print_report
 from model.config.points import parse_point
 from model.counting import counted
+from model.errors import InputError
 from model.quantities import percent
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ def check(
     felt as they were made. Levels are means over 20 ms; taps that are left out are lost, lost
     sharpness is only mentioned. Exit status 1 if less than --least is kept.
     """
-    from controller.check.content_check import check_content
+    from controller.check.content_check import check_content, least_promise
+    from model.answer.answer import MIN_CONTRAST_DB
     from model.commands.options import Stopwatch
     from model.files.replacing import check_picture_name
     from model.table.file import load_table
@@ -76,6 +78,8 @@ def check(
     place = middle if at is None else parse_point(at, what="--at")
     others = [parse_point(each, what="--quiet") for each in quiet or []]
     pattern = pattern_of(file, channel)
+    if not (any(each for _, each in pattern.intensity) or pattern.transients):
+        raise InputError(f"{file}: is silent; there is nothing to check")
     with Stopwatch() as watch:
         checked = check_content(pattern, table, level, at=place, quiet=others)
     files = []
@@ -85,11 +89,18 @@ def check(
 
         save_figure(content_figure(pattern, checked), picture)
         files = [str(picture)]
-    is_kept = checked.kept_share >= least
+    is_kept, verdict = checked.kept_share >= least, "good"
+    promised = least_promise(checked.parts)
+    if not is_kept:
+        verdict = f"lost too much, at least {percent(least)} must be"
+    elif promised is not None and promised < MIN_CONTRAST_DB:
+        verdict = (
+            f"good, but other fingers feel much of it: {promised:.1f} dB promised above them, "
+            f"{MIN_CONTRAST_DB:g} dB or more are felt apart"
+        )
     rows = [
         *_lines(checked),
-        f"{file}: {percent(checked.kept_share)} kept, {'good' if is_kept else 'lost too much'}"
-        f"{'' if is_kept else f', at least {percent(least)} must be'}; "
+        f"{file}: {percent(checked.kept_share)} kept, {verdict}; "
         f"{pattern.duration:.2f} s of content in {watch.elapsed:.1f} s",
         *(f"wrote {name}" for name in files),
     ]

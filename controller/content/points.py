@@ -10,7 +10,7 @@ from controller.content.pattern import Pattern, Transient, along
 from model.errors import InputError
 
 MAX_GIVEN = 500
-"""Most points, and most taps: the bound of OpenXR; Android guarantees 16."""
+"""Most points and taps together: the bound of OpenXR; Android guarantees 16."""
 
 Given: TypeAlias = Sequence[Sequence[float]]
 """`[time_s, intensity, sharpness]` of each, in order of time."""
@@ -23,10 +23,8 @@ def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
 
     Raises InputError, with the index of one, for what is none.
     """
-    if not (len(points) <= MAX_GIVEN >= len(taps) and (points or taps)):
-        raise InputError(
-            f"points or taps must be 1 to {MAX_GIVEN}, got {len(points)} and {len(taps)}"
-        )
+    if not 1 <= (count := len(points) + len(taps)) <= MAX_GIVEN:
+        raise InputError(f"points and taps must be 1 to {MAX_GIVEN} together, got {count}")
     lasting, short = [*_checked("points", points)], [*_checked("taps", taps)]
     return Pattern(
         max([time for time, _, _ in (*lasting[-1:], *short[-1:])]),
@@ -41,20 +39,22 @@ def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
 
     Raises InputError for too many taps.
     """
-    if (count := len(pattern.transients)) > MAX_GIVEN:
-        raise InputError(f"taps must be up to {MAX_GIVEN}, got {count}; leave some out")
     taps = [(each.time, each.intensity, each.sharpness) for each in pattern.transients]
+    room = MAX_GIVEN - len(taps)
+    if room < (2 if pattern.intensity else 0):
+        raise InputError(f"taps must be up to {MAX_GIVEN - 2}, got {len(taps)}; leave some out")
     if not pattern.intensity:
         return [], taps
     times, levels = np.array(pattern.intensity).T
-    if len(levels) > MAX_GIVEN:
-        times = np.linspace(times[0], times[-1], MAX_GIVEN)
-        levels = along(pattern.intensity, times)
     between = np.setdiff1d([time for time, _ in pattern.sharpness], times)
-    within = between[(between > times[0]) & (between < times[-1])][: MAX_GIVEN - len(times)]
-    moments = np.append(times, within)
+    between = between[(between > times[0]) & (between < times[-1])]
+    moments = np.append(times, between)
     order = np.argsort(moments, kind="stable")
-    moments, levels = moments[order], np.append(levels, along(pattern.intensity, within))[order]
+    levels = np.append(levels, along(pattern.intensity, between))[order]
+    moments = moments[order]
+    if len(moments) > room:
+        moments = np.linspace(times[0], times[-1], room)
+        levels = along(pattern.intensity, moments)
     sharpness = along(pattern.sharpness, moments)
     return [*zip(moments.tolist(), levels.tolist(), sharpness.tolist(), strict=True)], taps
 

@@ -121,8 +121,8 @@ def test_points_and_taps_of_a_program() -> None:
     taps = (Transient(*tap),)
     assert pattern == Pattern(0.3, ((0, 0.5), (0.2, 1)), ((0, 1), (0.2, 0)), taps)
     for points, words in (
-        ([], "points or taps must be 1 to 500, got 0"),
-        ([(0, 0, 0)] * 501, "points or taps must be 1 to 500, got 501"),
+        ([], "points and taps must be 1 to 500 together, got 0"),
+        ([(0, 0, 0)] * 501, "points and taps must be 1 to 500 together, got 501"),
         ([(0, 0)], r"points\[0\] must be \[time_s, intensity, sharpness\], got 2 values"),
         ([(1, 0, 0), (0, 0, 0)], r"points\[1\] time_s must be 1 to 60, got 0"),
         ([(0, float("nan"), 0)], r"points\[0\] intensity must be 0 to 1, got nan"),
@@ -138,9 +138,9 @@ def test_points_are_given_of_a_pattern_whose_curves_have_their_own_times() -> No
     assert points == [(0, 0, 0), (0.1, 1, 0.5), (0.1, 0.5, 0.5), (0.2, 0.5, 1), (0.4, 0.5, 1)]
     assert taps == [(0.3, 1, 0)]
     rise = tuple((number / 1000, number / 2000) for number in range(2001))
-    many, _ = points_of(Pattern(2.0, rise))
-    assert len(many) == 500
-    assert max(abs(level - time / 2) for time, level, _ in many) < 1e-9
+    many, _ = points_of(Pattern(2.0, rise[::5], rise, (Transient(0.3, 1, 0),)))
+    assert len(many) == 499
+    assert max(abs(each - time / 2) for time, *both in many for each in both) < 1e-9
 
 
 def test_formats_are_listed() -> None:

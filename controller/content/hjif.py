@@ -24,6 +24,7 @@ from model.counting import counted
 
 _VIBRATION = ("Other", "Acceleration", "Vibration", "Vibrotactile", "Vibrotactile Texture")
 _RATE = 2000  # Hz, at which a curve is sampled
+_MAX_CURVES = 600.0  # s; of all curves of a file together, each a second longer
 _TRANSIENT_HZ = 90.0
 """Frequency of a transient that has none, as the reference encoder has it [Hz]."""
 
@@ -37,7 +38,7 @@ _RMS = {
 """Root mean square of a wave over that of a sine."""
 
 _Ticks = Annotated[float, Field(ge=0)]
-_Hz = Annotated[float, Field(ge=0)]
+_Hz = Annotated[float, Field(ge=0, le=1e6)]
 _Gain = Annotated[float, Field(ge=-1000, le=1000)]
 
 
@@ -113,7 +114,7 @@ class Hjif(ContentFormat):
             message = f"channel must be 1 to {len(found)}, got {channel}"
             raise refusal(source, message if found else "has no channel of vibration")
         path, perception, chosen = found[channel - 1]
-        reading = _Reading(validation, perception, chosen, 1 / file.timescale)
+        reading = _HjifReading(validation, perception, chosen, 1 / file.timescale)
         for index, band in enumerate(chosen.bands):
             reading.add(band, (*path, "bands", index))
         validation.finish()
@@ -124,7 +125,7 @@ class Hjif(ContentFormat):
         return reading.pattern(source, remarks)
 
 
-class _Reading:
+class _HjifReading:
     """Collects what a channel's bands ask for."""
 
     def __init__(
@@ -140,7 +141,7 @@ class _Reading:
         self._gain = abs(channel.gain) * 10**perception.perception_unit_exponent
         self._tick = tick
         self._count = self._moved = 0
-        self._end = 0.0
+        self._end = self._curves = 0.0
         self._segments: list[Segment] = []
         self._transients: list[Transient] = []
         self._remarks: tuple[str, ...] = ()
@@ -175,6 +176,10 @@ class _Reading:
                 return
             if problem := too_much(self._end, self._count):
                 self._validation.add(where, problem)
+                return
+            self._curves += (1 + times[-1] - times[0]) if times and band.band_type == "Curve" else 0
+            if self._curves > _MAX_CURVES:
+                self._validation.add(where, "has too many curves, or too long ones; leave some out")
                 return
             if times:
                 self._play(band, effect, times)

@@ -41,7 +41,7 @@ _TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 
 
 @dataclass(frozen=True)
-class Click:
+class Tap:
     """A transient: when it starts [s], its level [dB SL] and its band [Hz]."""
 
     time: float
@@ -64,7 +64,7 @@ class Rendition:
     level_db_sl: float
     band: Band
     modulation_hz: float | None
-    clicks: tuple[Click, ...]
+    clicks: tuple[Tap, ...]
     remarks: tuple[str, ...]
 
     def smoothed(self) -> "Rendition":
@@ -114,7 +114,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
     clicks = tuple(
-        Click(tap.time, level, _band(frequency, frequencies))
+        Tap(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
     )
     starts = np.array([each.time for each in clicks])
@@ -227,14 +227,18 @@ def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
 
 def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
     """The frequency [Hz] about whose band most of the energy is: its mean there."""
+    order = np.argsort(hertz, kind="stable")
+    ascending, below = hertz[order], np.append(0.0, np.cumsum(energy[order]))
     tried = np.geomspace(MIN_HZ, MAX_HZ, 60)
-    is_near = np.abs(hertz / tried[:, None] - 1) <= _BAND
-    best = is_near[best_of(is_near @ energy)]
-    return float(np.average(hertz[best], weights=energy[best]))
+    first = np.searchsorted(ascending, (1 - _BAND) * tried)
+    end = np.searchsorted(ascending, (1 + _BAND) * tried, side="right")
+    best = best_of(below[end] - below[first])
+    near = order[first[best] : end[best]]
+    return float(np.average(hertz[near], weights=energy[near]))
 
 
 def _lost(
-    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Tap]
 ) -> Iterator[str]:
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])

@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
-from controller.content.rendition import CLICK_DURATION, Click, Rendition, rendered
+from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.play.intent import Pulse
 from controller.play.joint_answer import MAX_DB_SL
@@ -53,7 +53,10 @@ class File(Effect):
         if self.file in named_contents():
             self._pattern = _named(self.file)
             return
-        path = (folder / self.file).resolve()
+        try:
+            path = (folder / self.file).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # links in a circle, no name of a file
+            raise InputError(f"file must name a file, got {self.file!a}: {error}") from error
         if not path.is_relative_to(folder.resolve()):
             raise InputError(
                 f"file must be in the folder of the layout, got {self.file}; copy it there"
@@ -130,7 +133,7 @@ class _FileRun(EffectRun):
         )
 
     def _click_of(
-        self, click: Click, pulse: Pulse, among_others: EffectStimulus | None
+        self, click: Tap, pulse: Pulse, among_others: EffectStimulus | None
     ) -> EffectStimulus:
         return EffectStimulus(
             None if self._is_limit else click.level_db_sl,

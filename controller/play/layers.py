@@ -95,6 +95,11 @@ class LayerContent:
     course_until: float = -math.inf
 
     @property
+    def is_amid_course(self) -> bool:
+        """Whether another piece of its course is to be sent."""
+        return self.content.course is not None and self.ending_due < math.inf
+
+    @property
     def settled_after(self) -> float:
         """How long [s] after the commit its ramp or onset has ended."""
         onset = self.layer.onset
@@ -163,7 +168,7 @@ class Layers:
         self._course_knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
         if not self._course_knots:
             why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
-            _logger.info("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
+            _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf
@@ -359,7 +364,10 @@ class Layers:
         self.is_silent, self._over = False, ()
 
     def ended(self, now: float) -> tuple[Content, ...]:
-        """Return the contents that have ended by themselves by a time [s], once."""
+        """Return the contents that have ended by themselves by a time [s], once.
+
+        Not those of which a piece is due, for which the host was late: they go on.
+        """
         over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
         fallen = {number for number in over if self.contents[number].is_falling}
         self.may_play -= fallen
@@ -367,7 +375,8 @@ class Layers:
         over = [number for number in over if number not in fallen]
         for number in over:
             self._change(number, drive={})
-        contents = tuple(self.contents[number].content for number in over)
+        late = {n for n in over if self.contents[n].is_amid_course}
+        contents = tuple(self.contents[number].content for number in over if number not in late)
         self._over = (*self._over, *contents)
         return contents
 

@@ -61,6 +61,7 @@ BLOCKED = (
 _UNANSWERED = (GIVEN_UP, BLOCKED)
 
 _NOTHING = Selection((), ())
+_SOON = 5.0  # s; of a course whose answer takes no longer than one of what lasts, nearly
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
 
 
@@ -107,6 +108,11 @@ def _targets_of(targets: Targets) -> set[Target]:
 
 def _of_any_level(targets: Targets) -> set[Target]:
     return {replace(target, level_db_sl=None) for _, target in targets}
+
+
+def _is_long(targets: Targets) -> bool:
+    """Whether any course is answered in more time than the control loop has."""
+    return any(each.course is not None and each.course.duration > _SOON for _, each in targets)
 
 
 def _of_any_course(targets: Targets) -> set[Target]:
@@ -277,7 +283,7 @@ class Selector:
             self.due = math.inf
             is_kept = is_kept and not self._is_limited  # by pulses that have ended
         if lasting:
-            takes_long = not is_alone(lasting, intended.protected)
+            takes_long = not is_alone(lasting, intended.protected) or _is_long(lasting)
         is_rested = is_due and is_kept and takes_long
         if is_rested and any(target.course for _, target in lasting):  # which no cross-fade follows
             is_rested = False

@@ -3,7 +3,6 @@
 from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -40,9 +39,10 @@ class Course:
                 f"a course must have 2 to {MAX_POINTS} times and as many shares, got "
                 f"{len(self.times)} and {len(self.shares)}"
             )
-        if self.times[0] != 0 or not all(one < after for one, after in pairwise(self.times)):
+        if self.times[0] != 0 or not (np.diff(self.times) > 0).all():
             raise InputError("times of a course must ascend from 0")
-        if not all(0 <= each <= 1 for each in self.shares):  # False for NaN
+        shares = np.array(self.shares)
+        if not ((shares >= 0) & (shares <= 1)).all():  # False for NaN
             raise InputError(
                 f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
                 f"{max(self.shares):g}"

@@ -43,7 +43,8 @@ rang after was up to 7 dB stronger on four ERAs, 18 dB on a large table.
 """
 
 _BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
-"""Distance of the frequencies beside its own that count of a drive, and the least share of one."""
+"""Distance of the frequencies beside its own that count of a drive, and the least share of one in
+the power of its strongest moments."""
 
 _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 """Steps [s] of pulses, and how many one has at most within its duration."""
@@ -227,7 +228,8 @@ class RingingUnderFingers:
             if key not in known:
                 known[key] = self.envelope.shares_at(off[near])
             np.add.at(found[own], rows[near], known[key])
-        found[found < _LEAST_SHARE] = 0.0
+        strongest = self.envelope.moments(self.envelope.values**2).max()
+        found[found < _LEAST_SHARE * strongest] = 0.0
         return found
 
     def spectrum(self, drive: Drive) -> Drive:

@@ -129,6 +129,14 @@ def test_level_over_time_is_that_of_the_wave(read: Read, seed: int) -> None:
             hjif([band("Transient", {"effect_type": "Composite"})]),
             r"effect_type: composite effects are not read",
         ),
+        pytest.param(  # 10 of a minute each: of ten thousand it would be minutes of work
+            hjif(
+                [band("Curve", *[{"effect_type": "Reference", "id": 3}] * 10)],
+                library=[effect(0, (0, 1, 90), (60_000, 1, 90), id=3)],
+            ),
+            r":\d+: .*effects\[9\]: has too many curves, or too long ones",
+            id="curves",
+        ),
     ],
 )
 def test_refusal_has_line_and_key(read: Read, given: dict[str, Any], words: str) -> None:

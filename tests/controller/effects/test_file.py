@@ -196,11 +196,23 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
         ("{kind: file, file: ../layout.ahap}", "must be in the folder of the layout"),
         ("{kind: file, file: /etc/hostname}", "must be in the folder of the layout"),
         ("{kind: file, file: link.ahap}", "must be in the folder of the layout"),
+        ("{kind: file, file: circle.ahap}", "must name a file"),
+        ('{kind: file, file: "a\\0b.ahap"}', "must name a file"),
         ("{kind: file, file: broken.ahap}", "broken.ahap:1"),
         ("{kind: file, file: door.ahap, channel: 2}", "channel must be left out"),
         ("{kind: file, file: door.txt}", "txt"),
     ],
-    ids=["missing", "above", "absolute", "link", "broken", "channel", "format"],
+    ids=[
+        "missing",
+        "above",
+        "absolute",
+        "link",
+        "circle",
+        "no name",
+        "broken",
+        "channel",
+        "format",
+    ],
 )
 def test_a_file_that_cannot_be_played_is_a_problem_of_its_layout(
     tmp_path: Path, effect: str, words: str
@@ -210,6 +222,7 @@ def test_a_file_that_cannot_be_played_is_a_problem_of_its_layout(
     folder.mkdir()
     (tmp_path / "layout.ahap").write_text(json.dumps(AHAP))
     (folder / "link.ahap").symlink_to(tmp_path / "layout.ahap")
+    (folder / "circle.ahap").symlink_to(folder / "circle.ahap")
     with pytest.raises(ConfigError) as caught:
         load_layout(write(folder, effect, door=AHAP, broken=[]), None)
     (problem,) = caught.value.problems

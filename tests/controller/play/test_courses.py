@@ -31,6 +31,7 @@ class FeelsCourse:
 
     course: Course
     loops: bool = False
+    tap: Pulse | None = None
     pulses: dict[float, Pulse] = field(default_factory=dict)
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
@@ -43,7 +44,9 @@ class FeelsCourse:
         if now >= pulse.end:
             return HapticIntent((), "the course has ended")
         target = Target(first.key, 20.0, pulse=pulse, course=self.course)
-        return HapticIntent((target,), until=pulse.end)
+        if self.tap is None or now >= self.tap.end:
+            return HapticIntent((target,), until=pulse.end)
+        return HapticIntent((target, Target(first.key, 14.0, pulse=self.tap)), until=self.tap.end)
 
     @property
     def started_at(self) -> float:
@@ -73,10 +76,16 @@ def expected(times: np.ndarray, course: Course = WAVE, full: float = FULL) -> np
     return full * np.interp(times, course.times, course.shares, left=0.0, right=0.0)
 
 
-def furthest(times: np.ndarray, levels: np.ndarray, early: float = WAY, late: float = WAY) -> float:
+def furthest(
+    times: np.ndarray,
+    levels: np.ndarray,
+    early: float = WAY,
+    late: float = WAY,
+    course: Course = WAVE,
+) -> float:
     """How far levels are from all that is due from so early [s] on until so late."""
     shifts = np.arange(-early, late + 1e-9, 0.0005)
-    due = np.array([expected(times - each) for each in shifts])
+    due = np.array([expected(times - each, course) for each in shifts])
     return float(np.maximum(due.min(axis=0) - levels, levels - due.max(axis=0)).max())
 
 
@@ -114,6 +123,25 @@ async def test_a_course_has_no_gap_while_the_host_is_late() -> None:
         chain.turning.set()
         times, levels = np.array(looks).T
         assert furthest(times - felt.started_at, levels) < ROUNDING
+
+
+@in_virtual_time
+async def test_a_course_goes_on_where_its_host_was_late_for_longer() -> None:
+    """By 0.6 s, beyond its end by itself: where it would be, also after a tap beside it."""
+    felt = FeelsCourse(Course((0.0, 0.1, 3.0), (0.0, 1.0, 0.5)))
+    async with set_running(knots=32, intent_source=felt, watchdog=2.0) as chain:
+        await looked_at(chain, 0.7, FINGER)
+        chain.turning.clear()
+        _, levels = await looked_at(chain, 0.6, FINGER)
+        assert levels[-1] == 0
+        chain.turning.set()
+        await looked_at(chain, 0.1, FINGER)
+        for _ in range(2):
+            times, levels = await looked_at(chain, 0.4, FINGER)
+            assert furthest(times - felt.started_at, levels, course=felt.course) < ROUNDING
+            felt.tap = Pulse(0.04, times[-1])
+            chain.controller.cycle.request_update()
+            await looked_at(chain, 0.1, FINGER)
 
 
 @in_virtual_time

@@ -11,7 +11,7 @@ from model.answer.course import Course
 from model.answer.fingers import Finger, Placement, Stimulus
 from model.answer.over_duration import DriveEnvelope, RingingUnderFingers, pulse_ramp
 from model.answer.plan import answer, query
-from model.arrays import FloatArray
+from model.arrays import FloatArray, Point
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
@@ -124,6 +124,7 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
     """Along its raised cosines, at the level of its 40 ms and its frequency: with its contrast.
 
     Up to 1.5 dB more: of a click the first 40 ms count at the target, of a course the strongest.
+    Of two frequencies that are nearly as good a click has the better one in time.
     """
     table, times = smooth_table(), np.linspace(0, 0.05, 51)
     ramp = pulse_ramp(0.04)
@@ -137,6 +138,22 @@ def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
         contrasts = [each.fingers[0].promised_contrast_db or 0.0 for each in (one, other)]
         assert contrasts[0] - 0.1 <= contrasts[1] <= contrasts[0] + 1.5
         assert other.fingers[0].level_db_sl == pytest.approx(level, abs=0.01)
+
+
+@pytest.mark.parametrize("quiet", [(), (QUIET,)], ids=["alone", "beside"])
+def test_a_course_that_stays_faint_is_answered_as_a_strong_one(quiet: tuple[Point, ...]) -> None:
+    """A fiftieth of it, 34 dB fainter, 34 dB above: all is linear, so it is the same drive."""
+    table, placed = smooth_table(), Placement((TARGET,), quiet)
+    found = []
+    for height in (1.0, 0.02):
+        course = along(1.0, np.array([0.0, height, 0.0]))
+        level = -14 - 20 * math.log10(height)
+        found.append(query(table, placed, level, course=course, drive_mode="phased"))
+    strong, faint = found
+    assert faint.layers[0].frequency == strong.layers[0].frequency
+    for name, tone in strong.layers[0].excitation.items():
+        other = faint.layers[0].excitation[name]
+        assert abs(0.02 * other.phasor / tone.phasor - 1) < 1e-3
 
 
 def test_promise_over_a_course_is_kept() -> None:

@@ -133,12 +133,12 @@ class _FileRun(EffectRun):
         )
 
     def _click_of(
-        self, click: Tap, pulse: Pulse, among_others: EffectStimulus | None
+        self, tap: Tap, pulse: Pulse, among_others: EffectStimulus | None
     ) -> EffectStimulus:
         return EffectStimulus(
-            None if self._is_limit else click.level_db_sl,
+            None if self._is_limit else tap.level_db_sl,
             pulse=pulse,
-            band=click.band,
+            band=tap.band,
             is_absolute=True,
             among_others=among_others,
         )

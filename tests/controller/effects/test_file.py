@@ -106,11 +106,13 @@ def test_a_loop_has_its_clicks_in_every_turn() -> None:
 def test_a_finger_that_is_alone_feels_the_file_as_it_is() -> None:
     """A step of intensity at 0.5 s lasts 5 ms alone, and 40 ms beside another finger.
 
-    By hand: an average over 20 ms at half height is 40 ms wide.
+    By hand: an average over 20 ms at half height is 40 ms wide. A tap has a wider band there: 58.5
+    and 80 Hz, moved by a third of an octave less 10 %.
     """
     step = Pattern(1.0, ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0), (0.9, 1.0)), ((0.0, 0.0),))
-    player = player_of(it=file_of(step))
+    player, player_with_tap = player_of(it=file_of(step)), player_of(it=file_of())
     play(player, 0.0)
+    play(player_with_tap, 0.0)
     rises = []
     for others in ((), (TWO,)):
         course = felt(player, 0.1, *others)[False].course
@@ -119,6 +121,9 @@ def test_a_finger_that_is_alone_feels_the_file_as_it_is() -> None:
         rises.append(int(((shares > 0.01) & (shares < 0.99)).sum()))
     assert rises[0] <= 5
     assert 25 <= rises[1] <= 40
+    among, lone = (felt(player_with_tap, 0.2, *each)[True].band for each in ((TWO,), ()))
+    assert among == pytest.approx((51.1, 91.6), abs=0.1)
+    assert lone == (58.5, 80.0)
     alone = felt(player, 0.2)[False]
     assert alone.course is not None
     assert alone.course.at(np.array([0.51]))[0] == 1.0

@@ -17,6 +17,8 @@ EXAMPLE = Path(era_haptics.__file__).parents[1] / "examples" / "modbus_server" /
 FAILED = {"pieces", "exceptions"}
 """What docs/how-to/write-an-amplifier.md says that the server cannot do."""
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings", "events"}
+BY_MACHINE = {"clock_rate"}
+"""What is skipped, with that reason, where exchanges are long on the machine of the test."""
 
 pytestmark = pytest.mark.real_time
 
@@ -55,4 +57,4 @@ async def test_conformance_finds_what_the_server_cannot_do(kind: str, drives: bo
     skipped = {each.check.name for each in report.results if each.result == "skipped"}
     names = {check.name for _, check in checks}
     assert set(failed) == names & FAILED, failed
-    assert skipped == names & SKIPPED
+    assert skipped - BY_MACHINE == names & SKIPPED

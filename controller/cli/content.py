@@ -10,7 +10,6 @@ from controller.cli.play import pattern_of
 from model.commands.options import JsonOption, print_report
 from model.config.points import parse_point
 from model.counting import counted
-from model.finger.perception import STRONG_DB_SL
 from model.quantities import percent
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def check(
     ] = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
-    ] = STRONG_DB_SL,
+    ] = 20.0,
     channel: Annotated[
         int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
     ] = None,

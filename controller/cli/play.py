@@ -9,7 +9,6 @@ from controller.cli.daemon import Socket, connected
 from model.commands.options import JsonOption, print_report
 from model.config.points import parse_point
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
 
 if TYPE_CHECKING:
     from controller.content.pattern import Pattern
@@ -95,6 +94,7 @@ def _simulate(
     from controller.check.content_check import play_content
     from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
     from model.finger.fingertip import fingertip_weights
+    from model.finger.perception import STRONG_DB_SL
     from model.table.file import load_table
 
     check_ending(output, ".wav", what="a sound")

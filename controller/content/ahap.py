@@ -93,7 +93,7 @@ class Ahap(ContentFormat):
         file = validation.finish()
         if file.Version >= 2:
             validation.add(("Version",), f"must be below 2, got {file.Version:g}")
-        reading = _Reading()
+        reading = _AhapReading()
         for index, entry in enumerate(file.Pattern):
             reading.add(entry)
             if problem := too_much(reading.end, reading.count):
@@ -111,7 +111,7 @@ class Ahap(ContentFormat):
         )
 
 
-class _Reading:
+class _AhapReading:
     """Collects events and parameters of a file, and what of them was clamped or left out."""
 
     def __init__(self) -> None:

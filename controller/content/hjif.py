@@ -114,7 +114,7 @@ class Hjif(ContentFormat):
             message = f"channel must be 1 to {len(found)}, got {channel}"
             raise refusal(source, message if found else "has no channel of vibration")
         path, perception, chosen = found[channel - 1]
-        reading = _Reading(validation, perception, chosen, 1 / file.timescale)
+        reading = _HjifReading(validation, perception, chosen, 1 / file.timescale)
         for index, band in enumerate(chosen.bands):
             reading.add(band, (*path, "bands", index))
         validation.finish()
@@ -125,7 +125,7 @@ class Hjif(ContentFormat):
         return reading.pattern(source, remarks)
 
 
-class _Reading:
+class _HjifReading:
     """Collects what a channel's bands ask for."""
 
     def __init__(

@@ -33,6 +33,7 @@ SMOOTHING = 0.020
 
 _APART = 0.060  # s; between the starts of clicks at least, as at different fingers
 _BAND = 0.1  # on each side of a frequency
+_WIDER = 2 ** (1 / 3) / (1 + _BAND)  # beside others: to a third of an octave on each side
 _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
 _MENTIONED = 0.05  # share of what lasts whose sharpness may be lost without a word
 _ROUNDING = 1e-9  # of times [s], and of counts of steps
@@ -40,7 +41,7 @@ _TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 
 
 @dataclass(frozen=True)
-class Click:
+class Tap:
     """A transient: when it starts [s], its level [dB SL] and its band [Hz]."""
 
     time: float
@@ -63,16 +64,19 @@ class Rendition:
     level_db_sl: float
     band: Band
     modulation_hz: float | None
-    clicks: tuple[Click, ...]
+    clicks: tuple[Tap, ...]
     remarks: tuple[str, ...]
 
     def smoothed(self) -> "Rendition":
         """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
 
-        Its modulation stays. It starts from rest and ends at rest, within its duration.
+        Its modulation stays. It starts from rest and ends at rest, within its duration. Bands reach
+        a third of an octave to each side: about what a finger tells, for 1 dB of contrast.
         """
+        clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
+        among = replace(self, band=_wider(self.band), clicks=clicks)
         if self.course is None:
-            return self
+            return among
         times, shares = np.array(self.course.times), np.array(self.course.shares)
         texture = np.zeros(len(times))
         if self.modulation_hz is not None:
@@ -82,7 +86,7 @@ class Rendition:
         shares = averaged(shares - texture, times[1], SMOOTHING) + texture
         shares *= rise(times, SMOOTHING) * rise(times[-1] - times, SMOOTHING)
         course = Course(self.course.times, tuple(np.clip(shares, 0, 1).tolist()))
-        return replace(self, course=course)
+        return replace(among, course=course)
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
@@ -110,7 +114,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
     clicks = tuple(
-        Click(tap.time, level, _band(frequency, frequencies))
+        Tap(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
     )
     starts = np.array([each.time for each in clicks])
@@ -177,6 +181,11 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
     )
 
 
+def _wider(band: Band) -> Band:
+    """A band as it is beside others."""
+    return band[0] / _WIDER, band[1] * _WIDER
+
+
 def _as_tap(pattern: Pattern) -> Pattern:
     """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
     moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
@@ -229,16 +238,15 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 
 
 def _lost(
-    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Click]
+    hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Tap]
 ) -> Iterator[str]:
     """What of what lasts is not played as the file has it."""
     away = (hertz < band[0]) | (hertz > band[1])
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
-        sounding = hertz[shares > 0]
+        of_file = hertz[shares > 0]
         yield (
-            f"sharpness of {100 * lost:.0f} % of what lasts: {sounding.min():.0f} to "
-            f"{sounding.max():.0f} Hz in the file, here one frequency of {band[0]:.0f} to "
-            f"{band[1]:.0f} Hz"
+            f"sharpness of {100 * lost:.0f} % of what lasts: {of_file.min():.0f} to "
+            f"{of_file.max():.0f} Hz in the file, here one frequency near {sum(band) / 2:.0f} Hz"
         )
     if clicks:
         yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"

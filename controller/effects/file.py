@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr
 
 from controller.content.formats import named_content, named_contents, read_content
 from controller.content.pattern import Pattern
-from controller.content.rendition import CLICK_DURATION, Rendition, rendered
+from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.play.intent import Pulse
 from controller.play.joint_answer import MAX_DB_SL
@@ -113,7 +113,7 @@ class _FileRun(EffectRun):
         self, alone: Rendition, among: Rendition, now: float, *, loop: bool, is_limit: bool
     ) -> None:
         self._pulse = Pulse(math.inf if loop else alone.duration, now, is_raised=False)
-        self._rendition, self._is_limit = alone, is_limit
+        self._alone, self._among, self._is_limit = alone, among, is_limit
         among_others = self._lasting_of(among, None)
         self._lasting = self._lasting_of(alone, among_others)
         self._started = 0  # clicks
@@ -132,16 +132,27 @@ class _FileRun(EffectRun):
             among_others=among_others,
         )
 
+    def _click_of(
+        self, click: Tap, pulse: Pulse, among_others: EffectStimulus | None
+    ) -> EffectStimulus:
+        return EffectStimulus(
+            None if self._is_limit else click.level_db_sl,
+            pulse=pulse,
+            band=click.band,
+            is_absolute=True,
+            among_others=among_others,
+        )
+
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return what lasts, and the click that is due, if any."""
         if now >= self._pulse.end:
             return None
         while now >= self._next_click():
-            click = self._rendition.clicks[self._started % len(self._rendition.clicks)]
+            number = self._started % len(self._alone.clicks)
             self._started += 1
             pulse = Pulse(CLICK_DURATION, now)
-            level = None if self._is_limit else click.level_db_sl
-            self._click = EffectStimulus(level, pulse=pulse, band=click.band, is_absolute=True)
+            among_others = self._click_of(self._among.clicks[number], pulse, None)
+            self._click = self._click_of(self._alone.clicks[number], pulse, among_others)
         until = min(self._next_click(), self._pulse.end)
         if self._click is not None and self._click.pulse is not None:
             if now < self._click.pulse.end:
@@ -155,7 +166,7 @@ class _FileRun(EffectRun):
 
     def _next_click(self) -> float:
         """When [s] the next click starts; infinite for none."""
-        found, count = self._rendition, len(self._rendition.clicks)
+        found, count = self._alone, len(self._alone.clicks)
         if not count or (self._started >= count and self._pulse.duration < math.inf):
             return math.inf
         turns, number = divmod(self._started, count)

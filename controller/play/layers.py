@@ -163,7 +163,7 @@ class Layers:
         self._course_knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
         if not self._course_knots:
             why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
-            _logger.info("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
+            _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf

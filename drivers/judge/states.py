@@ -169,8 +169,10 @@ class ExpectedStates:
         here = self.state or 0
         if here not in _FALLING:
             return [0, OFF] if here == STATES["NOT_READY"] else [here]
-        may_be_silent = when[1] > self.silent[0] - ROUNDED - self.slack
-        return [here] * (not self._is_silent(when)) + [_FALLING[here]] * may_be_silent
+        states = [] if self._is_silent(when) else [here]
+        if when[1] > self.silent[0] - ROUNDED - self.slack:
+            states.append(_FALLING[here])
+        return states
 
     def _rule_against(self, now: int) -> str:
         """Which rule a state breaks."""

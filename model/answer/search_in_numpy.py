@@ -1,6 +1,5 @@
 """Tones of contents in numpy: where there is no compiler, and what the kernel in C must find."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -37,7 +36,7 @@ MAX_BY_POINT = 8
 IN_TIME = 3
 """Candidates of a pulse that are solved in time, the best by their energy."""
 
-_TINY = 1e-20
+_TINY, _TOO_LOUD = 1e-20, 1e12  # powers; of candidates that are out
 _BATCH = 64  # candidates that are judged at once
 
 
@@ -255,7 +254,7 @@ def _judged(
         if over is not None and others and not over.envelope.is_course:
             by_energy = own[of] / np.sqrt(loudest[of][:, others].max(axis=1))
             order = of[best_first(percentile(by_energy))]
-            loudest[order[IN_TIME:]], some = math.inf, order[:IN_TIME]
+            loudest[order[IN_TIME:]], some = _TOO_LOUD, order[:IN_TIME]
             tried = [found.drives[each] for each in some.tolist()]
             lasting = fingers.felt(JUDGING_DRAWS, *tones_of(tried))[0][:, targets, 0].min(axis=1)
             during = [over.over_drive(drive) for drive in tried]

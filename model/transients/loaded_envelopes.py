@@ -10,7 +10,7 @@ their dynamic stiffness D, they hold the plate by the forces
 The demodulated response less its quasi-static part, which a slow envelope would give, is inverted
 on a line s = i omega + sigma + i nu by a discrete Fourier transform: what comes after the time that
 is followed returns as exp(-sigma period). For long envelopes the plate is solved every half hertz,
-linear between, and as far as smooth ones have a spectrum.
+linear between, and as far as smooth ones have a spectrum, which ends along a raised cosine.
 """
 
 import math
@@ -23,11 +23,13 @@ from model.arrays import ComplexArray, FloatArray
 from model.structure.attachments import Fingertip, coupled_forces
 from model.transients.time_response import PlateInTime
 
-_DAMPING, _LONG_DAMPING = 5.0, 1.0
-"""Sigma times the period, by which what is late has grown: of what is long, whose spectrum is cut
-off, little, or what rings before a jump at the start would be all that is felt at the end."""
+_DAMPING = 5.0  # sigma times the period, by which what is late has grown
 
-_RESOLUTION, _LONG_BAND = 0.5, 60.0  # Hz; of what is long, to each side
+_RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; of what is long, to each side
+
+_GUARD = 12
+"""Steps after the end that are left out: before a jump at the start the plate seems to ring, for no
+spectrum is without an end, and that comes round there, where it has grown most."""
 
 
 def enveloped_accelerations(
@@ -46,29 +48,28 @@ def enveloped_accelerations(
     whose values are a step [s] apart; points (p, r): shapes; fingers: shape (r,) under each and its
     load. At the times of the envelope.
     """
+    asked, envelope = len(envelope), np.pad(envelope, (0, _GUARD))
     count = len(envelope)
-    is_long = 1 / (count * step) < _RESOLUTION
-    damping = _LONG_DAMPING if is_long else _DAMPING
-    growth = np.exp(damping / count * np.arange(count))
+    growth = np.exp(_DAMPING / count * np.arange(count))
     transform, nu = np.fft.fft(envelope / growth), np.fft.fftfreq(count, step)
     lines = np.sort(nu)
-    if is_long:
+    if 1 / (count * step) < _RESOLUTION:
         lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
     s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
-    s[:-1] += damping / (count * step)
+    s[:-1] += _DAMPING / (count * step)
     found = _held_by(plate, s, bases, frequency, points, fingers)
     steady = found[-1]
-    transient = (found[:-1] - steady).astype(np.complex64)
+    ends = np.sin(np.pi * np.minimum(1 - np.abs(lines / lines[0]), 0.5)) ** 2
+    transient = ((found[:-1] - steady) * ends[:, None]).astype(np.complex64)
     is_near = np.abs(nu) <= lines[-1]
     after = np.clip(np.searchsorted(lines, nu[is_near]), 1, len(lines) - 1)
     share = ((lines[after] - nu[is_near]) / (lines[after] - lines[after - 1])).astype(np.float32)
     between = share[:, None] * transient[after - 1] + (1 - share[:, None]) * transient[after]
     every = np.zeros((count, len(steady)), dtype=np.complex64)
     every[is_near] = transform[is_near, None].astype(np.complex64) * between
-    found = np.append(fft.ifft(every, axis=0), steady[None], axis=0)
-    found[:-1] *= growth[:, None].astype(np.float32)
-    found[:-1] += envelope[:, None].astype(np.float32) * found[-1]
-    return found
+    found = fft.ifft(every, axis=0) * growth[:, None].astype(np.float32)
+    found += envelope[:, None].astype(np.float32) * steady.astype(np.complex64)
+    return np.append(found[:asked], steady[None], axis=0)
 
 
 def _held_by(

@@ -197,7 +197,17 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
         ("{kind: file, file: door.ahap, channel: 2}", "channel must be left out"),
         ("{kind: file, file: door.txt}", "txt"),
     ],
-    ids=["missing", "above", "absolute", "link", "circle", "no name", "broken", "channel", "format"],
+    ids=[
+        "missing",
+        "above",
+        "absolute",
+        "link",
+        "circle",
+        "no name",
+        "broken",
+        "channel",
+        "format",
+    ],
 )
 def test_a_file_that_cannot_be_played_is_a_problem_of_its_layout(
     tmp_path: Path, effect: str, words: str

@@ -82,13 +82,19 @@ def test_next_to_a_null_little_is_felt_of_slow_changes() -> None:
     assert shares[[0, 2]] == pytest.approx(0.25**2 / 25, rel=0.1)
 
 
+def jump() -> Course:
+    """From 0 to 1 within 5 ms, and from there down to 0 over a second."""
+    return along(1.2, np.concatenate([[0.0], np.linspace(1, 0, 200), np.zeros(40)]))
+
+
+@pytest.mark.parametrize("course", [strokes(), jump()], ids=["strokes", "jump"])
 @pytest.mark.parametrize("loads", [(), (2.5, 0.4)])
 @pytest.mark.parametrize("frequency", [60.0, 110.0, 250.0])
 def test_a_course_is_felt_as_on_the_plate_in_time(
-    frequency: float, loads: tuple[float, ...]
+    frequency: float, loads: tuple[float, ...], course: Course
 ) -> None:
     """The strongest 40 ms of samples, at a target and at the loudest point of another finger."""
-    table, course = small_table(), strokes()
+    table = small_table()
     drive = {"SW": Tone(frequency, 0.2 * STROKE, 0.3), "NE": Tone(frequency, 0.1 * STROKE, -1.1)}
     ringing = RingingUnderFingers(table, (TARGET, QUIET), loads, DriveEnvelope.of_course(course))
     frequencies, bases = base_amplitudes(drive, table.eras)
@@ -115,25 +121,23 @@ def test_a_course_is_felt_as_on_the_plate_in_time(
 
 
 def test_a_course_that_is_a_click_is_answered_as_the_click() -> None:
-    """Along its raised cosines, at the level of its 40 ms: at its frequency, with its contrast.
+    """Along its raised cosines, at the level of its 40 ms and its frequency: with its contrast.
 
     Up to 1.5 dB more: of a click the first 40 ms count at the target, of a course the strongest.
     Of two frequencies that are nearly as good a click has the better one in time.
     """
     table, times = smooth_table(), np.linspace(0, 0.05, 51)
-    alike = []
     ramp = pulse_ramp(0.04)
     click = along(0.05, rise(times, ramp) - rise(np.asarray(times - 0.04), ramp))
     for target, *quiet in contact_sets(6, fingers=3, seed=8):
         placed = Placement((target,), tuple(quiet))
         one = query(table, placed, 20.0, duration=0.04, drive_mode="phased")
-        level = 20.0 - click.strongest_db
-        other = query(table, placed, level, course=click, drive_mode="phased")
+        level, hertz = 20.0 - click.strongest_db, one.layers[0].frequency
+        at = {"course": click, "band_hz": (hertz, hertz)}
+        other = query(table, placed, level, **at, drive_mode="phased")
         contrasts = [each.fingers[0].promised_contrast_db or 0.0 for each in (one, other)]
         assert contrasts[0] - 0.1 <= contrasts[1] <= contrasts[0] + 1.5
         assert other.fingers[0].level_db_sl == pytest.approx(level, abs=0.01)
-        alike.append(one.layers[0].frequency == other.layers[0].frequency)
-    assert sum(alike) >= 5
 
 
 @pytest.mark.parametrize("quiet", [(), (QUIET,)], ids=["alone", "beside"])
@@ -170,12 +174,12 @@ def test_promise_over_a_course_is_kept() -> None:
 def test_side_bands_of_a_course_are_promised_too() -> None:
     """A texture of 20 Hz along a course: on nine of ten plates in time."""
     table, rig, answers = smooth_table(), smooth_rig(), []
-    for places in contact_sets(6, fingers=2, seed=5):
+    for places in contact_sets(10, fingers=2, seed=5):
         fingers = [Finger(places[0], Stimulus(20.0, course=strokes(), modulation_hz=20.0))]
         answers.append(answer(table, fingers, quiet=places[1:], drive_mode="phased"))
-    assert sum(bool(each.layers[0].side_bands) for each in answers) >= 3
+    assert sum(bool(each.layers[0].side_bands) for each in answers) >= 5
     promised = np.array([each.fingers[0].promised_contrast_db for each in answers])
-    found = given(table, rig, answers, 10, seed=6)
+    found = given(table, rig, answers, 30, seed=6)
     assert 0.86 <= np.mean(found >= promised[:, None]) <= 0.97
 
 

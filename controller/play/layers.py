@@ -95,11 +95,6 @@ class LayerContent:
     course_until: float = -math.inf
 
     @property
-    def is_amid_course(self) -> bool:
-        """Whether another piece of its course is to be sent."""
-        return self.content.course is not None and self.ending_due < math.inf
-
-    @property
     def settled_after(self) -> float:
         """How long [s] after the commit its ramp or onset has ended."""
         onset = self.layer.onset
@@ -368,17 +363,25 @@ class Layers:
 
         Not those of which a piece is due, for which the host was late: they go on.
         """
-        over = [n for n, one in self.contents.items() if one.drive and now >= one.ends_at]
+        over = [
+            number
+            for number, one in self.contents.items()
+            if one.drive and now >= one.ends_at and not self._goes_on(one, now)
+        ]
         fallen = {number for number in over if self.contents[number].is_falling}
         self.may_play -= fallen
         self._replace({n: one for n, one in self.contents.items() if n not in fallen})
         over = [number for number in over if number not in fallen]
         for number in over:
-            self._change(number, drive={})
-        late = {n for n in over if self.contents[n].is_amid_course}
-        contents = tuple(self.contents[number].content for number in over if number not in late)
+            self._change(number, drive={}, ending_due=math.inf)
+        contents = tuple(self.contents[number].content for number in over)
         self._over = (*self._over, *contents)
         return contents
+
+    def _goes_on(self, one: LayerContent, now: float) -> bool:
+        """Whether a piece of its course is due."""
+        is_due = one.content.course is not None and one.ending_due <= now
+        return is_due and now < self._confirmed_until(one.content)
 
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return those of the contents that are still wanted that have ended by themselves."""
@@ -516,11 +519,12 @@ class Layers:
             knots=max(knots // among, 1) if knots else 0,
             is_first=until is None,
         )
+        has_ended = until is not None and now >= self.contents[number].ends_at
         return self.builder.build_piece(
             number,
             content.layer,
             piece,
-            playing=self._drive_of(number),
+            playing={} if has_ended else self._drive_of(number),
             valid_for=piece.duration + HELD,
             is_after=is_after and piece.has_knots,
         )

@@ -101,7 +101,9 @@ class Ledger:
                 token = self.doubt.token
                 raise CommandRefused(f"set {token} must be confirmed first; read the status")
             fade = 0.0 if self._budget.is_unlimited else max(map(_fade, requested))
-            remaining = self._budget.remaining(now, fade=fade, delay=delay)
+            remaining = self._budget.remaining(
+                now, fade=fade, delay=delay + self._waits(requested, now)
+            )
             if remaining < math.inf:
                 left = math.floor(min(remaining, _VALID_FOR.high) * _VALID_FOR.per_unit)
                 if left <= 0:
@@ -146,7 +148,7 @@ class Ledger:
         before: Vibration | None = None
         if is_vibrating(*layers):
             lasts = 0.0 if self._budget.is_unlimited else max(map(_lasts, layers))
-            before = self._budget.sent(now, lasts=lasts)
+            before = self._budget.sent(now, lasts=lasts + self._waits(layers, now))
         self.doubt = Doubt(token, layers, self._first_sent[1], before)
 
     def resolve(self, token: int, now: float) -> None:
@@ -312,6 +314,13 @@ class Ledger:
                 "lower the levels or drive fewer channels at once"
             )
         return None
+
+    def _waits(self, layers: Sequence[LayerSet], now: float) -> float:
+        """Return how long [s] from now on layers wait at most for the ends of onsets."""
+        if self._budget.is_unlimited:
+            return 0.0
+        ends = [self.playback.onsets_end(one.layer, now) for one in layers if one.after]
+        return max(ends, default=now) - now
 
     def _is_within_at_most(self, layers: Sequence[LayerSet], late: float, until: float) -> bool:
         """Whether the limits hold with all that may play at its largest at once: nearly always.

@@ -457,3 +457,16 @@ def test_what_is_admitted_stays_within_the_limits_whenever_it_is_played(seed: in
             before = levels
         ledger.resolve(token, min(commit + 0.001, until))
     assert admitted > 20
+
+
+def test_what_waits_for_an_onset_ends_within_the_longest_vibration() -> None:
+    """By hand: of 2 s, 0.5 have gone by, the onset lasts 0.5 more, and 0.1 may be on the way.
+
+    A ramp of 0.1 s is left for its end: it may last for 0.8 s from where it begins.
+    """
+    ledger = Ledger(replace(WIDE, on_time=2.0), CAN)
+    onset = Envelope(1000, ((1000, 0),) * 9)  # ten steps of 0.1 s
+    play(ledger, 1, 0.0, Layer(0, (tone(onset=onset),), ramp=0.1, valid_for=1.5))
+    waits = Layer(0, (tone(keep_phase=True),), ramp=0.1, after=True)
+    (one,) = ledger.admit([waits], 0.5)
+    assert one.valid_for == pytest.approx(800, abs=2)

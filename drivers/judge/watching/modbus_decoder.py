@@ -71,7 +71,11 @@ class ModbusDecoder(Decoder):
         super().__init__()
         self._over_tcp = over_tcp
         self._readers: dict[Direction, AduReader] = {
-            direction: AduReader(is_rtu=not over_tcp, of_requests=direction == "amplifier")
+            direction: AduReader(
+                is_rtu=not over_tcp,
+                of_requests=direction == "amplifier",
+                waits=direction == "host",  # a piece of a response may hold what looks like one
+            )
             for direction in self.rest
         }
         self._last: dict[Direction, float] = {}  # times of the last bytes [s]

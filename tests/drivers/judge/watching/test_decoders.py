@@ -50,6 +50,11 @@ PING: tuple[Heard, ...] = (
 """With tag 8 and session 7."""
 PART = rtu("01 04 04")
 """The first of a response: its checksum is the first register, the tag."""
+WHOLE = rtu(
+    "01 04 32 9F55 0000 0004 0000 0001 0000 00FA 00FA 0708 36FF DBDF 32"
+    "0A 0408 07C0 081B 17B9 06B8 320A 0000 0000 0000 0000 0000 0000 0000"
+)
+"""A status of which 13 bytes, from the 27th on, are a frame of unit 10 with its checksum."""
 OFF = "0000 0000 0001 0000 0000 0000 0000 00FA 0708 0000 0101 0000 0000 0000 0000"
 """Registers of a status without a tag: state 1, one channel and one layer."""
 TONES = ("201 04 00 11 05 01 00 64 00", "201 04 01 02 00 D0 07 E8 03")
@@ -107,6 +112,17 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
             (">", rtu("01 04 0C80 0002"), "read on", {}),
             ("<", PART, "", {}),
             ("<", rtu(f"{PART.hex()} 0000")[len(PART) :], "reply", {}),
+        ),
+    ),
+    "response of which a piece has a checksum of its own": (
+        "modbus-rtu",
+        (
+            (">", rtu("01 10 0C00 0003 06 9F55 B882 0000"), "Ping", {"session": 0xB882}),
+            ("<", rtu("01 10 0C00 0003"), "carried out", {}),
+            (">", rtu("01 04 0C80 0019"), "read on", {}),
+            ("<", WHOLE[:26], "", {}),
+            ("<", WHOLE[26:39], "", {}),
+            ("<", WHOLE[39:], "reply", {"state": 4}),
         ),
     ),
     "frames in any order, and a copy": (

@@ -30,6 +30,9 @@ def play(
         typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL; default: 20, or its own."),
     ] = None,
     loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
+    channel: Annotated[
+        int | None, typer.Option(metavar="N", help="Channel of a file that has several.", min=1)
+    ] = None,
     simulate: Annotated[
         Path | None,
         typer.Option(metavar="TABLE", help="Table file of a plate that is simulated instead."),
@@ -52,14 +55,15 @@ def play(
     if simulate is not None and output is not None:
         if loop:
             raise InputError("--loop must be left out with --simulate")
-        _simulate(file, simulate, output, place, level=level, as_json=as_json)
+        pattern = pattern_of(file, channel)
+        _simulate(file, pattern, simulate, output, place, level=level, as_json=as_json)
         return
     with connected(socket) as era:
         if file.suffix:
             from controller.content.formats import read_content
             from controller.content.points import points_of
 
-            points, taps = points_of(read_content(file))
+            points, taps = points_of(read_content(file, channel))
             era.play(points, place, taps=taps, level_db_sl=level, loop=loop)
         else:
             era.play(str(file), place, level_db_sl=level, loop=loop)
@@ -79,6 +83,7 @@ def pattern_of(file: Path, channel: int | None = None) -> "Pattern":
 
 def _simulate(
     file: Path,
+    pattern: "Pattern",
     table_file: Path,
     output: Path,
     place: tuple[float, float],
@@ -102,7 +107,7 @@ def _simulate(
     check_replaceable(output, is_own=begins_with(output, b"RIFF"), what="WAV file")
     table = load_table(table_file)
     given = STRONG_DB_SL if level is None else level
-    played = play_content(pattern_of(file), table, given, at=place)
+    played = play_content(pattern, table, given, at=place)
     felt = played.accelerations @ fingertip_weights(*place, table.plate)
     sound = resample(felt, round(len(felt) * _RATE / played.rate))
     full_scale = float(np.abs(sound).max()) / _PEAK or 1.0

@@ -200,10 +200,14 @@ class Effect(TunedSection, ABC):
         """Return it as it is played at the frequencies of a table [Hz]."""
         return self
 
-    @property
-    def gives_level(self) -> bool:
-        """Whether its layout gives it a level of its own."""
-        return "level" in self.model_fields_set
+    def gives_level_in(self, region: Region | None) -> bool:
+        """Whether its layout gives it a level of its own, in a region or outside of all."""
+        is_given = region is not None and region.has_level
+        return is_given or "level" in self.model_fields_set
+
+    def band_in(self, region: Region | None) -> Band | None:
+        """Return its band [Hz] in a region, or outside of all; None: any."""
+        return self.tuned_band if region is None or region.band is None else region.band
 
     @property
     def has_end(self) -> bool:

@@ -81,13 +81,11 @@ class SurfaceLayout:
 
     def gives_level(self, name: str, region: Region | None) -> bool:
         """Whether it gives an effect, by name, a level of its own in a region."""
-        is_given = region is not None and region.has_level
-        return is_given or self.effects[name].gives_level
+        return self.effects[name].gives_level_in(region)
 
     def band_of(self, name: str, region: Region | None) -> Band | None:
         """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""
-        own = None if region is None else region.band
-        return self.effects[name].tuned_band if own is None else own
+        return self.effects[name].band_in(region)
 
     def band_problems(self, frequencies: FloatArray) -> list[str]:
         """Return what a table of frequencies [Hz] plays instead of bands that it lacks."""

@@ -206,7 +206,7 @@ class EffectPlayer:
         requested = REQUESTED_PRIORITY
         at = finger, finger.region, name, effect, contact, now
         self._start(*at, level=level, priority=requested)
-        is_given = level_db_sl is not None or effect.gives_level
+        is_given = level_db_sl is not None or effect.gives_level_in(None)
         finger.plays[-1].above_db = None if is_given else CLICK_ABOVE_DB
         finger.plays[-1].player = player
 
@@ -323,10 +323,9 @@ class EffectPlayer:
         run = effect.start_in(region, contact, now, level_db_sl=level)
         if not isinstance(run, EffectRun):
             raise WrongResultError(effect, run, EffectRun)
-        band = effect.tuned_band if region is None or region.band is None else region.band
+        band = effect.band_in(region)
         is_elsewhere = region is None and priority != REQUESTED_PRIORITY
-        is_given = effect.gives_level or (region is not None and region.has_level)
-        above = None if is_given else CLICK_ABOVE_DB
+        above = None if effect.gives_level_in(region) else CLICK_ABOVE_DB
         finger.plays.append(
             _Play(name, effect, run, self._number, priority, band, region, is_elsewhere, above)
         )

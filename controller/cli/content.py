@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from controller.cli.play import pattern_of
-from model.commands.options import JsonOption, print_report
+from model.commands.options import JsonOption, QuietOption, print_report
 from model.config.points import parse_point
 from model.counting import counted
 from model.errors import InputError
@@ -36,13 +36,7 @@ def check(
         str | None,
         typer.Option(metavar="X,Y", help="Position of the finger in metres; default: the middle."),
     ] = None,
-    quiet: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="X,Y",
-            help="Position of a finger that must not feel it, in metres; repeatable.",
-        ),
-    ] = None,
+    quiet: QuietOption = None,
     level: Annotated[
         float, typer.Option(metavar="DB_SL", help="Level of intensity 1, dB SL.")
     ] = 20.0,
@@ -68,11 +62,11 @@ def check(
     from controller.check.content_check import check_content, least_promise
     from model.answer.answer import MIN_CONTRAST_DB
     from model.commands.options import Stopwatch
-    from model.files.replacing import check_picture_name
+    from model.files.replacing import check_picture
     from model.table.file import load_table
 
     if picture is not None:
-        check_picture_name(picture)
+        check_picture(picture)
     table = load_table(table_file)
     middle = table.plate.length / 2, table.plate.width / 2
     place = middle if at is None else parse_point(at, what="--at")

@@ -60,10 +60,9 @@ def play(
         return
     with connected(socket) as era:
         if file.suffix:
-            from controller.content.formats import read_content
             from controller.content.points import points_of
 
-            points, taps = points_of(read_content(file, channel))
+            points, taps = points_of(pattern_of(file, channel))
             era.play(points, place, taps=taps, level_db_sl=level, loop=loop)
         else:
             era.play(str(file), place, level_db_sl=level, loop=loop)

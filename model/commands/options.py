@@ -28,6 +28,12 @@ SizeOption = Annotated[
     str | None, typer.Option("--size", metavar="WxH", help="Size of pictures in cm: 16x10.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+QuietOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="X,Y", help="Position of a finger that must not feel it, in metres; repeatable."
+    ),
+]
 ContactsOption = Annotated[
     Path | None,
     typer.Option(

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from model.commands.options import JsonOption, TableArgument, print_report
+from model.commands.options import JsonOption, QuietOption, TableArgument, print_report
 from model.config.points import parse_point
 from model.errors import InputError
 
@@ -22,13 +22,7 @@ def query(
         list[str] | None,
         typer.Option(metavar="X,Y", help="Position of a target finger in metres; repeatable."),
     ] = None,
-    quiet: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="X,Y",
-            help="Position of a finger that must not feel it, in metres; repeatable.",
-        ),
-    ] = None,
+    quiet: QuietOption = None,
     own: Annotated[
         list[str] | None,
         typer.Option(

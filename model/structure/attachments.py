@@ -12,7 +12,7 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 
 import cmath
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol, Self, TypeAlias, TypeVar
 
@@ -111,6 +111,16 @@ class Source(Support, Protocol):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """The source with another stiffness and damping, by factors."""
 
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Its fields that an identification may change, by the kind of parameter."""
+
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D [N/m] and of the force [N] with its values, by kind, each as omega.
+
+        With damping [N s/m] and bolt_mass [kg], of all others with the logarithm.
+        """
+
 
 class MeasuredGains:
     """The measured gain of a source: gains at ascending frequencies, empty for a gain of 1."""
@@ -206,6 +216,18 @@ class Era(MeasuredGains):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An ERA that is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Its spring, damper and bolt."""
+        return {kind: kind for kind in ("stiffness", "damping", "bolt_mass")}
+
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D and of the force, which spring and damper pass on from the base."""
+        w, base = np.asarray(omega), self.base(omega)
+        held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
+        bolt = -(w**2) + 0j, np.zeros(w.shape, dtype=complex)
+        return {kind: (own, own * base) for kind, own in held.items()} | {"bolt_mass": bolt}
 
 
 def damping_from_ratio(

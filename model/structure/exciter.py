@@ -18,6 +18,7 @@ currents, rocking of the magnet.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -145,6 +146,29 @@ class Exciter(MeasuredGains):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An exciter whose suspension is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Suspension, coil, magnet and force factor."""
+        own = {kind: kind for kind in ("stiffness", "damping", "magnet_mass", "force_factor")}
+        return own | {"bolt_mass": "coil_mass"}
+
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D and of the force: dS makes T² dS and T² dS base, as that is defined.
+
+        A heavier magnet moves less, dT = T (1 - T) dM / M.
+        """
+        w, share, force = np.asarray(omega), self._share(omega), self.force(omega)
+        base, still = self.base(w), 1 - share
+        electric = 2j * w * self.force_factor**2 / self._impedance(w)
+        changes = {"stiffness": self.stiffness, "damping": 1j * w, "force_factor": electric}
+        found = {kind: (share**2 * dS, share**2 * dS * base) for kind, dS in changes.items()}
+        by_factor, of_force = found["force_factor"]
+        return found | {
+            "force_factor": (by_factor, of_force + force),
+            "magnet_mass": (self._spring(w) * share * still, force * still),
+            "bolt_mass": (-(w**2) + 0j, np.zeros(w.shape, dtype=complex)),
+        }
 
     def _impedance(self, w: FloatArray) -> ComplexArray:
         """Z [ohm]."""

@@ -82,9 +82,9 @@ KINDS = {
     # By data sheets: of the plate's mass that an ERA carries.
     "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
     # Of an ERA, on each axis.
-    # Of exciters, by parts of one kind beside each other.
-    "magnet_mass": Kind(0.1, drift=0.0),
-    "force_factor": Kind(0.1, drift=0.01),
+    # Of exciters.
+    "magnet_mass": Kind(_BUILT.stiffness, bound=math.log(10.0)),
+    "force_factor": Kind(_BUILT.stiffness, drift=0.01),
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
     "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
@@ -245,7 +245,8 @@ def space_of(
         space = space.and_further(kind, names, std, lower, upper)
 
     add("thickness", ["thickness"], uncertainty.thickness)
-    add("modulus", ["modulus"], KINDS["modulus"].std * (uncertainty.thickness > 0))
+    modulus = max(KINDS["modulus"].std, uncertainty.modulus)
+    add("modulus", ["modulus"], modulus * (uncertainty.thickness > 0))
     add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
     damping = math.log(uncertainty.damping)
     damped = [float(damping > 0 and era.damping > 0) for era in rig.eras]
@@ -286,7 +287,7 @@ def space_of(
     for kind in EXCITER_KINDS:
         excites = np.array([float(kind in era.fields) for era in rig.eras])
         names = [f"{kind.replace('_', ' ')} {name}" for name in eras if excites.any()]
-        add(kind, names, KINDS[kind].std * excites[: len(names)])
+        add(kind, names, uncertainty.stiffness * excites[: len(names)])
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
     add(
@@ -350,8 +351,10 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
     }
     # Places may leave the plate, whose shapes go on by their slopes.
     form = (*FORM, "place", "mode_shifts") if has_form else ()
+    excites = np.array(["magnet_mass" in era.fields for era in rig.eras])
+    magnet = ("magnet_mass",) if excites.any() else ()
     columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
-    for name in ("modulus", "stiffness", "gain", *added, *form):
+    for name in ("modulus", "stiffness", "gain", *magnet, *added, *form):
         kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
         std = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
         lower = -value if name in added else -kind.bound
@@ -359,6 +362,8 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
         columns[:, space.groups[name]] = np.array(
             np.broadcast_arrays(std, lower / std, upper / std)
         ).reshape(3, -1)
+    for name in magnet:
+        columns[0, space.groups[name]] *= excites
     return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 
 

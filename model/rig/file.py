@@ -66,7 +66,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             wanted,
             plate,
             frequency_max=section.limits.frequency[1],
-            stiffness=max(era.stiffness for era in everything.values()),
+            stiffness=max(era.in_time.stiffness for era in everything.values()),
             foot=min(era.foot for era in everything.values()),
         ),
         eras=tuple(era for name, era in everything.items() if name in wiring),

@@ -23,7 +23,7 @@ from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -145,7 +145,7 @@ def gain_notes(rig: Rig) -> list[str]:
     return [text for era in behind for text in _notes(era, low, high)]
 
 
-def _notes(era: Era, low: float, high: float) -> list[str]:
+def _notes(era: Source, low: float, high: float) -> list[str]:
     if not era.gains:
         return [
             f"eras.{era.name}.gains: missing behind an output, so that its motion is a guess, a "

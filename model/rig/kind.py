@@ -18,7 +18,7 @@ from urllib.parse import quote
 from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.errors import InputError
-from model.rig.checks import STIFF_MOUNT
+from model.rig.era_section import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
@@ -95,7 +95,7 @@ def _point_costs(rig: Rig) -> list[str]:
     plate = rig.plate
     decade = math.log(10) / (2 * math.pi * plate.shear_rigidity)
     mounts = [
-        *((era.name, era.stiffness, era.foot) for era in rig.eras),
+        *((era.name, era.support.stiffness, era.foot) for era in rig.eras),
         *(
             (name, load.stiffness, load.foot)
             for name, load in zip(

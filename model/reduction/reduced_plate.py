@@ -15,8 +15,8 @@ force of the pulp, a spring and a damper between the plate and the phalanx.
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
 the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
-geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers
-and air lose added to eta omega². That is
+geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers,
+air and the springs of supports with a loss factor lose added to eta omega². That is
 positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
 of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
 in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
@@ -207,7 +207,9 @@ def modal_matrices(
     omega = np.sqrt(eigenvalues)
     lossy = (psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ psi
     share = np.sqrt(loss_factors(reduced.plate, omega))
-    lost = lossy * np.outer(share, share) + (psi.T * elasticity.losses) @ psi
+    at_fixed = phi[: len(fixed)] @ psi
+    in_springs = (at_fixed.T * [each.loss_factor * each.stiffness for each in fixed]) @ at_fixed
+    lost = lossy * np.outer(share, share) + (psi.T * elasticity.losses) @ psi + in_springs
     viscous = lost / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T

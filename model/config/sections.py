@@ -228,9 +228,7 @@ def _section_at(root: type[Section], path: KeyPath) -> type[Section]:
             kind = get_args(kind)[-1]
         else:
             kind = kind.model_fields[part].annotation
-        if get_origin(kind) in (Union, UnionType):  # of a field that may be left out
-            kind = get_args(kind)[0]
-        if get_origin(kind) is Annotated:
+        while get_origin(kind) in (Union, UnionType, Annotated):  # one that may be left out
             kind = get_args(kind)[0]
     section: type[Section] = kind
     return section

@@ -86,7 +86,11 @@ def _check_stiff_mount(
     section: type[EraSection | SupportSection],
 ) -> None:
     stiffness = validation.field((*path, "stiffness"), section)
-    if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in _given(validation, path):
+    if (
+        stiffness is not None
+        and stiffness >= STIFF_MOUNT
+        and "foot" not in _given(validation, path)
+    ):
         validation.add(
             (*path, "foot"),
             f"missing; add the radius of the patch on which it holds the plate: at "
@@ -119,6 +123,8 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
     if "layers" in given:
         for key in sorted({"thickness", "material"} & given):
             validation.add(("plate", key), "must not be given with layers; remove one of the two")
+        if "grain" in given:
+            validation.add(("plate", "grain"), "is for a plate without layers; remove it")
     else:
         for key in ("thickness", "material"):
             if key not in given:
@@ -126,7 +132,8 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
         if "bond" in given:
             validation.add(("plate", "bond"), "is for layers only; remove it")
     paths = [("plate", "material"), *_layer_materials(validation)]
-    if not all([_check_material(validation, path) for path in paths]):
+    good = [_check_material(validation, path) for path in paths]
+    if not all(good):
         return None
     section = validation.part(("plate",), PlateSection)
     if section is None or (section.layers is None and not {"thickness", "material"} <= given):
@@ -160,6 +167,8 @@ def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
     given = _given(validation, path)
     if not given:
         return True
+    if "by_frequency" in given and given & ORTHOTROPIC:
+        validation.add((*path, "by_frequency"), "is of an isotropic material only; remove it")
     kind, other = ISOTROPIC, ORTHOTROPIC
     if given & ORTHOTROPIC and not given & ISOTROPIC or len(given & ORTHOTROPIC) > 1:
         kind, other = other, kind
@@ -266,6 +275,6 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             )
 
 
-def _given(validation: Validation[RigSection], path: tuple[str, ...]) -> set[str]:
+def _given(validation: Validation[RigSection], path: KeyPath) -> set[str]:
     """Keys of a section that are not empty."""
     return {key for key, value in validation.mapping(path).items() if value is not None}

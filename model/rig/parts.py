@@ -74,20 +74,20 @@ def laminate_of(section: PlateSection) -> Laminate | None:
 
     A single layer stands for a material that depends on frequency.
     """
-    known, thickness = section.material, section.thickness
     if section.layers is None:
-        if not isinstance(known, KnownMaterial) or not known.by_frequency or thickness is None:
+        known, thickness = section.material, section.thickness
+        if known is None or not known.by_frequency or thickness is None:
             return None
-        material = known.of_thickness(thickness)
-        return Laminate((LaminateLayer(material, thickness, by_frequency=known.by_frequency),))
+        alone = material_of(known, thickness)
+        return Laminate((LaminateLayer(alone, thickness, by_frequency=tuple(known.by_frequency)),))
     return Laminate(tuple(map(_layer_of, section.layers)), bond=section.bond)
 
 
 def _layer_of(section: LayerSection) -> LaminateLayer:
-    """A layer; one of a material by name that depends on frequency has that, unless it says other."""
+    """A layer; its material's dependence on frequency holds unless it states losses of its own."""
     rows = section.by_frequency
-    if rows is None and section.loss_factor is None and isinstance(section.material, KnownMaterial):
-        rows = [*section.material.by_frequency]
+    if rows is None and section.loss_factor is None:
+        rows = [*(section.material.by_frequency or ())]
     return LaminateLayer(
         material_of(section.material, section.thickness),
         section.thickness,
@@ -120,9 +120,7 @@ def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> E
 def masses_of(section: MassSection, plate: Plate) -> tuple[PointLoad, ...]:
     """A mass on the plate, or those of a frame along its edges."""
     if section.at is not None:
-        return (
-            PointLoad(*_onto(plate, section.at), mass=section.mass or 0.0, foot=section.foot),
-        )
+        return (PointLoad(*_onto(plate, section.at), mass=section.mass or 0.0, foot=section.foot),)
     per_length = section.mass_per_length or 0.0
     return tuple(
         PointLoad(x, y, mass=per_length * length)

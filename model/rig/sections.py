@@ -49,6 +49,7 @@ from model.rig.key_types import (
     check_url,
 )
 from model.rig.uncertainty import BOUNDS, Uncertainty
+from model.structure.feet_and_frames import DEFAULT_POINTS
 from model.structure.materials import KnownMaterial, known_material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 
@@ -94,6 +95,8 @@ class _OrNone:
         return {"anyOf": [handler(schema), {"const": "none"}]}
 
 
+ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI]
+
 ISOTROPIC = frozenset({"E", "nu"})
 ORTHOTROPIC = frozenset({"E1", "E2", "G12", "G13", "G23", "nu12"})
 """Numbers of a material that is the same in all directions, and of one with a grain."""
@@ -104,7 +107,7 @@ class MaterialSection(Section):
 
     model_config = ConfigDict(
         json_schema_extra={
-            "oneOf": [{"required": sorted(ISOTROPIC)}, {"required": sorted(ORTHOTROPIC)}]
+            "oneOf": [{"required": [*sorted(ISOTROPIC)]}, {"required": [*sorted(ORTHOTROPIC)]}]
         }
     )
 
@@ -150,6 +153,12 @@ class MaterialSection(Section):
     G23: Annotated[float, _modulus()] | None = None
     """Transverse shear modulus across it, of wood the rolling shear."""
 
+    by_frequency: ModulusRows | None = None
+    """As that of a [layer](#layers), of a plate of an isotropic material that depends on it.
+
+    Limits: 2 rows or more, by ascending frequency
+    """
+
 
 MaterialOrName = Annotated[MaterialSection | KnownMaterial, _MaterialByName()]
 
@@ -166,9 +175,7 @@ class LayerSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
     """Eta of the layer itself, E (1 + i eta), beside the `loss_factor` of the plate."""
 
-    by_frequency: Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI] | None = (
-        None
-    )
+    by_frequency: ModulusRows | None = None
     """`[[frequency in Hz, factor of E, loss factor], ...]`: linear in the logarithms of frequency
     and factor, constant outside; in place of `loss_factor`.
 
@@ -353,7 +360,7 @@ class MassSection(Section):
     Default: required with `along`
     """
 
-    points: Points = 7
+    points: Points = DEFAULT_POINTS
     """Of each edge, at which a frame acts; more for many waves along it."""
 
 
@@ -398,7 +405,7 @@ class SupportSection(Section):
     Default: required with `along`
     """
 
-    points: Points = 7
+    points: Points = DEFAULT_POINTS
     """Of each edge, at which it acts; more for many waves along it."""
 
 

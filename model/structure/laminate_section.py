@@ -259,7 +259,7 @@ def _homogeneous(
         width=width,
         thickness=_rounded(thickness),
         material=Material(
-            "laminate",
+            laminate.layers[0].material.name if len(laminate.layers) == 1 else "laminate",
             E=_rounded(12 * bent.rigidity * (1 - bent.nu**2) / thickness**3),
             rho=_rounded(density / thickness),
             nu=_rounded(bent.nu),

@@ -96,6 +96,15 @@ class Material:
         return Orthotropy(1.0, shear, shear, shear)
 
     @property
+    def moduli(self) -> dict[str, float]:
+        """Its moduli [Pa] by the keys of a rig file."""
+        of = self.orthotropy
+        if of is None:
+            return {"E": self.E}
+        shares = {"E1": 1.0, "E2": of.e2, "G12": of.g12, "G13": of.g13, "G23": of.g23}
+        return {key: share * self.E for key, share in shares.items()}
+
+    @property
     def plane_stress(self) -> float:
         """1 - nu_12 nu_21, by which moduli are divided in a plate."""
         return 1 - self.nu**2 * self.shares.e2

@@ -15,6 +15,7 @@ SECTIONS: Mapping[str, type[Section]] = {
     "material": sections.MaterialSection,
     "eras": sections.EraSection,
     "masses": sections.MassSection,
+    "supports": sections.SupportSection,
     "amplifiers": sections.AmplifierSection,
     "limits": sections.LimitsSection,
     "uncertainty": sections.UncertaintySection,

@@ -170,7 +170,7 @@ def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
     if "by_frequency" in given and given & ORTHOTROPIC:
         validation.add((*path, "by_frequency"), "is of an isotropic material only; remove it")
     kind, other = ISOTROPIC, ORTHOTROPIC
-    if given & ORTHOTROPIC and not given & ISOTROPIC or len(given & ORTHOTROPIC) > 1:
+    if len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0):
         kind, other = other, kind
     for key in sorted(kind - given):
         others = "E1, E2, G12, G13, G23, nu12" if kind is ISOTROPIC else "E and nu"

@@ -15,7 +15,7 @@ from model.rig.sections import (
     SupportSection,
 )
 from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
-from model.structure.feet_and_frames import FEET, FOOT_LOSS, edge_points
+from model.structure.feet_and_frames import EDGE_FOOT, FEET, FOOT_LOSS, edge_points
 from model.structure.laminate_section import equivalent_plate
 from model.structure.materials import KnownMaterial
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Orthotropy, Plate
@@ -56,7 +56,7 @@ def _loss_factor(section: PlateSection) -> float:
 
 
 def material_of(section: MaterialSection | KnownMaterial, thickness: float) -> Material:
-    """The material of a board or layer of a thickness [m]; raises InputError for one of no solid."""
+    """The material of a board or layer of a thickness [m]; InputError for one of no solid."""
     if isinstance(section, KnownMaterial):
         return section.of_thickness(thickness)
     if section.E is not None and section.nu is not None:
@@ -123,7 +123,7 @@ def masses_of(section: MassSection, plate: Plate) -> tuple[PointLoad, ...]:
         return (PointLoad(*_onto(plate, section.at), mass=section.mass or 0.0, foot=section.foot),)
     per_length = section.mass_per_length or 0.0
     return tuple(
-        PointLoad(x, y, mass=per_length * length)
+        PointLoad(x, y, mass=per_length * length, foot=EDGE_FOOT)
         for x, y, length in edge_points(plate, section.points)
     )
 
@@ -152,6 +152,7 @@ def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
             y,
             stiffness=per_length * length,
             damping=damping * length / edge,
+            foot=EDGE_FOOT,
             loss_factor=loss_factor,
         )
         for x, y, length in edge_points(plate, section.points)

@@ -392,7 +392,7 @@ class SupportSection(Section):
     """Of a viscous damper, in place of a loss factor, or beside one that is given."""
 
     foot: Foot = 0.0
-    """Radius of the disc on which it presses, 0 for a point. Required from a stiffness of 1 MN/m."""
+    """Radius of the disc on which it presses, 0 for a point; required from 1 MN/m on."""
 
     along: Edges | None = None
     """`edges` for what holds all of them, as foam tape, in place of `at`."""
@@ -568,7 +568,7 @@ class RigSection(Section):
     supports: Annotated[
         dict[Identifier, SupportSection], Field(max_length=64, default_factory=dict)
     ]
-    """Feet and frames that hold the plate and are not driven, by name, see [supports](#supports)."""
+    """What holds the plate and is not driven, by name, see [supports](#supports)."""
 
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
     """Amplifiers by name, see [amplifiers](#amplifiers)."""

@@ -6,9 +6,10 @@ plate's compliance in all shorter waves, the mean over all directions phi of
 
     1 / (4 pi D k²) + ln(k_max / k) / (2 pi S),    k = min(a / |cos phi|, b / |sin phi|),
 
-D the flexural rigidity, of a board that towards phi, and S the shear rigidity. The square of a Legendre polynomial waves along the plate,
-and so does what is missing in all higher ones: at x = L (1 - cos t) / 2 there is 1 + o times as
-much in all waves that end at a, so that a is to be divided by sqrt(1 + o),
+D the flexural rigidity, of a board that towards phi, and S the shear rigidity. The square of a
+Legendre polynomial waves along the plate, and so does what is missing in all higher ones: at
+x = L (1 - cos t) / 2 there is 1 + o times as much in all waves that end at a, so that a is to be
+divided by sqrt(1 + o),
 
     o = cos(2 (p - 1) t) / ((p - 1) sin t).
 

@@ -2,7 +2,8 @@
 
 What acts along the edges, a bonded frame or foam tape, acts at Gauss-Legendre points of each edge
 with their weights: of n points the work in products of shapes up to degree 2 n - 1 is exact. As
-points they stay what they are on a plate of any thickness, which what is solved of it is not.
+points they stay what they are on a plate of any thickness, which what is solved of it is not. Each is a
+small disc: a line does not dent the plate without limit, as a point does.
 """
 
 import math
@@ -17,6 +18,9 @@ FEET = {"foam": 2e3, "rubber": 30e3}
 
 DEFAULT_POINTS = 7
 """Points of each edge."""
+
+EDGE_FOOT = 1e-3
+"""Radius [m] of the discs at these points."""
 
 FOOT_LOSS = 0.15
 """Loss factor of foam and rubber: assumed."""

@@ -156,9 +156,8 @@ _KNOWN = (
     ),
     KnownMaterial(
         Material("mdf", E=3.4e9, rho=780.0, nu=0.3),
-        source="rho Hunt et al., BioResources 8(1) 115, 2013, of boards of 3.7 mm; E the standard's "
-        "2.7 GPa (EN 622-5, from memory) times the 1.26 of Hunt et al., dynamic over static; nu "
-        "assumed",
+        source="rho Hunt et al., BioResources 8(1) 115, 2013, of boards of 3.7 mm; E 2.7 GPa (EN "
+        "622-5, from memory) times their 1.26, dynamic over static; nu assumed",
         variation="E 2.7 to 4 GPa, rho 700 (8.1 mm) to 830 (2.6 mm) kg/m³, nu 0.25 to 0.3",
         loss_factor="0.01 to 0.03, assumed",
         own_loss=0.02,

@@ -42,7 +42,8 @@ LEAST_LOSS = 1e-9
 class Sensor:
     """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is "".
 
-    amplifier: on whose clock its phases count, "" for that of none.
+    amplifier: on whose clock its phases count, "" for that of none; mass [kg]: of a sensor that is
+    moved, which weighs on the plate there while this place is measured, and nowhere else.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Sensor:
     x: float = 0.0
     y: float = 0.0
     amplifier: str = ""
+    mass: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,11 @@ class ForwardModel:
             found.append(names.index(sensor.era) if sensor.era else after)
             after += not sensor.era
         return np.array(found, dtype=int)
+
+    @cached_property
+    def sensor_masses(self) -> FloatArray:
+        """Mass of each sensor that weighs on the plate where it is, see `Sensor`, (s,) [kg]."""
+        return np.array([sensor.mass for sensor in self.sensors])
 
     @cached_property
     def lateness(self) -> FloatArray:

@@ -27,7 +27,8 @@ class MeasuredValue:
 
     Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
     known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors;
-    sensor_mass [kg]: as `Responses.masses`.
+    sensor_mass [kg]: as `Responses.masses`; setting: with what it was measured, in words, "" for
+    not known.
     """
 
     era: str
@@ -38,6 +39,7 @@ class MeasuredValue:
     value: complex
     place: str
     sensor_mass: float = 0.0
+    setting: str = ""
 
 
 @dataclass(frozen=True, eq=False)

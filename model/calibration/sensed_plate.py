@@ -81,6 +81,11 @@ class SensedPlate:
         )
         return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
 
+    @property
+    def masses(self) -> FloatArray:
+        """Mass of the sensor at each point while it measures there, (s,) [kg]."""
+        return np.array([sensor.mass for sensor in self.model.sensors])
+
     @cached_property
     def numbers(self) -> IntArray:
         """Where each fitted value is in the space, (n,)."""

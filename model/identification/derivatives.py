@@ -2,7 +2,8 @@
 
 With L = 1 - T Z, changes dA of the free receptance and dZ of what is attached change the receptance
 T of the plate on its attachments by L dA L^T - T dZ T: a mode, a place or an attachment by a rank
-of one or two (`model.identification.forward`).
+of one or two (`model.identification.forward`). A sensor of mass m that is on the plate while it measures
+sees l dT_sj + l² w² m T_sj dT_ss.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.forward import LEAST_LOSS, PlateAt
+from model.identification.parameters import EXCITER_KINDS
 from model.reduction.free_plate import TERMS, combined
 from model.structure.plate import LOSS_FREQUENCY
 
@@ -55,8 +57,8 @@ Columns: TypeAlias = dict[str, ComplexArray]
 
 def _by_plate(plate: PlateAt) -> Columns:
     """By thickness, modulus and loss factor of the whole plate."""
-    functions, reach, n = plate.functions, plate.reach, plate.base.shape[1]
-    seen, driven = reach[:, plate.model.observed], reach[:, :n].swapaxes(1, 2)
+    functions, reach = plate.functions, plate.reach
+    seen, driven = reach[:, plate.model.observed], reach[:, _pushed(plate)].swapaxes(1, 2)
 
     def responses(of_modes: ComplexArray | float, of_rest: ComplexArray | float) -> ComplexArray:
         """By what changes logarithms of the stiffness of modes (f, r), and of all else (f,)."""
@@ -65,11 +67,11 @@ def _by_plate(plate: PlateAt) -> Columns:
             change += seen @ (plate.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
         rest = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
         further = _attached(plate, combined(rest, plate.located.truncated))
-        return np.asarray(plate.scale * (further - functions.thickness**3 * change))[..., None]
+        return _responses(plate, further - functions.thickness**3 * change)[..., None]
 
     by_stiffness = responses(1.0, 1.0)
     by_loss = responses(plate.by_loss, plate.by_loss_of_rest)
-    by_mass = plate.scale * _attached(plate, plate.free_receptance)
+    by_mass = _responses(plate, _attached(plate, plate.free_receptance))
     powers = np.log(plate.model.frequencies / LOSS_FREQUENCY)[:, None, None, None]
     return {
         "thickness": 2 * by_stiffness - by_mass[..., None],
@@ -81,10 +83,10 @@ def _by_plate(plate: PlateAt) -> Columns:
 
 
 def _attached(plate: PlateAt, change: ComplexArray) -> ComplexArray:
-    """Change of T at sensors and ERAs (f, s, n) by one of the free receptance (f, a, a)."""
+    """Change of T as `_responses` takes it, by one of the free receptance (f, a, a)."""
     left = plate.left
     return np.asarray(
-        left[:, plate.model.observed] @ change @ left[:, : plate.base.shape[1]].swapaxes(1, 2)
+        left[:, plate.model.observed] @ change @ left[:, _pushed(plate)].swapaxes(1, 2)
     )
 
 
@@ -100,15 +102,17 @@ def _by_modes(plate: PlateAt) -> Columns:
 
 def _by_form(plate: PlateAt) -> Columns:
     """By foreign mass and what stretches the plate, which couple its modes."""
-    model, functions, n = plate.model, plate.functions, plate.base.shape[1]
+    model, functions = plate.model, plate.functions
     if model.form is None:
         return {}
     reach = plate.reach @ model.form.cells.T
     share = model.rig.plate.mass * functions.thickness
     by_mass = _outer(plate, reach, reach, share * _per_frequency(plate, reach.shape[-1]))
-    seen, driven = plate.reach[:, model.observed], plate.reach[:, :n].swapaxes(1, 2)
-    factor = -(functions.q * functions.thickness)[:, None, None] * plate.scale
-    stretched = [factor * (seen @ slope @ driven) for slope in model.form.stiffening]
+    seen, driven = plate.reach[:, model.observed], plate.reach[:, _pushed(plate)].swapaxes(1, 2)
+    factor = -(functions.q * functions.thickness)[:, None, None]
+    stretched = [
+        _responses(plate, factor * (seen @ slope @ driven)) for slope in model.form.stiffening
+    ]
     sides = np.array([model.rig.plate.length, model.rig.plate.width])
     return {
         "foreign_mass": by_mass - by_mass.mean(axis=-1, keepdims=True),
@@ -123,7 +127,7 @@ def _by_places(plate: PlateAt) -> Columns:
     A place changes the receptance in its row and its column.
     """
     model = plate.model
-    n, moved = plate.base.shape[1], np.repeat(model.movable, 2)
+    n, moved = plate.force.shape[1], np.repeat(model.movable, 2)
     located, functions = plate.located, plate.functions
     rows = located.shape_slopes @ plate.moved
     rows = rows + combined(functions.truncated(TERMS), located.truncated_slopes)
@@ -144,21 +148,21 @@ def _by_places(plate: PlateAt) -> Columns:
 
 
 def _by_attachments(plate: PlateAt) -> Columns:
-    """By stiffness, damping and bolt mass of ERAs, and by the parts of fingers."""
+    """By the values of ERAs, which also drive through them, and by the parts of fingers."""
     model, values, Y = plate.model, plate.values, plate.responses
-    n, eras = plate.base.shape[1], np.arange(plate.base.shape[1])
+    n = plate.force.shape[1]
+    eras, slopes = np.arange(n), [each.slopes(model.omega) for each in plate.sources]
+    none = np.zeros((2, len(model.omega)), dtype=complex)
     found: Columns = {}
-    by_damping = np.broadcast_to(1j * model.omega[:, None], plate.base.shape)
-    for kind, change in (
-        ("stiffness", np.broadcast_to(values.stiffness, plate.base.shape)),
-        ("damping_added", by_damping),
-    ):
+    for kind in ("stiffness", "damping", "bolt_mass", *EXCITER_KINDS):
+        change, of_force = np.array([each.get(kind, none) for each in slopes]).transpose(1, 2, 0)
         found[kind] = _held(plate, eras, change)
-        # The base moves through spring and damper.
-        found[kind][:, :, eras, eras] += Y * (change / plate.base)[:, None]
-    found["damping_each"] = found["damping_added"] * values.damping
+        found[kind][:, :, eras, eras] += Y * (of_force / plate.full_levels / plate.force)[:, None]
+    for kind in EXCITER_KINDS:
+        found[kind] = found[kind][..., : len(model.space.indices(kind))]
+    found["damping_added"] = found["damping"]
+    found["damping_each"] = found["damping"] * values.damping
     found["damping"] = found["damping_each"].sum(axis=-1, keepdims=True)
-    found["bolt_mass"] = _held(plate, eras, -_per_frequency(plate, n))
     first = n + len(model.rig.masses) + model.mass_count
     by_finger = [
         _held(plate, np.full(4, first + number), slopes)
@@ -192,8 +196,9 @@ def _by_scale(plate: PlateAt) -> ComplexArray:
     """By the scale of each sensor, which may be zero."""
     count = len(plate.values.sensor_scales)
     plain = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late
-    plain = plain * plate.receptance[:, plate.model.observed, : plate.base.shape[1]]
-    return np.asarray(plain[..., None] * np.eye(len(plate.model.observed), count)[:, None])
+    return np.asarray(
+        (plain * plate.seen)[..., None] * np.eye(len(plate.model.observed), count)[:, None]
+    )
 
 
 _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
@@ -207,6 +212,7 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "damping_each",
         "damping_added",
         "bolt_mass",
+        *EXCITER_KINDS,
         "fingers",
     ),
     _by_gains: (
@@ -230,5 +236,26 @@ def _held(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:
 def _outer(plate: PlateAt, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
     """Responses of T = factor u v^T, (f, s, n, m), of columns (f, a, m) and factors (f, m)."""
     left = u[:, plate.model.observed] * factor[:, None]
-    found = left[:, :, None] * v[:, None, : plate.base.shape[1]]
-    return np.asarray(found * plate.scale[..., None])
+    return _responses(plate, left[:, :, None] * v[:, None, _pushed(plate)])
+
+
+def _pushed(plate: PlateAt) -> slice | IntArray:
+    """Columns of T whose changes count: those of ERAs, then of sensors that load the plate."""
+    n = plate.force.shape[1]
+    if plate.lightness is None:
+        return slice(n)
+    return np.concatenate([np.arange(n), plate.model.observed])
+
+
+def _responses(plate: PlateAt, change: ComplexArray) -> ComplexArray:
+    """Change of the responses (f, s, n, ...) by one of T (f, s, columns of `_pushed`, ...)."""
+    further = (1,) * (change.ndim - 3)
+    n, at = plate.force.shape[1], np.arange(change.shape[1])
+    found = change[:, :, :n]
+    if plate.lightness is not None:
+        assert plate.model.sensor_inertia is not None  # noqa: S101  there is a mass
+        loaded = plate.model.sensor_inertia[:, :, None] * plate.seen
+        own = change[:, at, n + at][:, :, None]
+        found = found + loaded.reshape(*loaded.shape, *further) * own
+        found = found * plate.lightness.reshape(*plate.lightness.shape, 1, *further)
+    return np.asarray(found * plate.scale.reshape(*plate.scale.shape, *further))

@@ -1,10 +1,13 @@
 """Responses of a rig's plate at its sensors for a vector of parameters.
 
 With A the receptance of the free plate between all attachments and sensors, Z the dynamic stiffness
-of what is attached there (0 at a sensor) and T = A (1 + Z A)^-1, a sensor s answers to the base of
-ERA j, moved by its gain g_j, with
+of what is attached there (0 at a sensor) and T = A (1 + Z A)^-1, a sensor s answers to the drive of
+ERA j, which by its gain g_j pushes with F_j g_j on a plate that is held, (k_j + i w c_j) g_j for a
+base, with
 
-    Y_sj = -w² sigma_s T_sj (k_j + i w c_j) g_j.
+    Y_sj = -w² sigma_s l_s T_sj F_j g_j,    l_s = 1 / (1 - w² m_s T_ss).
+
+A sensor of mass m_s loads the plate only while it measures: one that is moved from place to place.
 """
 
 from collections.abc import Sequence
@@ -24,6 +27,7 @@ from model.structure.attachments import (
     Fingertip,
     attached_stiffness,
     coupled_forces,
+    drive_forces,
     footprints_of,
 )
 from model.structure.modal_elasticity import (
@@ -34,6 +38,9 @@ from model.structure.modal_elasticity import (
 )
 from model.structure.plate import LOSS_FREQUENCY
 
+SENSOR_FOOT = 5e-3
+"""Radius of the disc on which a sensor's mass acts [m]: under a point a plate is soft."""
+
 LEAST_LOSS = 1e-9
 """Loss factor that counts for none, so that there are derivatives by its logarithm."""
 
@@ -42,8 +49,8 @@ LEAST_LOSS = 1e-9
 class Sensor:
     """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is "".
 
-    amplifier: on whose clock its phases count, "" for that of none; mass [kg]: of a sensor that is
-    moved, which weighs on the plate there while this place is measured, and nowhere else.
+    amplifier: on whose clock its phases count, "" for that of none; mass [kg]: on the plate only
+    while this sensor measures, as that of one sensor moved from place to place.
     """
 
     name: str
@@ -110,11 +117,6 @@ class ForwardModel:
         return np.array(found, dtype=int)
 
     @cached_property
-    def sensor_masses(self) -> FloatArray:
-        """Mass of each sensor that weighs on the plate where it is, see `Sensor`, (s,) [kg]."""
-        return np.array([sensor.mass for sensor in self.sensors])
-
-    @cached_property
     def lateness(self) -> FloatArray:
         """By which a response to an ERA is late by a clock that is, (s, n, amplifiers).
 
@@ -159,8 +161,18 @@ class ForwardModel:
     @cached_property
     def pads(self) -> FloatArray:
         """Footprints (q, 3) of the sensors that are not at ERAs [m]."""
-        alone = [(each.x, each.y, 0.0) for each in self.sensors if not each.era]
+        alone = [
+            (each.x, each.y, SENSOR_FOOT if each.mass else 0.0)
+            for each in self.sensors
+            if not each.era
+        ]
         return np.array(alone, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def sensor_inertia(self) -> FloatArray | None:
+        """omega² times the masses of the sensors (f, s) [N/m], None where they weigh nothing."""
+        masses = np.array([each.mass for each in self.sensors])
+        return self.omega[:, None] ** 2 * masses if masses.any() else None
 
     @cached_property
     def movable(self) -> IntArray:
@@ -223,8 +235,8 @@ class PlateAt:
     values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
     by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
     factor, and of all that a mode loses; bending (f, r, r), added (r, r): stiffness and mass
-    between modes by form errors; base (f, n): force of an ERA on the plate per displacement of its
-    base [N/m]; stiffness (f, a): of what is attached; free_receptance A, receptance T, of the plate
+    between modes by form errors; sources: the ERAs; force (f, n): of each on a plate that is held,
+    per unit of its drive; stiffness (f, a): of what is attached; free_receptance A, receptance T, of the plate
     with its attachments, and left factor L (f, a, a); moved (f, r, a): coordinates of the free
     plate by a force at each; finger_slopes: by finger, derivatives of its dynamic stiffness by its
     parts (f, 4).
@@ -235,14 +247,16 @@ class PlateAt:
         self.functions = self._functions()
         self.located = model.places(self.values)
         w, values = model.omega[:, None], self.values
-        self.base = values.stiffness + 1j * w * values.damping
+        self.sources = values.sources(model.rig)
+        self.full_levels = np.array([each.full_level for each in self.sources])
+        self.force = drive_forces(model.omega, self.sources) / self.full_levels
         loads = [
             _finger(each.fingertip, logs, model.omega)
             for each, logs in zip(model.fingers, values.fingers, strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
         held = [
-            self.base - w**2 * values.bolt_mass,
+            attached_stiffness(model.omega, self.sources),
             model.fixed_stiffness,
             -(w**2) * values.masses[:, 0],
             *(load[:, None] for load, _ in loads),
@@ -285,7 +299,7 @@ class PlateAt:
     def drive(self) -> ComplexArray:
         """Force of each drive on the plate per unit of what it plays, times -omega² (f, n)."""
         values, model = self.values, self.model
-        force = self.base * values.drive_gains * model.drive_gains * self.lag
+        force = self.force * values.drive_gains * model.drive_gains * self.lag
         return np.asarray(-(model.omega**2)[:, None] * force)
 
     @cached_property
@@ -305,10 +319,24 @@ class PlateAt:
         return np.asarray(np.exp(-1j * self.model.omega[:, None, None] * delays))
 
     @cached_property
+    def seen(self) -> ComplexArray:
+        """Receptance between sensors and ERAs, each sensor's mass on the plate (f, s, n) [m/N]."""
+        found = self.receptance[:, self.model.observed, : self.force.shape[1]]
+        return found if self.lightness is None else self.lightness[:, :, None] * found
+
+    @cached_property
+    def lightness(self) -> ComplexArray | None:
+        """Motion of the plate at each sensor relative to one without its mass, None where 1."""
+        inertia, at = self.model.sensor_inertia, self.model.observed
+        return None if inertia is None else 1 / (1 - inertia * self.receptance[:, at, at])
+
+    @cached_property
     def responses(self) -> ComplexArray:
-        """Acceleration at each sensor per base displacement of each ERA (f, s, n) [1/s²]."""
-        n = self.base.shape[1]
-        return np.asarray(self.scale * self.receptance[:, self.model.observed, :n])
+        """Acceleration at each sensor per unit of the drive of each ERA (f, s, n).
+
+        [1/s²] of a base that moves, [m/s²/V] of an exciter.
+        """
+        return np.asarray(self.scale * self.seen)
 
     def _functions(self) -> FreeReceptance:
         model, values = self.model, self.values

@@ -82,6 +82,9 @@ KINDS = {
     # By data sheets: of the plate's mass that an ERA carries.
     "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
     # Of an ERA, on each axis.
+    # Of exciters, by parts of one kind beside each other.
+    "magnet_mass": Kind(0.1, drift=0.0),
+    "force_factor": Kind(0.1, drift=0.01),
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
     "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
@@ -101,6 +104,9 @@ theory: on plates of 1.5 mm without shear deformation, with viscous losses
 (docs/measured/identification.md). No measurement tells of it, and answers do not depend on it.
 """
 
+EXCITER_KINDS = ("magnet_mass", "force_factor")
+"""Kinds of which exciters alone have parameters; a rig without any has none."""
+
 FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
 """Kinds of which a plate with form errors alone has parameters."""
 
@@ -113,6 +119,7 @@ VALUE_UNITS = {
     "stiffness": "N/m",
     "damping": "N s/m",
     "bolt_mass": "kg",
+    "magnet_mass": "kg",
 }
 """Units of the values of a rig that parameters change."""
 
@@ -258,8 +265,13 @@ def space_of(
     add("loss_exponent", ["loss exponent"], exponent * lossy, lower=low, upper=high)
     add("gain", [f"gain {name}" for name in eras], uncertainty.gain)
     add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
-    # A measured gain has the lag of its drive in it.
-    lagging = np.array([float(drives_lag and not era.gains) for era in rig.eras])
+    # A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
+    lagging = np.array(
+        [
+            float(drives_lag and not era.gains and "force_factor" not in era.fields)
+            for era in rig.eras
+        ]
+    )
     for kind in ("inertia", "drag"):
         std = KINDS[kind].std * lagging
         add(kind, [f"{kind} of drive {name}" for name in eras], std, lower=0.0)
@@ -268,8 +280,13 @@ def space_of(
     add("delay", [f"delay of amplifier {name}" for name in amplifiers], delays)
     add("sensor_gain", [f"gain of sensor {name}" for name in sensors])
     add("sensor_phase", [f"phase of sensor {name}" for name in sensors])
-    least = [-era.bolt_mass / KINDS["bolt_mass"].std for era in rig.eras]
+    least = np.array([-getattr(era, era.fields["bolt_mass"]) for era in rig.eras])
+    least /= KINDS["bolt_mass"].std
     add("bolt_mass", [f"bolt mass {name}" for name in eras], lower=least)
+    for kind in EXCITER_KINDS:
+        excites = np.array([float(kind in era.fields) for era in rig.eras])
+        names = [f"{kind.replace('_', ' ')} {name}" for name in eras if excites.any()]
+        add(kind, names, KINDS[kind].std * excites[: len(names)])
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
     add(
@@ -313,10 +330,15 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
         mode_count=form_modes or 0,
         form_of=len(sensors) if has_form else None,
     )
-    damping, bolt = np.array([(era.damping, era.bolt_mass) for era in rig.eras]).T
+    damping, bolt = (
+        np.array([getattr(era, era.fields[kind]) for era in rig.eras])
+        for kind in ("damping", "bolt_mass")
+    )
     ratio = np.array(
         [
-            damping_from_ratio(1.0, stiffness=era.stiffness, plate_mass=plate.mass, era_count=count)
+            damping_from_ratio(
+                1.0, stiffness=era.in_time.stiffness, plate_mass=plate.mass, era_count=count
+            )
             for era in rig.eras
         ]
     )

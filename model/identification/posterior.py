@@ -100,10 +100,16 @@ def relevant(space: Space) -> dict[str, FloatArray]:
     mass = _rows(space, "thickness")
     by_rigidity = mass + _rows(space, "modulus") / 2
     gain, phase = _rows(space, "gain"), _rows(space, "phase")
+    damping = _rows(space, "damping_each") + _rows(space, "damping") - mass
+    factor = space.groups["force_factor"]
+    if factor.stop > factor.start:
+        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        damping = damping[space.std[factor] == 0]
+        gain = gain + _rows(space, "force_factor")
     return {
         "frequency": by_rigidity + _rows(space, "mode_shifts") / 2,
         "stiffness": _rows(space, "stiffness") - mass,
-        "damping": _rows(space, "damping_each") + _rows(space, "damping") - mass,
+        "damping": damping,
         "loss": _rows(space, "loss") + _rows(space, "mode_losses"),
         "gain": gain - gain.mean(axis=0),
         "phase": phase - phase.mean(axis=0),

@@ -10,7 +10,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.identification.parameters import Space
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import Era, Gain, PointLoad
+from model.structure.attachments import Gain, PointLoad, Source
 from model.structure.plate import LOSS_FREQUENCY, Plate
 
 _LEAST_MASS = 1e-5  # kg; less is none
@@ -22,7 +22,8 @@ class Values:
     """A rig's plate with n ERAs, m additional masses and k fingers, in units of the model.
 
     thickness, modulus: factors; loss_factor at LOSS_FREQUENCY, loss_exponent; stiffness [N/m],
-    damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs; masses (m, 3): kg and x,
+    damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs, bolts of exciters their
+    coils; magnet_mass, force_factor (n,): of exciters, factors; masses (m, 3): kg and x,
     y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
     loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
     beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
@@ -41,6 +42,8 @@ class Values:
     stiffness: FloatArray
     damping: FloatArray
     bolt_mass: FloatArray
+    magnet_mass: FloatArray
+    force_factor: FloatArray
     places: FloatArray
     masses: FloatArray
     mode_shifts: FloatArray
@@ -64,7 +67,10 @@ class Values:
             return space.values(x, kind)
 
         plate, n = rig.plate, len(rig.eras)
-        k, c, m = np.array([(era.stiffness, era.damping, era.bolt_mass) for era in rig.eras]).T
+        k, c, m = (
+            np.array([getattr(era, era.fields[kind]) for era in rig.eras])
+            for kind in ("stiffness", "damping", "bolt_mass")
+        )
         at = np.array([(era.x, era.y) for era in rig.eras])
         sides = np.array([plate.length, plate.width])
         masses = own("masses").reshape(-1, 3)
@@ -78,6 +84,8 @@ class Values:
             stiffness=k * np.exp(own("stiffness")),
             damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
             bolt_mass=m + own("bolt_mass"),
+            magnet_mass=np.exp(np.append(own("magnet_mass"), np.zeros(n))[:n]),
+            force_factor=np.exp(np.append(own("force_factor"), np.zeros(n))[:n]),
             places=at + own("place").reshape(n, 2),
             masses=masses,
             mode_shifts=own("mode_shifts"),
@@ -93,6 +101,21 @@ class Values:
             foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
             stretch=np.append(own("side") / sides[: len(own("side"))], own("poisson")),
         )
+
+    def sources(self, rig: Rig) -> list[Source]:
+        """The rig's ERAs with their values, where the rig has them and without gains."""
+        found = []
+        for number, era in enumerate(rig.eras):
+            new = {
+                "stiffness": self.stiffness[number],
+                "damping": max(self.damping[number], 0.0),
+                "bolt_mass": max(self.bolt_mass[number], 0.0),
+            }
+            for kind in era.fields.keys() - new:
+                new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
+            fields = {era.fields[kind]: float(value) for kind, value in new.items()}
+            found.append(replace(era, gains=(), **fields))
+        return found
 
     def lag(self, frequencies: FloatArray) -> ComplexArray:
         """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
@@ -128,12 +151,9 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
             era,
             x=float(places[number, 0]),
             y=float(places[number, 1]),
-            stiffness=float(values.stiffness[number]),
-            damping=float(max(values.damping[number], 0.0)),
-            bolt_mass=float(max(values.bolt_mass[number], 0.0)),
-            gains=_gains(era, rig, values, number),
+            gains=_gains(rig, values, number),
         )
-        for number, era in enumerate(rig.eras)
+        for number, era in enumerate(values.sources(rig))
     )
     return replace(
         rig,
@@ -155,12 +175,13 @@ def additional_masses(values: Values) -> Sequence[PointLoad]:
     ]
 
 
-def _gains(era: Era, rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
+def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     """Measured gains times what was identified; of an ERA without any at one frequency.
 
     Over the rig's frequencies where the drive lags, and where the clock of its amplifier does.
     """
-    lags, delay = values.inertia[number] or values.drag[number], _delay(era, rig, values)
+    era = rig.eras[number]
+    lags, delay = values.inertia[number] or values.drag[number], _delay(era.name, rig, values)
     if values.drive_gains[number] == 1 and not (lags or delay):
         return era.gains
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
@@ -177,9 +198,9 @@ def _gains(era: Era, rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     )
 
 
-def _delay(era: Era, rig: Rig, values: Values) -> float:
+def _delay(era: str, rig: Rig, values: Values) -> float:
     """By which an ERA is late with its amplifier's clock [s]."""
     if not len(values.delays):
         return 0.0
     names = sorted({channel.amplifier for channel in rig.wiring.values()})
-    return float(values.delays[names.index(rig.wiring[era.name].amplifier)])
+    return float(values.delays[names.index(rig.wiring[era].amplifier)])

@@ -12,9 +12,9 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 
 import cmath
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,15 +49,105 @@ class Support(Protocol):
         """Force on it per displacement [N/m] at omega [rad/s], of its shape."""
 
 
+@dataclass(frozen=True)
+class InTime:
+    """A source in time: a spring and a damper from the plate to its far end, and what drives it.
+
+    mass [kg]: moves with the plate; stiffness [N/m], damping [N s/m]; far_mass [kg]: of the far
+    end, None where that moves by itself or is held; by_drive, by_rate: force that pushes the plate
+    and the far end apart per unit of the drive and of its rate.
+    """
+
+    mass: float
+    stiffness: float
+    damping: float
+    far_mass: float | None
+    by_drive: float
+    by_rate: float
+
+
 class Source(Support, Protocol):
-    """What drives the plate, and supports it: an ERA, or a force with an impedance."""
+    """What drives the plate, and supports it: an actuator.
+
+    Its drive is in a unit of its own, metres of an ERA's base or volts of an exciter. Errors of its
+    spring and damper act on the plate with the change of D times the base less the plate's motion.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its name in the rig."""
+
+    @property
+    def full_level(self) -> float:
+        """Amplitude of its drive at level 1."""
+
+    @property
+    def gains(self) -> tuple[Gain, ...]:
+        """Its measured gain."""
+
+    @property
+    def support(self) -> "PointLoad":
+        """What it is at rest to a plate that moves slowly."""
+
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time."""
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain of its drive at frequencies [Hz], of their shape."""
 
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
 
+    def base(self, omega: FloatArray) -> ComplexArray:
+        """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
+
+    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of its stiffness [N/m]."""
+
+    def by_damping(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of its damping [N/m]."""
+
+    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
+        """The source with another stiffness and damping, by factors."""
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Its fields that an identification may change, by the kind of parameter."""
+
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D [N/m] and of the force [N] with its values, by kind, each as omega.
+
+        With damping [N s/m] and bolt_mass [kg], of all others with the logarithm.
+        """
+
+
+class MeasuredGains:
+    """The measured gain of a source: gains at ascending frequencies, empty for a gain of 1."""
+
+    gains: tuple[Gain, ...]
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
+
+        Linear between measured frequencies, constant outside. At negative frequencies, as in the
+        lower sideband of a fast ramp, the conjugate: what is driven is real.
+        """
+        if not self.gains:
+            return np.ones(np.shape(frequencies), dtype=complex)
+        measured = [frequency for frequency, _, _ in self.gains]
+        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
+        found = np.interp(np.abs(frequencies), measured, values)
+        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+
+    def _tuples_of_gains(self) -> None:
+        """Keep gains as tuples: a file gives lists, which cannot be compared and hashed."""
+        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
+        object.__setattr__(self, "gains", gains)
+
 
 @dataclass(frozen=True)
-class Era:
+class Era(MeasuredGains):
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
     x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
@@ -85,27 +175,23 @@ class Era:
             at_least="damping bolt_mass foot",
             finite="x y",
         )
-        # A file gives lists; only tuples can be compared and hashed with the rest.
-        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
-        object.__setattr__(self, "gains", gains)
+        self._tuples_of_gains()
 
-    def gain(self, frequencies: FloatArray) -> ComplexArray:
-        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
-
-        Linear between measured frequencies, constant outside. At negative frequencies, as in the
-        lower sideband of a fast ramp, the conjugate: the base's motion is real.
-        """
-        if not self.gains:
-            return np.ones(np.shape(frequencies), dtype=complex)
-        measured = [frequency for frequency, _, _ in self.gains]
-        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
-        found = np.interp(np.abs(frequencies), measured, values)
-        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+    @property
+    def full_level(self) -> float:
+        """Amplitude of its base at level 1, its stroke [m]."""
+        return self.stroke
 
     @property
     def support(self) -> "PointLoad":
         """The ERA at rest, as a load of the plate."""
         return PointLoad(self.x, self.y, self.stiffness, self.damping, self.bolt_mass, self.foot)
+
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time; the base moves by itself."""
+        k, c = self.stiffness, self.damping
+        return InTime(self.bolt_mass, k, c, far_mass=None, by_drive=k, by_rate=c)
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k_b + i omega c - omega² m_b [N/m] at omega [rad/s], of its shape."""
@@ -118,6 +204,30 @@ class Era:
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
         return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
+
+    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of k_b, k_b [N/m]."""
+        return np.full(np.shape(omega), self.stiffness, dtype=complex)
+
+    def by_damping(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of c, i omega c [N/m]."""
+        return np.asarray(1j * omega * self.damping)
+
+    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
+        """An ERA that is stiffer and damps more by factors."""
+        return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    @property
+    def fields(self) -> Mapping[str, str]:
+        """Its spring, damper and bolt."""
+        return {kind: kind for kind in ("stiffness", "damping", "bolt_mass")}
+
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D and of the force, which spring and damper pass on from the base."""
+        w, base = np.asarray(omega), self.base(omega)
+        held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
+        bolt = -(w**2) + 0j, np.zeros(w.shape, dtype=complex)
+        return {kind: (own, own * base) for kind, own in held.items()} | {"bolt_mass": bolt}
 
 
 def damping_from_ratio(

@@ -21,12 +21,6 @@ DEFAULT_LEVEL = 0.3
 
 def measure(
     rig_file: RigArgument,
-    device: Annotated[
-        str,
-        typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
-        ),
-    ],
     sensors_file: Annotated[
         Path,
         typer.Option(
@@ -38,6 +32,20 @@ def measure(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="MEASURED.uff|.csv", help="File to write.")
     ],
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
+        ),
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE|DIR",
+            help="In place of --device: a stepped sine that was recorded, .wav, or measured, .csv.",
+        ),
+    ] = None,
     frequencies: Annotated[
         str | None,
         typer.Option(
@@ -90,22 +98,32 @@ def measure(
     lines = parse_frequencies(frequencies) if frequencies else None
     desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True))
     is_moved = are_places(desk.sensors)
+    if (device is None) == (source is None):
+        raise InputError("give --device, a sound card, or --from, what another has measured")
     for option, is_wrong, needs in (
+        ("--frequencies", source is not None and lines is not None, "--device"),
+        ("--stepped", source is not None and stepped, "--device"),
+        ("--resume", source is not None and resume, "--device"),
         ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
         ("--stepped", stepped and is_moved, "sensors that stay where they are"),
     ):
         if is_wrong:
             raise InputError(f"{option} needs {needs}; leave it out")
-    opened = open_desk(desk, device, level=level, frequencies=lines, seed=seed)
-    if is_moved:
-        from sim.desk.moved_cli import measure_by_moving
+    is_whole = True
+    if source is not None:
+        from sim.desk.stepped_cli import measured_from
 
-        rows, answer, is_whole = measure_by_moving(
-            desk, opened, output, periods=periods, is_resumed=resume
-        )
+        rows, answer = measured_from(source, desk, output)
     else:
-        rows, answer = _measure_at_once(desk, opened, output, periods=periods, stepped=stepped)
-        is_whole = True
+        opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)
+        if is_moved:
+            from sim.desk.moved_cli import measure_by_moving
+
+            rows, answer, is_whole = measure_by_moving(
+                desk, opened, output, periods=periods, is_resumed=resume
+            )
+        else:
+            rows, answer = _measure_at_once(desk, opened, output, periods=periods, stepped=stepped)
     if is_whole:
         next_words = ("calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated"))
         rows.append(next_line("era", *next_words))

@@ -47,7 +47,7 @@ def somewhere(space: Space, seed: int) -> FloatArray:
     x[space.groups["masses"].start] = 1.0
     lag = space.of("inertia", "drag")
     x[lag] = np.abs(x[lag])
-    x = np.clip(x * space.uncertain, space.lower, space.upper)
+    x = np.clip(x, space.lower + 0.1, space.upper - 0.1) * space.uncertain
     return inwards(space, x, by=0.6)
 
 

@@ -64,8 +64,13 @@ class DeskModel:
         """Number of the first states, which are the same under any fingers."""
         return 2 * len(self._plate.omega) + 2 * len(self._truth.rig.eras)
 
-    def under(self, fingers: Sequence[FingertipLoad] = ()) -> ModelInTime:
-        """The plate with fingers on it."""
+    def under(
+        self, fingers: Sequence[FingertipLoad] = (), *, moved: tuple[int, float] | None = None
+    ) -> ModelInTime:
+        """The plate with fingers on it.
+
+        moved: the only point with an accelerometer now, by its number, and its mass [kg].
+        """
         rig, r = self._truth.rig, len(self._plate.omega)
         count = len(rig.eras)
         at_eras, at_masses = self._at_attached[:count], self._at_attached[count:]
@@ -82,6 +87,11 @@ class DeskModel:
             damping += load.damping * np.outer(shape, shape)
             stiffness += load.stiffness * np.outer(shape, shape)
         damping += self._structural(mass, stiffness)
+        at_points = self._at_points
+        if moved is not None:
+            number, weight = moved
+            at_points = at_points[[number]]
+            mass += weight * at_points.T @ at_points
 
         contacts = self._plate.at(footprints_of(fingers)) if fingers else np.empty((0, r))
         p = len(fingers)
@@ -121,7 +131,7 @@ class DeskModel:
             A[row, v] = tip.damping / tip.phalanx_mass * shape
             A[row, phalanx] = -(tip.stiffness + tip.joint_stiffness) / tip.phalanx_mass
             A[row, row] = -(tip.damping + tip.joint_damping) / tip.phalanx_mass
-        return ModelInTime(A, B, self._at_points @ motion)
+        return ModelInTime(A, B, at_points @ motion)
 
     def _structural(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
         """Viscous damping that loses at each resonance of the supported plate what eta does.

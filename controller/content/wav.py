@@ -6,9 +6,7 @@ the sharpness is that of the stronger. What lies outside the frequencies that a 
 for is left out, and said in dB.
 """
 
-import io
 import math
-import warnings
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,8 @@ from controller.content.format import (
 from controller.content.mixing import thinned
 from controller.content.pattern import Curve, Pattern
 from model.arrays import FloatArray
+from model.errors import InputError
+from model.files.wav_file import samples_of
 
 _RATE = 200  # points a second
 _PER_POINT = 10  # samples of the analytic signal
@@ -62,31 +62,15 @@ class Wav(ContentFormat):
 
 def _samples(content: bytes, source: str) -> tuple[int, FloatArray]:
     """Return the rate [Hz], and samples (n, channels) of which 1 is full scale."""
-    from scipy.io import wavfile  # slow to import
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", r"Chunk \(non-data\)", wavfile.WavFileWarning)
-        try:
-            rate, given = wavfile.read(io.BytesIO(content))
-        except Exception as error:  # of a damaged file anything
-            message = f"is no WAV file of PCM or float: {error}; save it as one"
-            raise refusal(source, message) from error
+    try:
+        rate, samples = samples_of(content)
+    except InputError as error:
+        raise refusal(source, str(error)) from error
     if not _MIN_RATE <= rate <= _MAX_RATE:
         raise refusal(source, f"sample rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate}")
-    if problem := too_much(len(given) / rate, 0):
+    if problem := too_much(len(samples) / rate, 0):
         raise refusal(source, problem)
-    if not given.size:
-        raise refusal(source, "has no samples")
-    return rate, _scaled(given).reshape(len(given), -1)
-
-
-def _scaled(given: Any) -> FloatArray:
-    if given.dtype == np.uint8:
-        return np.asarray((given.astype(float) - 128) / 128)
-    full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
-    with np.errstate(all="ignore"):  # of float what is too large or no number is refused later
-        return np.asarray(given.astype(float) / full)
+    return rate, samples
 
 
 def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:

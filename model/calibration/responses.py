@@ -26,7 +26,9 @@ class MeasuredValue:
     """Acceleration at one sensor per base displacement of one ERA [1/s²] at a frequency [Hz].
 
     Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
-    known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors.
+    known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors;
+    sensor_mass [kg]: as `Responses.masses`; setting: with what it was measured, in words, "" for
+    not known.
     """
 
     era: str
@@ -36,6 +38,8 @@ class MeasuredValue:
     frequency: float
     value: complex
     place: str
+    sensor_mass: float = 0.0
+    setting: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,8 @@ class Responses:
 
     sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
     has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
-    known, and no polarity; skipped: number of values beyond the rig's limits of frequency.
+    known, and no polarity; skipped: number of values beyond the rig's limits of frequency. masses
+    (s,) [kg]: of a sensor that is moved, as `Sensor.mass`; None for none.
     """
 
     sensors: tuple[str, ...]
@@ -53,6 +58,7 @@ class Responses:
     values: ComplexArray
     has_phases: bool = True
     skipped: int = 0
+    masses: FloatArray | None = None
 
     @property
     def count(self) -> int:
@@ -72,6 +78,7 @@ class Responses:
             sensors=tuple(compress(self.sensors, kept)),
             points=self.points[kept],
             values=self.values[:, :, kept],
+            masses=None if self.masses is None else self.masses[kept],
         )
 
 
@@ -94,6 +101,7 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     if skipped:
         _logger.warning("%d of %d values beyond %s are left out", skipped, len(measured), limits)
     sensors: dict[str, tuple[float, float]] = {}
+    masses: dict[str, float] = {}
     first: dict[str, str] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
     found: dict[tuple[float, int, str], complex] = {}
@@ -106,6 +114,11 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
             raise InputError(
                 f"{each.place}: sensor {each.sensor} must have one position, got {_shown(known)} "
                 f"({place}) and {_shown(each.point)} m; name sensors differently"
+            )
+        if masses.setdefault(each.sensor, each.sensor_mass) != each.sensor_mass:
+            raise InputError(
+                f"{each.place}: sensor {each.sensor} must have one mass, got "
+                f"{1e3 * masses[each.sensor]:g} ({place}) and {1e3 * each.sensor_mass:g} g"
             )
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
@@ -123,7 +136,14 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
         values[np.searchsorted(frequencies, frequency), number, column[sensor]] = value
     # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    return Responses(tuple(sensors), points, frequencies, values, skipped=skipped)
+    return Responses(
+        tuple(sensors),
+        points,
+        frequencies,
+        values,
+        skipped=skipped,
+        masses=np.array([*masses.values()]) if any(masses.values()) else None,
+    )
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:

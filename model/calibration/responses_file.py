@@ -3,9 +3,13 @@
 A CSV file has exactly the columns below and one value a line, in any order. A UFF file has a
 function of type 4 for every sensor and ERA, acceleration over displacement, with the nodes'
 positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
+
+The mass of a sensor that is moved and the setting of a measurement are in columns of their own, or
+in the second line of free text of a function: `sensor_mass_g=2 setting=level 0.1`.
 """
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +17,7 @@ import numpy as np
 
 from model.calibration.responses import MeasuredValue, Responses
 from model.errors import InputError
-from model.files.csv_file import read_lines, write_columns
+from model.files.csv_file import Column, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
@@ -28,6 +32,11 @@ from model.rig.rig import Rig
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
+MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
+_NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
+MAX_SENSOR_MASS = 500.0
+"""g; of a sensor that is moved. One that weighs more is no accelerometer."""
+
 _UP = 3  # +z
 # SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
 _ACCELERATION_UNITS = {
@@ -60,10 +69,24 @@ def read_measured(path: Path) -> list[MeasuredValue]:
     raise InputError(f"{path}: name of measured responses must end in .csv, .uff or .unv")
 
 
-def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
+def write_responses(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+    """Write responses as CSV or UFF by the name's ending; setting: as `MeasuredValue`.
+
+    Raises OSError.
+    """
+    write = write_responses_csv if path.suffix.lower() == ".csv" else write_responses_uff
+    write(path, responses, rig, setting=setting)
+
+
+def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
     """Write responses as CSV with all digits; raises OSError."""
     f, e, s = np.nonzero(np.isfinite(responses.values))
     values = responses.values[f, e, s]
+    further: dict[str, Column] = {}
+    if responses.masses is not None:
+        further[MASS] = 1e3 * responses.masses[s]
+    if setting:
+        further[SETTING] = [setting] * len(s)
     write_columns(
         path,
         {
@@ -76,12 +99,15 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
             "frequency_hz": responses.frequencies[f],
             "real_1_s2": values.real,
             "imag_1_s2": values.imag,
+            **further,
         },
     )
 
 
-def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
+def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
     """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
+    masses = np.zeros(len(responses.sensors)) if responses.masses is None else responses.masses
+    notes = [f"{MASS}={1e3 * mass:.10g} {SETTING}={setting}" for mass in masses]
     positions = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
@@ -101,6 +127,7 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
                         responses.values[measured, e, s],
                         (FREQUENCY, ACCELERATION, DISPLACEMENT),
                         ("m/s^2", "m"),
+                        note=notes[s] if setting or masses[s] else "",
                     )
                 )
     nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, positions, strict=True)}
@@ -109,7 +136,7 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
     found = []
-    for line in read_lines(path, COLUMNS, optional=ERA_COLUMNS):
+    for line in read_lines(path, COLUMNS, optional=(*ERA_COLUMNS, MASS, SETTING)):
         at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
         if len(at_era) == 1:
             raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
@@ -121,7 +148,20 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
             raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
         era_point = (at_era[0], at_era[1]) if at_era else None
         value = complex(real, imaginary)
-        found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, line.place))
+        mass, setting = line.number(MASS, 0.0), line.cells.get(SETTING, "")
+        found.append(
+            MeasuredValue(
+                era,
+                sensor,
+                (x, y),
+                era_point,
+                frequency,
+                value,
+                line.place,
+                _mass(line.place, mass),
+                setting,
+            )
+        )
     return found
 
 
@@ -169,6 +209,7 @@ def _uff_values(
         name = f"{name or 'node'}:{function.response}"
     scale *= math.prod(-1 if direction < 0 else 1 for direction in function.directions)
     x, y, _ = content.nodes[function.response]
+    mass, setting = _noted(function)
     era_point = None if reference is None else (float(reference[0]), float(reference[1]))
     return [
         MeasuredValue(
@@ -179,6 +220,8 @@ def _uff_values(
             hertz * frequency,
             scale * value,
             place,
+            mass,
+            setting,
         )
         for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
     ]
@@ -191,3 +234,22 @@ def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
         spelled = ", ".join(filter(None, known))
         raise InputError(f"{place}: unit must be one of {spelled}, got {label!r}; export it so")
     return known[plain]
+
+
+def _noted(function: Function) -> tuple[float, str]:
+    """Mass of the sensor [kg] and setting by the free text of a function; raises InputError."""
+    found = _NOTE.search(function.note)
+    if found is None:
+        return 0.0, ""
+    try:
+        mass = float(found["mass"])
+    except ValueError:
+        mass = math.nan
+    return _mass(function.place, mass), (found["setting"] or "").strip()
+
+
+def _mass(place: str, grams: float) -> float:
+    """A sensor's mass [kg] from grams; raises InputError."""
+    if not 0 <= grams <= MAX_SENSOR_MASS:  # nor for NaN
+        raise InputError(f"{place}: {MASS} must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}")
+    return grams / 1e3

@@ -112,6 +112,7 @@ _FULL = 0.999  # of full scale
 _LOOPED = 0.05  # of a sample that a loop-back brings back at least
 _CROSSTALK = 0.02  # of it, that other outputs may
 _COHERENT = 0.9  # in the median over frequencies
+_FAINT = 0.01  # of full scale: what converters themselves add is heard beside it
 _MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
 
 
@@ -213,22 +214,32 @@ def check_clocks(
 
 
 def check_coherence(
-    found: Estimate, sensors: Sequence[WiredSensor], eras: Sequence[tuple[str, int]]
+    found: Estimate,
+    recorded: Sequence[FloatArray],
+    sensors: Sequence[WiredSensor],
+    eras: Sequence[tuple[str, int]],
 ) -> None:
-    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing."""
+    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing.
+
+    found: of what was recorded, runs (n, inputs) each.
+    """
     columns = [sensor.input - 1 for sensor in sensors]
     coherence = np.median(found.coherence[:, columns], axis=0)
-    incoherent = [
-        f"{sensor.name} ({each:.2f})"
-        for sensor, each in zip(sensors, coherence, strict=True)
-        if each < _COHERENT
-    ]
-    if incoherent:
-        raise LinkError(
-            f"coherence must be at least {_COHERENT:g} in the median, got {', '.join(incoherent)}; "
-            "check how these sensors are mounted, their cables and mains hum, choose a higher "
-            "--level or more --periods, or delete their lines"
-        )
+    peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
+    for are_faint, remedy in (
+        (True, "too low a level: choose a higher --level, or turn up the gain of the input"),
+        (False, "fix these sensors to the plate, check their cables and mains hum"),
+    ):
+        incoherent = [
+            f"{sensor.name} ({each:.2f}, input up to {100 * peak:.2g} % of full scale)"
+            for sensor, each, peak in zip(sensors, coherence, peaks, strict=True)
+            if each < _COHERENT and (peak < _FAINT) == are_faint
+        ]
+        if incoherent:
+            raise LinkError(
+                f"coherence must be at least {_COHERENT:g} in the median, got "
+                f"{', '.join(incoherent)}; {remedy}"
+            )
     moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
     for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):
         if each < _MOVED:

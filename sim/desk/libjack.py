@@ -103,7 +103,7 @@ class JackClient:
         return _names(libjack().jack_get_ports(self.pointer, pattern, _AUDIO, flags))
 
     def first_ports(self, other: str, flag: int, count: int) -> list[str]:
-        """The first of such ports; raises InputError where there are fewer, NoSound without card."""
+        """The first of such ports; InputError where there are fewer, NoSound without a card."""
         found = self.ports_of(other, flag)
         what = "outputs" if flag == IS_INPUT else "inputs"  # of the other client
         if not found and count and not other:
@@ -123,10 +123,10 @@ class JackClient:
         Outputs are what it plays: ports that take samples.
         """
         ports = _names(libjack().jack_get_ports(self.pointer, None, _AUDIO, 0))
-        names = dict.fromkeys(port.partition(":")[0] for port in ports)
+        names = dict.fromkeys(["", *(port.partition(":")[0] for port in ports)])
         return [
-            (name, *(len(self.ports_of(name, flag)) for flag in (IS_INPUT, IS_OUTPUT)))
-            for name in ("", *names)
+            (name, len(self.ports_of(name, IS_INPUT)), len(self.ports_of(name, IS_OUTPUT)))
+            for name in names
         ]
 
     def takers(self, other: str, count: int) -> list[str]:

@@ -83,7 +83,8 @@ def soft_amp(
 ) -> None:
     """Be an amplifier that plays through a sound device. Print its URL; Ctrl-C ends.
 
-    Wait, in fault, for a sound server that does not run. Silence is samples of zero. Level 1 is full scale of the device. Silent within 50 ms once its host or itself is killed.
+    Wait, in fault, for a sound server that does not run. Silence is samples of zero. Level 1 is
+    full scale of the device. Silent within 50 ms once its host or itself is killed.
     """
     from model.commands.options import print_report
     from sim.desk.devices import listed_devices

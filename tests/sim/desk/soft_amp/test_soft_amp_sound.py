@@ -100,7 +100,7 @@ async def test_silence_is_an_open_output_of_zeros(
     sound: tuple[Capture, dict[str, str]], tmp_path: Path
 ) -> None:
     """After a lost host, a stop and a disarm: connected, no gap, and every sample exactly zero."""
-    capture, environment = sound
+    _, environment = sound
     here = capture_on(environment["JACK_DEFAULT_SERVER"], "zeros", 2)
     options = ("--device", "jack:zeros", "--channels", "2", "--link", str(tmp_path / "amp"))
     soft_amp = SoftAmp(*options, environment=environment, log=tmp_path / "log")

@@ -88,14 +88,13 @@ def outputs(
         _write(rig_file, output, channels)
     is_wrong = any(each.verdict for each in heard if each.era) or bool(missing)
     is_wrong = is_wrong or (channels != own and not is_written)
+    again = ["era", "outputs", rig_file, "--device", device, "-o", rig_file.with_stem("wired")]
+    if sensors_file is not None:
+        again += ["--sensors", sensors_file]
     rows = [
         *_rows(heard, own, channels, missing, has_sensors=bool(desk.sensors)),
         f"wrote {output}" if is_written else None,
-        None
-        if missing or channels == own or is_written
-        else next_line(
-            "era", "outputs", rig_file, "--device", device, "-o", rig_file.with_stem("wired")
-        ),
+        None if missing or channels == own or is_written else next_line(*again),
     ]
     answer = {
         "outputs": [

@@ -76,6 +76,14 @@ def measure(
         bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
     ] = False,
     seed: Annotated[int, typer.Option(metavar="N", help="Draw other phases.", min=0)] = 0,
+    impedance: Annotated[
+        bool,
+        typer.Option(
+            "--impedance",
+            help="Measure an exciter instead: era measure --impedance --help.",
+            show_default=False,
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a plate through a sound card.

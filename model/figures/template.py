@@ -5,7 +5,7 @@ Lengths are millimetres. A template of the underside is mirrored left to right, 
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from model.config.units import LENGTH, quantity
 from model.figures import save_figure
 from model.files.array_file import whole_or_nothing
 from model.rig.rig import Rig
@@ -57,10 +58,15 @@ class Template:
         """Yield name, place and radius [mm], and the style of the circle, of all that is glued."""
         for era in self.rig.eras:
             yield era.name, (1000 * era.x, 1000 * era.y), 1000 * era.foot, "solid"
-        unnamed = len(self.rig.masses) - len(self.rig.supports)
-        names = [*(f"{1000 * each.mass:g} g" for each in self.rig.masses[:unnamed])]
-        for name, load in zip([*names, *self.rig.supports], self.rig.masses, strict=True):
-            yield name, (1000 * load.x, 1000 * load.y), 1000 * load.foot, "dashed"
+        data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
+        driven = {era.name for era in self.rig.eras}
+        others = [data.get(kind, {}).items() for kind in ("eras", "masses", "supports")]
+        for name, keys in chain(*others):
+            if "at" in keys and name not in driven:
+                x, y, foot = (
+                    1000 * quantity(k, LENGTH) for k in (*keys["at"], keys.get("foot", 0))
+                )
+                yield name, (x, y), foot, "dashed"
         for name, (x, y) in self.sensors.items():
             yield name, (1000 * x, 1000 * y), 0.0, "dotted"
 

@@ -31,7 +31,7 @@ def samples_of(content: bytes) -> tuple[int, FloatArray]:
 
 def _scaled(given: Any) -> FloatArray:
     if given.dtype == np.uint8:
-        return np.asarray((given.astype(float) - 128) / 128)
+        return np.asarray((given.astype(np.float32) - 128) / 128)
     full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
     with np.errstate(all="ignore"):  # of float what is too large or no number is refused later
-        return np.asarray(given.astype(float) / full)
+        return np.asarray(given.astype(np.float32) / full)

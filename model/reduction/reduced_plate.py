@@ -59,6 +59,7 @@ RESIDUAL_VECTORS = 3  # for each attachment
 
 # Residual vectors below this share of their squared norm are linear combinations of the others.
 _DEPENDENT = 1e-9
+_LEAST_SHIFTED = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +158,11 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     independent = squared_norms > _DEPENDENT * squared_norms.max(initial=0.0)
     orthonormal = scale[:, None] * vectors[:, independent] / np.sqrt(squared_norms[independent])
     shifted_eigenvalues, rotation = linalg.eigh(orthonormal.T @ shifted @ orthonormal)
-    omega = np.sqrt(shifted_eigenvalues / free.modes.largest_truncated - free.shift)
-    residual_transform = orthonormal @ rotation
+    # At least 1, the lowest truncated mode's; the local compliance between many near points, which
+    # is an approximation, leaves a few below zero that yield next to nothing.
+    physical = shifted_eigenvalues > _LEAST_SHIFTED
+    omega = np.sqrt(shifted_eigenvalues[physical] / free.modes.largest_truncated - free.shift)
+    residual_transform = orthonormal @ rotation[:, physical]
 
     def shapes(points: FloatArray) -> FloatArray:
         places = np.atleast_2d(np.asarray(points, dtype=float))

@@ -88,7 +88,8 @@ def outputs(
         _write(rig_file, output, channels)
     is_wrong = any(each.verdict for each in heard if each.era) or bool(missing)
     is_wrong = is_wrong or (channels != own and not is_written)
-    again = ["era", "outputs", rig_file, "--device", device, "-o", rig_file.with_stem("wired")]
+    again: list[str | Path] = ["era", "outputs", rig_file, "--device", device]
+    again += ["-o", rig_file.with_stem("wired")]
     if sensors_file is not None:
         again += ["--sensors", sensors_file]
     rows = [

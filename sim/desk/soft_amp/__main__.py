@@ -102,15 +102,12 @@ def _opened(settings: Settings) -> Output | None:
 
 
 def _awaited(settings: Settings, *, rate: int) -> Output:
-    """The device, as soon as it is there; why it is not is told once. rate [Hz]: until then."""
-    told = ""
+    """The device, as soon as it is there, with why it is not until then; rate [Hz]: meanwhile."""
     while True:
         try:
             return open_output(settings)
         except (InputError, LinkError) as problem:
-            if told != str(problem):
-                told = str(problem)
-                _tell(event="waiting", rate=rate, reason=told)
+            _tell(event="waiting", rate=rate, reason=str(problem))
             time.sleep(_RETRY)
 
 

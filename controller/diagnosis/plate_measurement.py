@@ -131,7 +131,7 @@ class PlateSelfMeasurement:
         eras = {self._rig.eras[number].name: frequency for number, frequency in step}
         plays = await self._player.play(
             {
-                era: Tone(frequency, level * self._rig.era(era).stroke)
+                era: Tone(frequency, level * self._rig.era(era).full_level)
                 for era, frequency in eras.items()
             }
         )
@@ -210,7 +210,7 @@ class PlateSelfMeasurement:
                 both = sensor.amplifier, rig.wiring[era].amplifier
                 if both[0] == both[1] or max(held[name] for name in both) <= MAX_HELD:
                     command = plays[era]
-                    base = command.level * rig.era(era).stroke
+                    base = command.level * rig.era(era).full_level
                     turned = np.exp(-1j * math.radians(command.phase))
                     responses[row, number[era]] = acceleration * turned / base
         return _StepResponses(played, responses)

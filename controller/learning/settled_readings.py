@@ -149,7 +149,7 @@ class SettledReadings:
             frequency,
             np.array(
                 [
-                    cmath.rect(tone.level * era.stroke, math.radians(tone.phase))
+                    cmath.rect(tone.level * era.full_level, math.radians(tone.phase))
                     if (tone := applied.drive.get(era.name)) is not None
                     else 0j
                     for era in self._rig.eras

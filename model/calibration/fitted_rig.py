@@ -82,8 +82,16 @@ def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
 
 
 def standard_error(rig: Rig, parameter: Parameter, value: float, error: float) -> float:
-    """Standard error of a value by that of a fit, by the model's, and of the mass it goes by."""
+    """Standard error of a value by that of a fit, by the model's, and of the mass it goes by.
+
+    Responses tell the damping of an exciter's suspension and coil together, and that of the coil
+    is known by its force factor.
+    """
     share = math.hypot(_MODEL_ERROR, _mass_scale_error(rig))
+    if parameter.kind == "damping":
+        era = rig.era(parameter.era)
+        electric = era.in_time.damping - era.damping
+        error = math.hypot(error, 2 * electric * rig.uncertainty.stiffness)
     if parameter.kind == "loss_factor":
         share = _LOSS_ERROR
     return math.hypot(error, share * value)

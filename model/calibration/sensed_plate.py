@@ -31,15 +31,19 @@ _KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value of a rig, such as is fitted: kind, and ERA, "" for the plate."""
+    """A value of a rig, such as is fitted: kind, and ERA, "" for the plate.
+
+    field: of the ERA, which an exciter may have another one of the kind; by default the kind.
+    """
 
     kind: str
     era: str
+    field: str = ""
 
     @property
     def name(self) -> str:
         """Name in reports."""
-        return f"{self.era} {self.kind}" if self.era else f"plate {self.kind}"
+        return f"{self.era or 'plate'} {self.field or self.kind}"
 
     @property
     def unit(self) -> str:
@@ -49,12 +53,13 @@ class Parameter:
     @property
     def is_factor(self) -> bool:
         """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
-        return self.kind in ("modulus", "stiffness")
+        return self.kind in ("modulus", "stiffness", "magnet_mass")
 
     def of(self, rig: Rig) -> float:
         """The value in a rig."""
         if self.era:
-            return float(getattr(rig.era(self.era), self.kind))
+            era = rig.era(self.era)
+            return float(getattr(era, era.fields[self.kind]))
         return (
             rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
         )
@@ -75,9 +80,10 @@ class SensedPlate:
     def rows(self) -> tuple[Parameter, ...]:
         """The fitted values: modulus and loss factor, then those of every ERA, (n,)."""
         of_eras = (
-            Parameter(kind, era.name)
+            Parameter(kind, era.name, era.fields[kind])
             for era in self.rig.eras
-            for kind in ("stiffness", "damping", "bolt_mass")
+            for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
+            if kind in era.fields
         )
         return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
 
@@ -143,6 +149,7 @@ class SensedPlate:
             "modulus": math.hypot(2 * stated.thickness, stated.modulus),
             "loss_factor": factor,
             "stiffness": math.hypot(stated.stiffness, stated.thickness),
+            "magnet_mass": math.hypot(stated.stiffness, stated.thickness),
             "damping": math.hypot(factor, KINDS["damping_each"].std),
         }
         own = np.array([row.of(self.rig) for row in self.rows])

@@ -276,7 +276,7 @@ def _channel(
         return _without_response(rig, number, is_dead=is_dead)
     driven = drives[number]
     # Commands are shares of the stroke of the ERA to which the rig wires the channel.
-    gain = float(match.gains[number]) * era.stroke / rig.eras[driven].stroke
+    gain = float(match.gains[number]) * era.full_level / rig.eras[driven].full_level
     states: list[ChannelState] = []
     confidence = min(
         shapes.confidence(number, driven, other)

@@ -82,9 +82,9 @@ KINDS = {
     # By data sheets: of the plate's mass that an ERA carries.
     "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
     # Of an ERA, on each axis.
-    # Of exciters, by parts of one kind beside each other.
-    "magnet_mass": Kind(0.1, drift=0.0),
-    "force_factor": Kind(0.1, drift=0.01),
+    # Of exciters.
+    "magnet_mass": Kind(_BUILT.stiffness, bound=math.log(10.0)),
+    "force_factor": Kind(_BUILT.stiffness, drift=0.01),
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
     "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
@@ -97,6 +97,8 @@ KINDS = {
     "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
     "poisson": Kind(0.015, "", "", 1.0),
+    # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.viscous_loss`).
+    "loss_law": Kind(1.0, "", "", 1.0),
 }
 """Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead.
 
@@ -107,7 +109,7 @@ theory: on plates of 1.5 mm without shear deformation, with viscous losses
 EXCITER_KINDS = ("magnet_mass", "force_factor")
 """Kinds of which exciters alone have parameters; a rig without any has none."""
 
-FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
+FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
 """Kinds of which a plate with form errors alone has parameters."""
 
 VALUE_UNITS = {
@@ -245,7 +247,8 @@ def space_of(
         space = space.and_further(kind, names, std, lower, upper)
 
     add("thickness", ["thickness"], uncertainty.thickness)
-    add("modulus", ["modulus"], KINDS["modulus"].std * (uncertainty.thickness > 0))
+    modulus = max(KINDS["modulus"].std, uncertainty.modulus)
+    add("modulus", ["modulus"], modulus * (uncertainty.thickness > 0))
     add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
     damping = math.log(uncertainty.damping)
     damped = [float(damping > 0 and era.damping > 0) for era in rig.eras]
@@ -286,7 +289,7 @@ def space_of(
     for kind in EXCITER_KINDS:
         excites = np.array([float(kind in era.fields) for era in rig.eras])
         names = [f"{kind.replace('_', ' ')} {name}" for name in eras if excites.any()]
-        add(kind, names, KINDS[kind].std * excites[: len(names)])
+        add(kind, names, uncertainty.stiffness * excites[: len(names)])
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
     add(
@@ -314,6 +317,7 @@ def space_of(
     add("foreign_mass", [f"mass {n}" for n in range(MASS_CELLS.cell_count) if has_form])
     add("side", ["length", "width"] if has_form else [])
     add("poisson", ["Poisson's ratio"] if has_form else [])
+    add("loss_law", ["loss law"] if has_form else [])
     return space
 
 
@@ -350,8 +354,10 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
     }
     # Places may leave the plate, whose shapes go on by their slopes.
     form = (*FORM, "place", "mode_shifts") if has_form else ()
+    excites = np.array(["magnet_mass" in era.fields for era in rig.eras])
+    magnet = ("magnet_mass",) if excites.any() else ()
     columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
-    for name in ("modulus", "stiffness", "gain", *added, *form):
+    for name in ("modulus", "stiffness", "gain", *magnet, *added, *form):
         kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
         std = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
         lower = -value if name in added else -kind.bound
@@ -359,6 +365,8 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
         columns[:, space.groups[name]] = np.array(
             np.broadcast_arrays(std, lower / std, upper / std)
         ).reshape(3, -1)
+    for name in magnet:
+        columns[0, space.groups[name]] *= excites
     return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 
 

@@ -18,12 +18,12 @@ from urllib.parse import quote
 from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.errors import InputError
-from model.rig.checks import STIFF_MOUNT
+from model.rig.era_section import STIFF_MOUNT
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -95,7 +95,7 @@ def _point_costs(rig: Rig) -> list[str]:
     plate = rig.plate
     decade = math.log(10) / (2 * math.pi * plate.shear_rigidity)
     mounts = [
-        *((era.name, era.stiffness, era.foot) for era in rig.eras),
+        *((era.name, era.support.stiffness, era.foot) for era in rig.eras),
         *(
             (name, load.stiffness, load.foot)
             for name, load in zip(
@@ -145,7 +145,7 @@ def gain_notes(rig: Rig) -> list[str]:
     return [text for era in behind for text in _notes(era, low, high)]
 
 
-def _notes(era: Era, low: float, high: float) -> list[str]:
+def _notes(era: Source, low: float, high: float) -> list[str]:
     if not era.gains:
         return [
             f"eras.{era.name}.gains: missing behind an output, so that its motion is a guess, a "

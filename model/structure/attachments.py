@@ -14,7 +14,7 @@ import cmath
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from model.errors import InputError
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
+
+Factor: TypeAlias = float | FloatArray
+"""Of a parameter that deviates, one or several."""
 
 
 class Support(Protocol):
@@ -53,17 +56,19 @@ class Support(Protocol):
 class InTime:
     """A source in time: a spring and a damper from the plate to its far end, and what drives it.
 
-    mass [kg]: moves with the plate; stiffness [N/m], damping [N s/m]; far_mass [kg]: of the far
-    end, None where that moves by itself or is held; by_drive, by_rate: force that pushes the plate
-    and the far end apart per unit of the drive and of its rate.
+    mass [kg]: moves with the plate; stiffness [N/m], damping [N s/m]; inertance [kg]: force by the
+    relative acceleration of both ends; far_mass [kg]: of the far end, None where that moves by
+    itself or is held; by_drive, by_rate: force that pushes the plate and the far end apart per unit
+    of the drive and of its rate.
     """
 
     mass: float
     stiffness: float
     damping: float
-    far_mass: float | None
-    by_drive: float
-    by_rate: float
+    far_mass: float | None = None
+    by_drive: float = 0.0
+    by_rate: float = 0.0
+    inertance: float = 0.0
 
 
 class Source(Support, Protocol):
@@ -98,6 +103,14 @@ class Source(Support, Protocol):
 
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
+
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Dynamic stiffness [N/m], and force by its drive without its gain, of one that deviates.
+
+        stiffness, damping: by factors; all arguments broadcast.
+        """
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
@@ -156,6 +169,9 @@ class Era(MeasuredGains):
     gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
     """
 
+    LEARNED: ClassVar = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
+    """Fields that measurements of a plate change."""
+
     name: str
     x: float
     y: float
@@ -191,11 +207,18 @@ class Era(MeasuredGains):
     def in_time(self) -> InTime:
         """Its equations in time; the base moves by itself."""
         k, c = self.stiffness, self.damping
-        return InTime(self.bolt_mass, k, c, far_mass=None, by_drive=k, by_rate=c)
+        return InTime(self.bolt_mass, k, c, by_drive=k, by_rate=c)
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k_b + i omega c - omega² m_b [N/m] at omega [rad/s], of its shape."""
         return self.support.dynamic_stiffness(omega)
+
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """D and k_b + i omega c [N/m] of one with another stiffness and damping, by factors."""
+        spring = stiffness * self.stiffness + 1j * omega * (damping * self.damping)
+        return np.asarray(spring - omega**2 * self.bolt_mass), np.asarray(spring)
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Amplitude of the base at full stroke [m] at omega [rad/s], its own gain included."""
@@ -353,6 +376,11 @@ class PointLoad:
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
         expect_values(self, "point load", at_least="stiffness damping mass foot", finite="x y")
+
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time."""
+        return InTime(self.mass, self.stiffness, self.damping)
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""

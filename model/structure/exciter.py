@@ -20,17 +20,13 @@ currents, rocking of the magnet.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from model.arguments import expect_values
 from model.arrays import ComplexArray, FloatArray
-from model.structure.attachments import (
-    InTime,
-    MeasuredGains,
-    PointLoad,
-)
+from model.structure.attachments import Factor, InTime, MeasuredGains, PointLoad
 
 
 @dataclass(frozen=True)
@@ -43,6 +39,11 @@ class Exciter(MeasuredGains):
     the coil in the magnet [m], infinite where no sheet says; held: whether a frame holds the
     magnet; gains: measured complex gain of its amplifier and converter.
     """
+
+    LEARNED: ClassVar = (
+        *("x", "y", "stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "gains"),
+    )
+    """Fields that measurements of a plate change."""
 
     name: str
     x: float
@@ -93,29 +94,41 @@ class Exciter(MeasuredGains):
 
     @property
     def in_time(self) -> InTime:
-        """Its equations in time, of a current that follows V - L V' / R at once, R = R_e + R_g.
+        """Its equations in time, of a current that follows u - L u' / R at once, R = R_e + R_g.
 
-        The force is within (omega L / R)² of the exact one, 0.5 % at 500 Hz of a common coil.
+        u is the voltage less the back EMF. Force and damping are within (omega L / R)² of the exact
+        ones, 0.5 % at 500 Hz of a common coil.
         """
         total = self.resistance + self.source_resistance
+        delay = self.inductance / total
         return InTime(
             mass=self.coil_mass,
             stiffness=self.stiffness,
             damping=self.damping + self.force_factor**2 / total,
             far_mass=None if self.held else self.magnet_mass,
             by_drive=self.force_factor / total,
-            by_rate=-self.force_factor * self.inductance / total**2,
+            by_rate=-self.force_factor * delay / total,
+            inertance=-(self.force_factor**2) * delay / total,
         )
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = S T - omega² m_c [N/m] at omega [rad/s], of its shape."""
-        w = np.asarray(omega)
-        return np.asarray(self._spring(w) * self._share(w) - w**2 * self.coil_mass)
+        return self.deviating(omega, 1.0, 1.0)[0]
 
     def force(self, omega: FloatArray) -> ComplexArray:
         """F = T Bl V / Z at full level on a plate that is held [N], its own gain included."""
         w = np.asarray(omega)
         return np.asarray(self._share(w) * self._pull(w))
+
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """D [N/m] and T Bl / Z [N/V] of one with another suspension, by factors."""
+        w = np.asarray(omega)
+        spring = self._spring(w, stiffness, damping)
+        share = self._share(w, spring)
+        by_voltage = share * self.force_factor / self._impedance(w)
+        return np.asarray(spring * share - w**2 * self.coil_mass), np.asarray(by_voltage)
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion Bl V / (Z omega² M) at full level by which errors of its spring change the force.
@@ -174,17 +187,19 @@ class Exciter(MeasuredGains):
         """Z [ohm]."""
         return np.asarray(self.resistance + self.source_resistance + 1j * w * self.inductance)
 
-    def _spring(self, w: FloatArray) -> ComplexArray:
-        """S [N/m]."""
-        damping = self.damping + self.force_factor**2 / self._impedance(w)
-        return np.asarray(self.stiffness + 1j * w * damping)
+    def _spring(
+        self, w: FloatArray, stiffness: Factor = 1.0, damping: Factor = 1.0
+    ) -> ComplexArray:
+        """S [N/m], of a suspension that is stiffer and damps more by factors."""
+        lost = damping * self.damping + self.force_factor**2 / self._impedance(w)
+        return np.asarray(stiffness * self.stiffness + 1j * w * lost)
 
-    def _share(self, w: FloatArray) -> ComplexArray:
-        """T."""
+    def _share(self, w: FloatArray, spring: ComplexArray | None = None) -> ComplexArray:
+        """T, by S [N/m] where it is not its own."""
         if self.held:
             return np.ones(w.shape, dtype=complex)
         inertia = w**2 * self.magnet_mass
-        return np.asarray(inertia / (inertia - self._spring(w)))
+        return np.asarray(inertia / (inertia - (self._spring(w) if spring is None else spring)))
 
     def _pull(self, w: FloatArray) -> ComplexArray:
         """Force of the current of a coil that is held [N], at full level."""

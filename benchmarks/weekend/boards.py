@@ -1,9 +1,9 @@
 """Contrast and level to expect of boards on foam or rubber with four exciters, by kind of board.
 
-    python -m benchmarks.weekend [--touches 40] [--plates 10] [--cases 0,2] [--workers 2] [--report]
+    python -m benchmarks.weekend.boards [--touches 40] [--plates 10] [--cases 0,2] [--report]
 
-Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at the
-same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of them
+Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at
+the same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of them
 quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards give,
 as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in the
 steady state, over the whole fingertip of the target and at the loudest point under each quiet one.
@@ -13,7 +13,7 @@ Level: of four exciters in phase under a finger, the least over the board but 2 
 
 import argparse
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -25,6 +25,7 @@ from benchmarks.setting import random_contacts, use_one_thread
 
 if TYPE_CHECKING:
     from era_haptics import SolvedPlate
+    from model.arrays import ComplexArray, FloatArray
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 
@@ -106,7 +107,9 @@ class Expected:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.weekend", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.weekend.boards", description=__doc__
+    )
     parser.add_argument("--touches", type=int, default=40, help="for each number of quiet fingers")
     parser.add_argument("--plates", type=int, default=10, help="drawn, of each board")
     parser.add_argument("--cases", help="numbers of boards, from 0; default: all")
@@ -123,7 +126,7 @@ def main() -> None:
             lines.append(_line(board, job.result()))
             print(lines[-1], flush=True)
     if options.report:
-        run = f"python -m benchmarks.weekend --touches {options.touches} --plates {options.plates}"
+        run = f"python -m benchmarks.weekend.boards --touches {options.touches} --plates {options.plates}"
         table = "\n".join(lines)
         write_parts(PAGE, {"boards": f"Printed by `{run} --report`.\n\n{table}"})
 
@@ -229,7 +232,9 @@ def sensed(
         field = np.abs(shares @ response(layer.frequency))
         squares = squares + (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
     total = np.sqrt(squares).reshape(len(answer.fingers), -1)
-    return float(decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max()))
+    return float(
+        decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max())
+    )
 
 
 def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, float]:

@@ -3,16 +3,15 @@
     python -m benchmarks.weekend.boards [--touches 40] [--plates 10] [--cases 0,2] [--report]
 
 Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at
-the same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of them
-quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards give,
-as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in the
+the same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of
+them quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards
+give, as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in the
 steady state, over the whole fingertip of the target and at the loudest point under each quiet one.
 Level: of four exciters in phase under a finger, the least over the board but 2 cm at its edge. With
 --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
 """
 
 import argparse
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -126,9 +125,9 @@ def main() -> None:
             lines.append(_line(board, job.result()))
             print(lines[-1], flush=True)
     if options.report:
-        run = f"python -m benchmarks.weekend.boards --touches {options.touches} --plates {options.plates}"
-        table = "\n".join(lines)
-        write_parts(PAGE, {"boards": f"Printed by `{run} --report`.\n\n{table}"})
+        counts = f"--touches {options.touches} --plates {options.plates}"
+        run = f"Printed by `python -m benchmarks.weekend.boards {counts} --report`."
+        write_parts(PAGE, {"boards": "\n".join([run, "", *lines])})
 
 
 _HEAD = (
@@ -211,7 +210,8 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
     points, weights = fingertips_on(np.array(fingers), length=size.length, width=size.width)
 
     def response(frequency: float) -> "ComplexArray":
-        return plate.responses(points.reshape(-1, 2), [frequency], fingers=fingers)[0]
+        places = points.reshape(-1, 2).tolist()
+        return np.asarray(plate.responses(places, [frequency], fingers=fingers)[0])
 
     return sensed(answer, plate.rig, response, weights)
 
@@ -224,13 +224,14 @@ def sensed(
 
     from model.finger.perception import decibels, detection_threshold
 
-    names, squares = [each.name for each in rig.eras], 0.0
+    names = [each.name for each in rig.eras]
+    squares: FloatArray = np.zeros(weights.size)
     for layer in answer.layers:
         shares = np.zeros(len(names), dtype=complex)
         for name, tone in layer.excitation.items():
             shares[names.index(name)] = tone.phasor / rig.full_levels[name]
         field = np.abs(shares @ response(layer.frequency))
-        squares = squares + (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
+        squares += (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
     total = np.sqrt(squares).reshape(len(answer.fingers), -1)
     return float(
         decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max())
@@ -249,11 +250,12 @@ def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, fl
         for side, count in ((rig.plate.length, 13), (rig.plate.width, 10))
     )
     least = np.full(len(frequencies), np.inf)
+    threshold = detection_threshold(np.array(frequencies), rig.threshold)
     for point in np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).tolist():
         found = np.abs(plate.responses([point], frequencies, fingers=[point])).sum(axis=1)[:, 0]
-        least = np.minimum(least, decibels(found / detection_threshold(frequencies, rig.threshold)))
+        least = np.minimum(least, decibels(found / threshold))
     return dict(zip(frequencies, least.tolist(), strict=True))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -34,6 +34,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad, fingertip_loads
+from model.structure.exciter import Exciter
 from model.table.build import build_table
 from sim.plant.imperfections import draw_imperfections
 
@@ -65,7 +66,6 @@ class BuiltBoard:
         rng = np.random.default_rng([SEED, seed])
         drawn = draw_imperfections(rig, seed=seed)
         real = drawn.plate.realised(rig)
-        gains = drawn.factors(rig)
         eras = tuple(
             replace(
                 each,
@@ -73,7 +73,8 @@ class BuiltBoard:
                 magnet_mass=each.magnet_mass * (1 + MAGNET * rng.standard_normal()),
                 gains=((100.0, float(abs(gain)), float(np.angle(gain))),),
             )
-            for each, gain in zip(real.eras, gains, strict=True)
+            for each, gain in zip(real.eras, drawn.factors(rig), strict=True)
+            if isinstance(each, Exciter)
         )
         feet = tuple(
             replace(each, stiffness=each.stiffness * float(np.exp(FEET * rng.standard_normal())))
@@ -96,7 +97,7 @@ class BuiltBoard:
         points = PLACES * size
         found = np.concatenate(
             [
-                self.responses(at[None], frequencies, [PointLoad(*at, mass=SENSOR_MASS)])
+                self.responses(at[None], frequencies, [PointLoad(at[0], at[1], mass=SENSOR_MASS)])
                 for at in points
             ],
             axis=2,
@@ -124,7 +125,8 @@ class BuiltBoard:
         ]
 
         def response(frequency: float) -> ComplexArray:
-            return self.responses(points.reshape(-1, 2), np.array([frequency]), loads)[0]
+            at = points.reshape(-1, 2)
+            return np.asarray(self.responses(at, np.array([frequency]), loads)[0])
 
         return sensed(answer, self.rig, response, weights)
 

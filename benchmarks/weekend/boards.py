@@ -5,10 +5,10 @@
 Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at
 the same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of
 them quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards
-give, as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in the
-steady state, over the whole fingertip of the target and at the loudest point under each quiet one.
-Level: of four exciters in phase under a finger, the least over the board but 2 cm at its edge. With
---report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
+give, as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in
+the steady state, over the whole fingertip of the target and at the loudest point under each quiet
+one. Level: of four exciters in phase under a finger, the least over the board but 2 cm at its edge.
+With --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
 """
 
 import argparse
@@ -219,7 +219,7 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
 def sensed(
     answer: Any, rig: "Rig", response: "Callable[[float], ComplexArray]", weights: "FloatArray"
 ) -> float:
-    """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips of weights."""
+    """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
     import numpy as np
 
     from model.finger.perception import decibels, detection_threshold

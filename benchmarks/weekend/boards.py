@@ -1,19 +1,18 @@
 """Contrast and level to expect of boards on foam or rubber with four exciters, by kind of board.
 
-    python -m benchmarks.weekend [--touches 40] [--plates 10] [--cases 0,2] [--workers 2] [--report]
+    python -m benchmarks.weekend.boards [--touches 40] [--plates 10] [--cases 0,2] [--report]
 
-Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at the
-same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of them
-quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards give,
-as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in the
-steady state, over the whole fingertip of the target and at the loudest point under each quiet one.
-Level: of four exciters in phase under a finger, the least over the board but 2 cm at its edge. With
---report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
+Each board is that of examples/weekend/rig.yaml with another size, material, feet and exciters, at
+the same shares of its sides. Fingers at random, 2 cm from the edge and 5 cm apart, one or two of
+them quiet, at 20 dB SL or more, from frequencies 10 Hz apart. Promised: what nine of ten boards
+give, as the table answers. Kept: on boards drawn within the same uncertainty (`SolvedPlate`), in
+the steady state, over the whole fingertip of the target and at the loudest point under each quiet
+one. Level: of four exciters in phase under a finger, the least over the board but 2 cm at its edge.
+With --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
 """
 
 import argparse
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -25,6 +24,7 @@ from benchmarks.setting import random_contacts, use_one_thread
 
 if TYPE_CHECKING:
     from era_haptics import SolvedPlate
+    from model.arrays import ComplexArray, FloatArray
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 
@@ -106,7 +106,9 @@ class Expected:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.weekend", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.weekend.boards", description=__doc__
+    )
     parser.add_argument("--touches", type=int, default=40, help="for each number of quiet fingers")
     parser.add_argument("--plates", type=int, default=10, help="drawn, of each board")
     parser.add_argument("--cases", help="numbers of boards, from 0; default: all")
@@ -123,9 +125,9 @@ def main() -> None:
             lines.append(_line(board, job.result()))
             print(lines[-1], flush=True)
     if options.report:
-        run = f"python -m benchmarks.weekend --touches {options.touches} --plates {options.plates}"
-        table = "\n".join(lines)
-        write_parts(PAGE, {"boards": f"Printed by `{run} --report`.\n\n{table}"})
+        counts = f"--touches {options.touches} --plates {options.plates}"
+        run = f"Printed by `python -m benchmarks.weekend.boards {counts} --report`."
+        write_parts(PAGE, {"boards": "\n".join([run, "", *lines])})
 
 
 _HEAD = (
@@ -208,7 +210,8 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
     points, weights = fingertips_on(np.array(fingers), length=size.length, width=size.width)
 
     def response(frequency: float) -> "ComplexArray":
-        return plate.responses(points.reshape(-1, 2), [frequency], fingers=fingers)[0]
+        places = points.reshape(-1, 2).tolist()
+        return np.asarray(plate.responses(places, [frequency], fingers=fingers)[0])
 
     return sensed(answer, plate.rig, response, weights)
 
@@ -216,20 +219,23 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
 def sensed(
     answer: Any, rig: "Rig", response: "Callable[[float], ComplexArray]", weights: "FloatArray"
 ) -> float:
-    """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips of weights."""
+    """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
     import numpy as np
 
     from model.finger.perception import decibels, detection_threshold
 
-    names, squares = [each.name for each in rig.eras], 0.0
+    names = [each.name for each in rig.eras]
+    squares: FloatArray = np.zeros(weights.size)
     for layer in answer.layers:
         shares = np.zeros(len(names), dtype=complex)
         for name, tone in layer.excitation.items():
             shares[names.index(name)] = tone.phasor / rig.full_levels[name]
         field = np.abs(shares @ response(layer.frequency))
-        squares = squares + (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
+        squares += (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
     total = np.sqrt(squares).reshape(len(answer.fingers), -1)
-    return float(decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max()))
+    return float(
+        decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max())
+    )
 
 
 def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, float]:
@@ -244,11 +250,12 @@ def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, fl
         for side, count in ((rig.plate.length, 13), (rig.plate.width, 10))
     )
     least = np.full(len(frequencies), np.inf)
+    threshold = detection_threshold(np.array(frequencies), rig.threshold)
     for point in np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).tolist():
         found = np.abs(plate.responses([point], frequencies, fingers=[point])).sum(axis=1)[:, 0]
-        least = np.minimum(least, decibels(found / detection_threshold(frequencies, rig.threshold)))
+        least = np.minimum(least, decibels(found / threshold))
     return dict(zip(frequencies, least.tolist(), strict=True))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,23 +1,40 @@
-"""Boards whose parts deviate, measured by one moved sensor, calibrated, touched: against the truth."""
+"""Boards whose parts deviate, measured by one moved sensor, calibrated, touched: against the truth.
 
-from collections.abc import Iterator, Mapping, Sequence
+    python -m benchmarks.weekend.chain [--boards 10] [--touches 20] [--workers 2] [--report]
+
+Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives and board drawn
+within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. A sensor of 2 g reads
+its responses at twelve places, with noise; `era calibrate` fits the rig. Of a table of that rig and
+one of the board as it is, exactly known but for the loads of fingers, the same random touches are
+answered, and felt on the board in the steady state: contrast beyond 25 dB counts as 25. In memory,
+without a sound card. With --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 
 import era_haptics as era
-from benchmarks.setting import random_contacts
-from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, SEED, sensed
+from benchmarks.page import write_parts
+from benchmarks.setting import random_contacts, use_one_thread
+from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
 from model.diagnosis.consistency import check_consistency
+from model.errors import InputError
 from model.finger.fingertip import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad, fingertip_loads
+from model.structure.exciter import Exciter
 from model.table.build import build_table
 from sim.plant.imperfections import draw_imperfections
 
@@ -49,7 +66,6 @@ class BuiltBoard:
         rng = np.random.default_rng([SEED, seed])
         drawn = draw_imperfections(rig, seed=seed)
         real = drawn.plate.realised(rig)
-        gains = drawn.factors(rig)
         eras = tuple(
             replace(
                 each,
@@ -57,7 +73,8 @@ class BuiltBoard:
                 magnet_mass=each.magnet_mass * (1 + MAGNET * rng.standard_normal()),
                 gains=((100.0, float(abs(gain)), float(np.angle(gain))),),
             )
-            for each, gain in zip(real.eras, gains, strict=True)
+            for each, gain in zip(real.eras, drawn.factors(rig), strict=True)
+            if isinstance(each, Exciter)
         )
         feet = tuple(
             replace(each, stiffness=each.stiffness * float(np.exp(FEET * rng.standard_normal())))
@@ -80,7 +97,7 @@ class BuiltBoard:
         points = PLACES * size
         found = np.concatenate(
             [
-                self.responses(at[None], frequencies, [PointLoad(*at, mass=SENSOR_MASS)])
+                self.responses(at[None], frequencies, [PointLoad(at[0], at[1], mass=SENSOR_MASS)])
                 for at in points
             ],
             axis=2,
@@ -102,11 +119,14 @@ class BuiltBoard:
         points, weights = fingertips_on(np.array(fingers), length=plate.length, width=plate.width)
         loads = [
             replace(each, fingertip=each.fingertip.multiplied(float(factor)))
-            for each, factor in zip(fingertip_loads(self.rig.fingertip, fingers), factors, strict=True)
+            for each, factor in zip(
+                fingertip_loads(self.rig.fingertip, fingers), factors, strict=True
+            )
         ]
 
         def response(frequency: float) -> ComplexArray:
-            return self.responses(points.reshape(-1, 2), np.array([frequency]), loads)[0]
+            at = points.reshape(-1, 2)
+            return np.asarray(self.responses(at, np.array([frequency]), loads)[0])
 
         return sensed(answer, self.rig, response, weights)
 
@@ -140,9 +160,77 @@ def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
         target, *others = random_contacts(rng, 1 + quiet, size, margin=EDGE).tolist()
         factors = np.exp(rig.uncertainty.fingertip * rng.standard_normal(1 + quiet))
         answers = [
-            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL) for each in (table, exact)
+            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL)
+            for each in (table, exact)
         ]
         felt, best = (built.contrast(each, factors) for each in answers)
         promised = answers[0].fingers[0].promised_contrast_db
         assert promised is not None
         yield Touch(quiet, promised, felt, best)
+
+
+def outcome(board: int, touched: int) -> "Outcome":
+    """Touches on a board by its number."""
+    use_one_thread()
+    rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
+    try:
+        return Outcome(board, tuple(touches(rig, board, touched)))
+    except InputError as refused:
+        return Outcome(board, (), str(refused))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Touches on a board; or why its calibration was refused."""
+
+    board: int
+    touches: tuple[Touch, ...]
+    refused: str = ""
+
+
+def table(found: Sequence[Outcome]) -> str:
+    """The figures as Markdown."""
+    touches = [each for one in found for each in one.touches]
+    rows = [
+        "| quiet | touches | promised / dB | felt / dB | board exactly known / dB | kept "
+        f"| lost of the first {COUNTED_DB:g} dB, mean |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name in ("1", "2", "all"):
+        some = [each for each in touches if name in ("all", str(each.quiet))]
+        promised, felt, exact = np.transpose([(t.promised, t.felt, t.exact) for t in some])
+        lost = np.minimum(exact, COUNTED_DB) - np.minimum(felt, COUNTED_DB)
+        medians = " | ".join(f"{np.median(each):.1f}" for each in (promised, felt, exact))
+        rows.append(
+            f"| {name} | {len(some)} | {medians} | {100 * (felt >= promised).mean():.0f} % "
+            f"| {lost.mean():.1f} dB |"
+        )
+    refused = [f"board {each.board}: {each.refused}" for each in found if each.refused]
+    text = f"{len(found)} boards, of which `era calibrate` refused {len(refused)}."
+    return "\n".join([*rows, "", text, *refused])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.weekend.chain", description=__doc__)
+    parser.add_argument("--boards", type=int, default=10)
+    parser.add_argument("--touches", type=int, default=20, help="for each number of quiet fingers")
+    parser.add_argument("--first", type=int, default=0, help="number of the first board")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--report", action="store_true")
+    options = parser.parse_args()
+    found = []
+    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+        numbers = range(options.first, options.first + options.boards)
+        for job in [pool.submit(outcome, number, options.touches) for number in numbers]:
+            found.append(job.result())
+            one = found[-1]
+            print(one.refused or table([one]).splitlines()[-3], flush=True)
+    text = table(found)
+    print(f"\n{text}")
+    if options.report:
+        run = f"python -m benchmarks.weekend.chain --boards {options.boards} --touches {options.touches}"
+        write_parts(PAGE, {"chain": f"Printed by `{run} --report`.\n\n{text}"})
+
+
+if __name__ == "__main__":
+    main()

@@ -141,7 +141,8 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
             axes.add_patch(Circle((x, y), radius, fill=False, lw=0.7, ls=style, gid=name))
         # Beside the cross on the side of the board's middle.
         is_right = (x < length / 2) != template.is_below
-        to = (6, 6) if is_right else (-6, 6)
+        away = 6 + 0.75 * radius * 72 / MM_PER_INCH  # points, beyond the circle
+        to = (away if is_right else -away, away)
         aligned = "left" if is_right else "right"
         text = f"{name}\n{x:.1f}, {y:.1f}"
         axes.annotate(

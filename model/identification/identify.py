@@ -8,6 +8,7 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
+from model.identification.grain import ROUNDS, with_grain_of
 from model.identification.held_out import SHARE, HeldOutPaths, hold_out
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space
@@ -81,11 +82,19 @@ def identify(
     would show it.
     """
     _check(rig, measurement)
-    setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
+    before, high = rig, float(measurement.frequencies[-1])
+    setting = Setting(rig, solved_for(rig, high), measurement)
     fitted = fit_in_stages(setting)
+    for _ in range(ROUNDS):
+        board = with_grain_of(setting, fitted)
+        if board is None:
+            break
+        rig = board
+        setting = Setting(rig, solved_for(rig, high), measurement)
+        fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
     posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
-    found = Identification(*(rig, rig, values, posterior, chi2(fitted), shift, None, fitted, seed))
+    found = Identification(*(before, rig, values, posterior, chi2(fitted), shift, None, fitted, seed))
     if found.is_explained:
         _check_gains(rig, measurement, values, fitted.space)
     unknown = unknowns(setting, fitted, posterior)

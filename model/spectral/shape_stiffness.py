@@ -8,7 +8,7 @@ have changed alike, by what a small change of it does to the section, in which K
 What the air behind a plate adds is left out, and how rotary inertia changes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -50,23 +50,57 @@ def stiffness_slopes(
         return section_of(changed, moduli, corrections)
 
     nominal = section(0.0)
+    slopes = np.zeros((3, *2 * unknowns[0].shape[1:]))
+    for of, v in _shapes(plate, degrees, unknowns, nominal):
+        for side in range(2):
+            slopes[side] += v.T @ class_stiffness(of, nominal, side) @ v
+        for step in (_STEP, -_STEP):
+            slopes[2] += v.T @ class_stiffness(of, section(step)) @ v / (2 * step)
+    return slopes
+
+
+def grain_slopes(
+    plate: Plate, degrees: tuple[int, int], unknowns: Sequence[FloatArray]
+) -> FloatArray:
+    """Derivatives of the stiffness of shapes (r,) of a board, (2, r), each by itself.
+
+    By the logarithms of its modulus across the length and of its shear modulus in the plane.
+    unknowns: as of `stiffness_slopes`.
+    """
+    layers = layers_of(plate)
+    material, thickness = plate.material, plate.thickness
+
+    def section(**shares: float) -> CrossSection:
+        other = replace(material, orthotropy=replace(material.shares, **shares))
+        layer = LaminateLayer(other, thickness)
+        return section_of([layer], [material.E], shear_corrections(layers))
+
+    slopes = np.zeros((2, unknowns[0].shape[1]))
+    for of, v in _shapes(plate, degrees, unknowns, section()):
+        for number, key in enumerate(("e2", "g12")):
+            own = getattr(material.shares, key)
+            for step in (_STEP, -_STEP):
+                K = class_stiffness(of, section(**{key: own * (1 + step)}))
+                slopes[number] += np.einsum("nr,nr->r", v, K @ v) / (2 * step)
+    return slopes
+
+
+def _shapes(
+    plate: Plate, degrees: tuple[int, int], unknowns: Sequence[FloatArray], nominal: CrossSection
+) -> Iterator[tuple[ClassFunctions, FloatArray]]:
+    """Yield of each class its functions, and shapes with their displacements along the plate."""
+    layers = layers_of(plate)
     x, y = (
         EdgedFunctions(side, degree, edge_decays(nominal, along))
         for along, (side, degree) in enumerate(
             zip((plate.length, plate.width), degrees, strict=True)
         )
     )
-    slopes = np.zeros((3, *2 * unknowns[0].shape[1:]))
     shift = (2 * np.pi * plate.lowest_bending_frequency) ** 2
     for parity, w in zip(CLASSES, unknowns, strict=True):
         of = ClassFunctions(x, y, parity, len(layers) + 1)
         along = follow(of, class_stiffness(of, nominal), interface_mass(layers), shift) @ w
-        v = np.vstack([w, along])
-        for side in range(2):
-            slopes[side] += v.T @ class_stiffness(of, nominal, side) @ v
-        for step in (_STEP, -_STEP):
-            slopes[2] += v.T @ class_stiffness(of, section(step)) @ v / (2 * step)
-    return slopes
+        yield of, np.vstack([w, along])
 
 
 def _with_nu(layer: LaminateLayer, further: float) -> LaminateLayer:

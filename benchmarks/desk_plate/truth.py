@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     eras = []
     for era in rig.eras:
         x, y = _near((era.x, era.y), plate, rng)
-        changes = {
+        changes: dict[str, Any] = {
             "x": x,
             "y": y,
             "stiffness": era.stiffness * relative(std.stiffness),

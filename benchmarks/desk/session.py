@@ -71,7 +71,7 @@ class Desk:
             said = ""
             while letter := process.stderr.read(1):
                 said += letter
-                if said.endswith("is kept: "):
+                if said.endswith("then Enter: "):
                     self._change({"sensor": said.rpartition("sensor at ")[2].split(",")[0]})
                     time.sleep(_MOVED)
                     process.stdin.write("\n")

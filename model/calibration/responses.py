@@ -14,6 +14,8 @@ from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.measurement import Measurement
 from model.rig.rig import Rig
+from model.structure.actuators import Actuator
+from model.structure.exciter import Exciter
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3
@@ -26,6 +28,8 @@ LEAST_SENSORS = 3
 @dataclass(frozen=True)
 class MeasuredValue:
     """Acceleration at one sensor per base displacement of one ERA [1/s²] at a frequency [Hz].
+
+    Per volt at an exciter [m/s²/V], is_per_volt.
 
     Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
     known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors;
@@ -42,6 +46,7 @@ class MeasuredValue:
     place: str
     sensor_mass: float = 0.0
     setting: str = ""
+    is_per_volt: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +142,7 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
         number = eras[each.era, each.era_point]
+        _check_unit(each, rig.eras[number])
         if (each.frequency, number, each.sensor) in found:
             raise InputError(
                 f"{each.place}: response of sensor {each.sensor} to ERA {rig.eras[number].name} "
@@ -168,6 +174,17 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
             f"{measured.place}: sensor {measured.sensor} must be on the rig's plate, from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(measured.point)} m; "
             "check the plate and the unit"
+        )
+
+
+def _check_unit(measured: MeasuredValue, actuator: Actuator) -> None:
+    if measured.is_per_volt != isinstance(actuator, Exciter):
+        right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
+        if measured.is_per_volt:
+            right, wrong = wrong, right
+        raise InputError(
+            f"{measured.place}: response to {actuator.name} must be acceleration per {right}, got "
+            f"per {wrong}; check the rig, or its unit"
         )
 
 

@@ -4,6 +4,9 @@ A CSV file has exactly the columns below and one value a line, in any order. A U
 function of type 4 for every sensor and ERA, acceleration over displacement, with the nodes'
 positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
 
+Responses to exciters are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions
+whose reference is of no type of its own (1), in V.
+
 The mass of a sensor that is moved and the setting of a measurement are in columns of their own, or
 in the second line of free text of a function: `sensor_mass_g=2 setting=level 0.1`.
 """
@@ -25,12 +28,16 @@ from model.files.uff import (
     FREQUENCY_RESPONSE,
     Function,
     Universal,
+    read_bytes,
     read_universal,
+    text_of,
     write_universal,
 )
 from model.rig.rig import Rig
+from model.structure.exciter import Exciter
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
+_PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
 MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
 _NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
@@ -38,6 +45,7 @@ MAX_SENSOR_MASS = 500.0
 """g; of a sensor that is moved. One that weighs more is no accelerometer."""
 
 _UP = 3  # +z
+_GENERAL = 1  # a data type without one of its own
 # SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
 _ACCELERATION_UNITS = {
     **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
@@ -79,7 +87,14 @@ def write_responses(path: Path, responses: Responses, rig: Rig, *, setting: str 
 
 
 def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
-    """Write responses as CSV with all digits; raises OSError."""
+    """Write responses as CSV with all digits.
+
+    Raises OSError; InputError for ERAs beside exciters, whose units differ.
+    """
+    kinds = {isinstance(era, Exciter) for era in rig.eras}
+    if len(kinds) > 1:
+        raise InputError(f"{path}: ERAs and exciters need a .uff file, whose functions have units")
+    real, imaginary = _PER_VOLT if True in kinds else COLUMNS[-2:]
     f, e, s = np.nonzero(np.isfinite(responses.values))
     values = responses.values[f, e, s]
     further: dict[str, Column] = {}
@@ -97,8 +112,8 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
             "x_m": responses.points[s, 0],
             "y_m": responses.points[s, 1],
             "frequency_hz": responses.frequencies[f],
-            "real_1_s2": values.real,
-            "imag_1_s2": values.imag,
+            real: values.real,
+            imaginary: values.imag,
             **further,
         },
     )
@@ -112,6 +127,7 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: 
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
     for e, era in enumerate(rig.eras):
+        reference = (_GENERAL, "V") if isinstance(era, Exciter) else (DISPLACEMENT, "m")
         for s, sensor in enumerate(responses.sensors):
             measured = np.isfinite(responses.values[:, e, s])
             if measured.any():
@@ -125,8 +141,8 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: 
                         (_UP, _UP),
                         responses.frequencies[measured],
                         responses.values[measured, e, s],
-                        (FREQUENCY, ACCELERATION, DISPLACEMENT),
-                        ("m/s^2", "m"),
+                        (FREQUENCY, ACCELERATION, reference[0]),
+                        ("m/s^2", reference[1]),
                         note=notes[s] if setting or masses[s] else "",
                     )
                 )
@@ -136,11 +152,14 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: 
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
     found = []
-    for line in read_lines(path, COLUMNS, optional=(*ERA_COLUMNS, MASS, SETTING)):
+    header = text_of(path, read_bytes(path)).lstrip().partition("\n")[0]
+    is_per_volt = _PER_VOLT[0] in header
+    columns = (*COLUMNS[:-2], *(_PER_VOLT if is_per_volt else COLUMNS[-2:]))
+    for line in read_lines(path, columns, optional=(*ERA_COLUMNS, MASS, SETTING)):
         at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
         if len(at_era) == 1:
             raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
-        x, y, frequency, real, imaginary = map(line.number, COLUMNS[2:])
+        x, y, frequency, real, imaginary = map(line.number, columns[2:])
         era, sensor = line.cells["era"], line.cells["sensor"]
         if not (era and sensor):
             raise InputError(f"{line.place}: era and sensor must have names")
@@ -160,6 +179,7 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
                 line.place,
                 _mass(line.place, mass),
                 setting,
+                is_per_volt,
             )
         )
     return found
@@ -183,14 +203,17 @@ def _uff_values(
     function: Function, content: Universal, named: dict[str, set[int]]
 ) -> list[MeasuredValue]:
     place = function.place
-    if function.data_types[1] != ACCELERATION or function.data_types[2] != DISPLACEMENT:
+    is_per_volt = function.data_types[2] == _GENERAL and function.units[1].lower() == "v"
+    is_known = is_per_volt or function.data_types[2] == DISPLACEMENT
+    if function.data_types[1] != ACCELERATION or not is_known:
         raise InputError(
             f"{place}: data types must be acceleration ({ACCELERATION}) over displacement "
-            f"({DISPLACEMENT}) of an ERA's base, got {function.data_types[1]} over "
-            f"{function.data_types[2]}"
+            f"({DISPLACEMENT}) of an ERA's base, or over volts ({_GENERAL}, in V) of an exciter, "
+            f"got {function.data_types[1]} over {function.data_types[2]}"
         )
     scale = _unit(place, function.units[0], _ACCELERATION_UNITS)
-    scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
+    if not is_per_volt:
+        scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
     hertz = _unit(place, function.abscissa_unit, _FREQUENCY_UNITS)
     if not np.iscomplexobj(function.data):
         raise InputError(f"{place}: response must be complex, got real; export it with phases")
@@ -222,6 +245,7 @@ def _uff_values(
             place,
             mass,
             setting,
+            is_per_volt,
         )
         for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
     ]

@@ -91,7 +91,7 @@ def measure(
     Play on all ERAs at once and record accelerometers. A cable leads from the output after those of
     the ERAs to the input after those of the sensors: it tells the delay, and lost blocks, whose run
     is repeated. Where all lines of --sensors have one input, one sensor is moved from line to line:
-    the terminal says where to. The file is for era calibrate.
+    the terminal says where to. The file is for era calibrate, and for era rig identify --measured.
     """
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place

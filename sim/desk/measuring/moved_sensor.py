@@ -130,13 +130,16 @@ def measure_places(
     found: dict[str, Measured] = {}
     todo = file.missing
     last: WiredSensor | None = None
+    tell(
+        "Enter measures a place, r the one before again, s skips it, q stops; what is measured is "
+        "kept"
+    )
     while todo:
         place = todo[0]
         number = file.desk.sensors.index(place) + 1
         reply = ask(
             f"Put the sensor at {place.name}, x {1e3 * place.x:g} mm, y {1e3 * place.y:g} mm "
-            f"(place {number} of {len(file.desk.sensors)}), then Enter; r repeats the place "
-            "before, s skips this one, q stops, and what is measured is kept: "
+            f"(place {number} of {len(file.desk.sensors)}), then Enter: "
         )
         match reply.strip().lower():
             case "q":

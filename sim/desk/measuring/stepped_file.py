@@ -14,6 +14,7 @@ from pathlib import Path
 from model.calibration.responses import MeasuredValue
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
+from model.structure.exciter import Exciter
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import Tone, tones_of
 from sim.sensors.sensor_file import WiredSensor, are_places
@@ -117,14 +118,15 @@ def _era(desk: Desk, output: str, place: str) -> str:
 def _value(
     desk: Desk, era: str, sensor: WiredSensor, frequency: float, ratio: complex, place: str
 ) -> MeasuredValue:
-    full_level = desk.rig.era(era).full_level
+    actuator = desk.rig.era(era)
     return MeasuredValue(
         era,
         sensor.name,
         (sensor.x, sensor.y),
         None,
         frequency,
-        ratio / full_level / sensor.sensitivity,
+        ratio / actuator.full_level / sensor.sensitivity,
         place,
         sensor.mass,
+        is_per_volt=isinstance(actuator, Exciter),
     )

@@ -27,13 +27,13 @@ def ratio(tone: int, era: int, sensor: int) -> complex:
     return complex((0.1 + 0.05 * tone) * np.exp(1j * (era - 2.5 * sensor + tone)))
 
 
-def played(era: int, *, held: float = 1.5) -> list[tuple[FloatArray, list[FloatArray]]]:
-    """Reference and sensors of each tone of an ERA; sensors settle within 0.2 s."""
+def played(era: int, *, held: float) -> list[tuple[FloatArray, list[FloatArray]]]:
+    """Reference and sensors of each tone of an ERA; sensors settle with a tenth of its time."""
     found = []
     times = np.arange(round(held * RATE)) / RATE
     for number, frequency in enumerate(TONES):
         angle = 2 * np.pi * frequency * times
-        rise = 1 - np.exp(-times / 0.05)
+        rise = 1 - np.exp(-times / (0.1 * held))
         heard = [
             rise * 0.5 * abs(r) * np.sin(angle + np.angle(r))
             for r in (ratio(number, era, sensor) for sensor in range(2))

@@ -329,7 +329,7 @@ def test_status_amid_a_fault_may_show_a_mark_that_came_twice(
 
 @pytest.mark.parametrize(("beats", "broken"), [(2, ["credit"]), (13, [])])
 def test_request_with_the_bytes_of_an_old_one_is_no_copy(beats: int, broken: list[str]) -> None:
-    """0.4 s later, on a disturbed wire, it is one, without a reply; 2.6 s later numbers come round."""
+    """0.4 s later, on a disturbed wire, it is one, without a reply; 2.6 s later it is new."""
     talk = Talk().armed().says(kind=hand.GET_STATUS)
     number = talk.sequence - 1
     talk.fed(beats - 2).told("faults", "a", are_on=True).told("faults", "a", are_on=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.answer.plan import query
 from model.arrays import Complex64Array
-from model.config.sections import Quantity, Section
+from model.config.sections import Section, quantities
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
@@ -140,8 +140,7 @@ def _physics(table: LocalizationTable) -> dict[str, Any]:
         key: each.dimension.key(key)
         for section in _SECTIONS
         for key, field in section.model_fields.items()
-        for each in field.metadata
-        if isinstance(each, Quantity)
+        for each in quantities(field)
     } | _NAMES
     return {
         name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)

@@ -297,7 +297,10 @@ def _channel(
     )
     if driven != number:
         states.append("other ERA")
-    strong = max(STRONG, math.exp(_GAIN_STDS * rig.uncertainty.gain))
+    known = rig.uncertainty
+    # No response tells a force factor from a gain.
+    varies = 0.0 if isinstance(era, Era) else known.stiffness
+    strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
     if gain < 1 / strong:
         states.append("weak")
     elif gain > strong:

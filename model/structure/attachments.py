@@ -124,6 +124,9 @@ class Source(Support, Protocol):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """The source with another stiffness and damping, by factors."""
 
+    def loosened(self, share: float) -> Self:
+        """The source where it is held by a share of its contact."""
+
     @property
     def fields(self) -> Mapping[str, str]:
         """Its fields that an identification may change, by the kind of parameter."""
@@ -242,6 +245,10 @@ class Era(MeasuredGains):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An ERA that is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    def loosened(self, share: float) -> Self:
+        """An ERA with a share of its stiffness, which damps less, too."""
+        return self.varied(stiffness=share, damping=min(share, 1.0))
 
     @property
     def fields(self) -> Mapping[str, str]:

@@ -172,6 +172,18 @@ class Exciter(MeasuredGains):
         """An exciter whose suspension is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
 
+    def loosened(self, share: float) -> Self:
+        """An exciter that acts with a share of its dynamic stiffness, by its glue, and less force.
+
+        The force falls by the root of the share, and by as much again in a gain.
+        """
+        return replace(
+            self.varied(stiffness=share, damping=share),
+            magnet_mass=share * self.magnet_mass,
+            coil_mass=share * self.coil_mass,
+            force_factor=math.sqrt(share) * self.force_factor,
+        )
+
     @property
     def fields(self) -> Mapping[str, str]:
         """Suspension, coil, magnet and force factor."""

@@ -122,13 +122,13 @@ def _asked(
     desk: "Desk", card: "SoundCard", count: int, *, level: float, frequency: float | None
 ) -> "list[Heard]":
     """What each output drives, as is said on the terminal."""
-    from sim.desk.measuring.outputs import Heard, tone, usual_tone
+    from sim.desk.measuring.outputs import Heard, default_tone, tone
 
     names, found = [name for name, _ in desk.eras], list[Heard]()
     for number in range(1, count + 1):
         signal = tone(
             desk, number, outputs=count, rate=card.rate, level=level,
-            frequency=frequency or usual_tone(desk.rig),
+            frequency=frequency or default_tone(desk.rig),
         )  # fmt: skip
         taken = [each.era for each in found if each.era]
         said = _said(partial(card.run, signal), number, count, names, taken)

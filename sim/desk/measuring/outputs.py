@@ -58,7 +58,7 @@ def tone(
     return found
 
 
-def usual_tone(rig: Rig) -> float:
+def default_tone(rig: Rig) -> float:
     """The usual frequency [Hz], or the nearest one within the rig's limits."""
     return float(np.clip(TONE, rig.limits.frequency_min, rig.limits.frequency_max))
 
@@ -105,15 +105,15 @@ def judged(desk: Desk, frequencies: FloatArray, found: Sequence[Estimate]) -> li
     points = np.array([[sensor.x, sensor.y] for sensor in desk.sensors])
     model = sensed_plate(desk.rig, points, frequencies).responses().transpose(1, 0, 2)
     model = model * desk.strokes[:, None, None]
-    sounding = [n for n, each in enumerate(found) if _moves(each, columns)]
-    if not sounding:
+    audible = [n for n, each in enumerate(found) if _moves(each, columns)]
+    if not audible:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")
-    values = np.array([found[n].values[:, columns, 0] / desk.sensitivities for n in sounding])
+    values = np.array([found[n].values[:, columns, 0] / desk.sensitivities for n in audible])
     rows, eras, signs = matched(values, model, frequencies)
     levels = _size(values[rows]) / _size(model[eras])
     levels = levels / np.median(levels)
     drives = {
-        sounding[row]: (int(era), bool(sign < 0), float(level))
+        audible[row]: (int(era), bool(sign < 0), float(level))
         for row, era, sign, level in zip(rows, eras, signs, levels, strict=True)
     }
     heard = []

@@ -18,7 +18,7 @@ from drivers.errors import LinkError
 from exciter_circuit import ExciterCircuit
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
-from sim.cli import app
+from sim.desk.impedance_cli import app
 from sim.desk.libjack import JackClient
 from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
@@ -67,7 +67,7 @@ def measured(
 ) -> tuple[int, str]:
     """Exit status of the command with a card in memory, and its last line."""
     monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
-    words = ["measure", "--impedance", "--device", "x", "--json", *map(str, arguments)]
+    words = ["--impedance", "--device", "x", "--json", *map(str, arguments)]
     done = CliRunner().invoke(app, words, input=typed)
     return done.exit_code, done.stdout.splitlines()[-1] if done.stdout else str(done.exception)
 
@@ -89,7 +89,7 @@ def test_parts_come_from_two_runs_and_a_scale(
     _check(json.loads(told))
     done = CliRunner().invoke(
         app,
-        ["measure", "--impedance", "--free", str(free), "--glued", str(glued), "--weight", "110.9"],
+        ["--impedance", "--free", str(free), "--glued", str(glued), "--weight", "110.9"],
     )
     assert done.exit_code == 0
     assert "resonance_is: mounted" in done.stdout

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
@@ -17,9 +18,9 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from sim.cli import app
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, tone
+from sim.desk.outputs_cli import outputs
 from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8000.0
@@ -115,9 +116,11 @@ def test_said_channels_are_written(
     card = cabled(truth)
     monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
     output = tmp_path / "wired.yaml"
+    app = typer.Typer()
+    app.command()(outputs)
     done = CliRunner().invoke(
         app,
-        ["outputs", str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
+        [str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
         input=said,
     )
     assert done.exit_code == status

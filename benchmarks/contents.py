@@ -268,7 +268,7 @@ def _print_distorted(
     from model.vibration.excitation import base_amplitudes
 
     above, near = [], []
-    strokes = np.array([era.stroke for era in table.eras])
+    strokes = np.array([era.full_level for era in table.eras])
     for places in _sets(table, contents, quiet, count=count, apart=apart):
         stimulus = Stimulus(band_hz=(40.0, 320.0))
         found = answer(

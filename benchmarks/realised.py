@@ -151,7 +151,7 @@ def realised(
         era_count=len(eras),
         contact_count=len(asked.contacts),
     )
-    shares = bases / [era.stroke for era in eras]
+    shares = bases / [era.full_level for era in eras]
     fields = np.einsum("fe,de,fep->fdp", shares, plates.gain, unit)
     sensed = np.abs(fields) / detection_threshold(frequencies, rig.threshold)[:, None, None]
     total = np.sqrt((sensed**2).sum(axis=0)).reshape(DRAWS, *weights.shape)

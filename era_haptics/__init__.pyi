@@ -20,6 +20,7 @@ from era_haptics.pictures import draw_contrast_map as draw_contrast_map
 from era_haptics.pictures import draw_map as draw_map
 from era_haptics.pictures import draw_playback as draw_playback
 from era_haptics.rigs import Era as Era
+from era_haptics.rigs import Exciter as Exciter
 from era_haptics.rigs import Plate as Plate
 from era_haptics.solved_plate import SolvedPlate as SolvedPlate
 from era_haptics.tables import answer as answer

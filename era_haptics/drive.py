@@ -83,12 +83,12 @@ def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
                 f"{limits.frequency_max:g} Hz, got {tone.frequency} Hz; widen limits.frequency of "
                 "the rig"
             )
-        levels[name] += abs(tone.amplitude) / rig.era(name).stroke
+        levels[name] += abs(tone.amplitude) / rig.era(name).full_level
     for name, level in levels.items():
         if not level <= _MAX_SUM:  # NaN, too
             raise InputError(
                 f"level of {name}, the sum of all that it plays at once, must be at most 1, its "
-                f"stroke of {rig.era(name).stroke:g} m, got {level}"
+                f"stroke of {rig.era(name).full_level:g} m, got {level}"
             )
     return layers
 
@@ -115,7 +115,7 @@ def _layer_of(drive: object, rig: Rig) -> Layer:
 
 def _tone_of(given: Driven, name: str, rig: Rig) -> Tone:
     """The tone that an ERA is given; raises InputError for anything else."""
-    stroke = rig.era(name).stroke
+    stroke = rig.era(name).full_level
     if isinstance(given, tuple):
         raise InputError(
             f"drive of {name} must be a frequency, a Drive, a Tone or a list of these, got "

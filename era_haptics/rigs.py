@@ -1,9 +1,11 @@
-"""Plates and ERAs by the keys of a rig file."""
+"""Plates, ERAs and exciters by the keys of a rig file."""
 
 from typing import Any
 
+from model.rig.era_section import EraSection
+from model.rig.exciter_section import ExciterSection
 from model.rig.from_keys import checked_keys
-from model.rig.sections import EraSection, PlateSection
+from model.rig.sections import PlateSection
 
 
 class Plate(dict[str, Any]):
@@ -25,3 +27,14 @@ class Era(dict[str, Any]):
 
     def __init__(self, **keys: Any) -> None:
         super().__init__(checked_keys("era.Era", EraSection, keys))
+
+
+class Exciter(dict[str, Any]):
+    """An exciter by the keys below `eras` in a rig file, of which `kind` is stated already.
+
+    `Exciter(type="DAEX25CT-4", at=(0.1, 0.1), amplifier="card", channel=0)`. Raises ConfigError.
+    """
+
+    def __init__(self, **keys: Any) -> None:
+        keys = {"kind": "exciter", **keys}
+        super().__init__(checked_keys("era.Exciter", ExciterSection, keys))

@@ -75,7 +75,7 @@ class HiddenPlate:
         """Acceleration per commanded displacement [1/s²], gains included, (f, e, p)."""
         eras = self.rig.eras
         found = direct_acceleration(self.matrices, eras, frequencies, points, loads=self.masses)
-        return np.asarray(found / np.array([era.stroke for era in eras])[:, None])
+        return np.asarray(found / np.array([era.full_level for era in eras])[:, None])
 
 
 def draw_plate(

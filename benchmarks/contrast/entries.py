@@ -61,7 +61,7 @@ class _Case:
 
     def fields_on(self, rows: IntArray, plates: Plates) -> ComplexArray:
         """Fields on plates at rows (f,) of the table's frequencies, (d, f, points, eras)."""
-        strokes = np.diag([complex(era.stroke) for era in self.table.eras])
+        strokes = np.diag([complex(era.full_level) for era in self.table.eras])
         bases = np.repeat(strokes[None], len(rows), axis=0)
         at = touched(self.table, self.placed)
         return accelerations_on(self.table, *at, self.table.attached, rows, bases, plates).swapaxes(
@@ -85,7 +85,7 @@ class _Case:
         """Weights (eras,), the largest at full stroke."""
         weights = weights / np.abs(weights).max()
         return {
-            era.name: Tone.from_phasor(frequency, complex(era.stroke * weight))
+            era.name: Tone.from_phasor(frequency, complex(era.full_level * weight))
             for era, weight in zip(self.table.eras, weights, strict=True)
         }
 
@@ -112,7 +112,7 @@ def _paper(case: _Case) -> Excitation:
     known = replace(case.table, uncertainty=Uncertainty.none())
     level = case.found.level_db_sl
     found = query(known, case.placed, level, drive_mode="switched").layers[0].excitation
-    strokes = case.table.strokes
+    strokes = case.table.full_levels
     return {name: replace(tone, amplitude=strokes[name]) for name, tone in found.items()}
 
 
@@ -189,7 +189,7 @@ def entry(name: str, plates: list[str]) -> dict[str, object]:
     found, patterns = data_set(), {}
     for plate in plates:
         table = build_table(found.plates[plate].rig, drive_mode="phased")
-        strokes = table.strokes
+        strokes = table.full_levels
         for contacts in found.plates[plate].sets:
             rng = np.random.default_rng([5, contacts.number])
             try:

@@ -63,7 +63,7 @@ def _rigs(found: DataSet) -> dict[str, Rig]:
 
 def _excitation(rig: Rig, drives: Mapping[str, tuple[float, float, float]]) -> Excitation:
     """Tones by ERA, those of level 0 left out."""
-    strokes = rig.strokes
+    strokes = rig.full_levels
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     tones = {}
     for name, (frequency, level, phase) in drives.items():

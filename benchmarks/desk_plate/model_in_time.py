@@ -109,7 +109,7 @@ class DeskModel:
             np.array([getattr(each, key) for each in self._truth.actuators])
             for key in ("ratio", "gain")
         )
-        strokes = np.array([era.stroke for era in rig.eras])
+        strokes = np.array([era.full_level for era in rig.eras])
         A[y, w] = np.eye(count)
         A[w, y], A[w, w] = -np.diag(omega**2), -np.diag(2 * ratio * omega)
         B[w] = np.diag(gain * omega**2 * strokes)

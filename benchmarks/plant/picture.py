@@ -58,7 +58,7 @@ def vibrate(
     reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras))
     plant = Plant(reduced, rig.eras)
     omega = 2 * np.pi * FREQUENCY
-    stroke = 0.2 * rig.eras[1].stroke
+    stroke = 0.2 * rig.eras[1].full_level
     plant.set_input(1, raised_cosine(0.0, 0.02, omega, 0j, stroke))
     times, felt = [], []
     for until, then in ((LANDS, contacts), (GOES, {}), (ENDS, {})):

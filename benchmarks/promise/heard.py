@@ -55,7 +55,7 @@ class _Part(Bench):
                 motion = motion_of(
                     [voice],
                     clock,
-                    stroke=self.rig.eras[index].stroke,
+                    stroke=self.rig.eras[index].full_level,
                     delay=self._delays[index],
                 )
                 terms += realised(motion, replace(errors, gain=errors.gain / threshold))

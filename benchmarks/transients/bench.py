@@ -109,7 +109,9 @@ class Bench:
             ]
             columns["shaped, realised"].append(float(np.median(realised)))
             columns["largest level"].append(
-                max(each.largest / self.rig.era(name).stroke for name, each in envelopes.items())
+                max(
+                    each.largest / self.rig.era(name).full_level for name, each in envelopes.items()
+                )
             )
         return columns
 
@@ -150,7 +152,10 @@ class Bench:
                     float(np.median([self._end_contrast(case, *each) for each in realised]))
                 )
                 left[f"{name}, largest level"].append(
-                    max(each.largest / self.rig.era(era).stroke for era, each in envelopes.items())
+                    max(
+                        each.largest / self.rig.era(era).full_level
+                        for era, each in envelopes.items()
+                    )
                 )
         return left, contrast
 
@@ -163,7 +168,7 @@ class Bench:
         steady = np.zeros(sum(len(disc) for disc in discs))
         frequencies, phasors = base_amplitudes(excitation, self.rig.eras)
         for omega, amplitudes in zip(2 * np.pi * frequencies, phasors, strict=True):
-            weights = amplitudes / [era.stroke for era in self.rig.eras]
+            weights = amplitudes / [era.full_level for era in self.rig.eras]
             state = weights @ steady_states(self.plate, omega)
             shapes = self.plate.reduced.at(np.concatenate(discs)) @ self.plate.displacement
             steady += omega**2 * np.abs(shapes @ state)

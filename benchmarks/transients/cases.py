@@ -53,7 +53,7 @@ class Case:
     ) -> Excitation:
         weights = level * self.weights * (1 if errors is None else errors)
         return {
-            era.name: Tone.from_phasor(self.frequency, era.stroke * complex(w))
+            era.name: Tone.from_phasor(self.frequency, era.full_level * complex(w))
             for era, w in zip(rig.eras, weights, strict=True)
         }
 
@@ -113,7 +113,7 @@ def case_of(excitation: Excitation, patterns: list[Case], rig: Rig) -> Case:
     for number, era in enumerate(rig.eras):
         tone = excitation.get(era.name)
         if tone is not None:
-            weights[number] = tone.phasor / era.stroke
+            weights[number] = tone.phasor / era.full_level
     (frequency,) = {tone.frequency for tone in excitation.values()}
     same = min(patterns, key=lambda each: abs(each.frequency - frequency))
     return replace(same, weights=weights)
@@ -141,8 +141,8 @@ def quantised(envelopes: Envelopes, rig: Rig) -> Envelopes:
     return {
         name: replace(
             each,
-            start=rounded(each.start, rig.era(name).stroke),
-            knots=tuple(rounded(knot, rig.era(name).stroke) for knot in each.knots),
+            start=rounded(each.start, rig.era(name).full_level),
+            knots=tuple(rounded(knot, rig.era(name).full_level) for knot in each.knots),
         )
         for name, each in envelopes.items()
     }

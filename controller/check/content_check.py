@@ -203,7 +203,7 @@ def play_content(
 def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray) -> FloatArray:
     """What moves the ERAs, in full strokes, (eras, n)."""
     signals = np.zeros((len(table.eras), len(times)))
-    strokes = np.array([era.stroke for era in table.eras])
+    strokes = np.array([era.full_level for era in table.eras])
     for part in parts:
         (layer, course), tau = (part.answer.layers[0], part.stimulus.course), times - part.start
         if course is None:

@@ -111,7 +111,7 @@ def playback_capabilities(
                 max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
                 min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
             ),
-            {era.name: era.stroke * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
+            {era.name: era.full_level * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
             power=min(one.power for one in limits.values()),
             slew=min(one.slew for one in limits.values()),
         ),

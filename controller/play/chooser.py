@@ -133,7 +133,7 @@ class Chooser:
         ]
         left = self._left_by([*pulses, *fading], capabilities)
         total = amplitudes_of([each.layer.excitation for each in free.contents])
-        if left.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY:
+        if left.limits.factor_within(total, self.table.full_levels) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
         if not limited.contents:
@@ -160,7 +160,7 @@ class Chooser:
         if not contents:
             return capabilities
         taken = amplitudes_of([each.layer.excitation for each in contents])
-        return capabilities.left_by(taken, self.table.strokes)
+        return capabilities.left_by(taken, self.table.full_levels)
 
     def _chosen(
         self,

@@ -135,11 +135,11 @@ class Crossfades:
         ):
             return False
         total = amplitudes_of([one.layer.excitation for one in (*beside, *voices)])
-        return self.capabilities.limits.factor_within(total, self.table.strokes) >= 1 - NEARLY
+        return self.capabilities.limits.factor_within(total, self.table.full_levels) >= 1 - NEARLY
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
         """The answer with the tones of contents that are felt together, and what these promise."""
-        strokes, drives, owners = [*self.table.strokes.values()], [], []
+        strokes, drives, owners = [*self.table.full_levels.values()], [], []
         rows, table = list[int](), self.table
         for number, stream in enumerate(goal.contents.streams):
             for one in voices[self.targets[stream.targets[0]][0].key]:

@@ -201,7 +201,7 @@ class SetBuilder:
         """
         least = _LEVEL.from_wire(1)
         faint = {
-            name: replace(tone, amplitude=least * self.rig.strokes[name])
+            name: replace(tone, amplitude=least * self.rig.full_levels[name])
             for name, tone in excitation.items()
         }
         ramp = min(ramp, self.ramp_max)
@@ -252,7 +252,7 @@ def route(
         )
     before: Drive = playing or {}
     restarted = restarted_by(excitation, before) if restarted is None else restarted
-    strokes = rig.strokes
+    strokes = rig.full_levels
     onsets, endings = on_wire(strokes, onset, ending)
     wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():

@@ -93,17 +93,20 @@ def bounds_in_words(asked: Quantity) -> str:
 
 
 def _docstrings(of: type) -> dict[str, str]:
-    """What stands below each field of a class, by its name."""
-    (tree,) = ast.parse(dedent(inspect.getsource(of))).body
-    body = tree.body if isinstance(tree, ast.ClassDef) else []
-    return {
-        field.target.id: inspect.cleandoc(str(below.value.value))
-        for field, below in pairwise(body)
-        if isinstance(field, ast.AnnAssign)
-        and isinstance(field.target, ast.Name)
-        and isinstance(below, ast.Expr)
-        and isinstance(below.value, ast.Constant)
-    }
+    """What stands below each field of a class and of sections that it extends, by its name."""
+    classes = [each for each in reversed(of.__mro__) if each is of or issubclass(each, Section)]
+    found = dict[str, str]()
+    for each in classes:
+        (tree,) = ast.parse(dedent(inspect.getsource(each))).body
+        found |= {
+            field.target.id: inspect.cleandoc(str(below.value.value))
+            for field, below in pairwise(tree.body if isinstance(tree, ast.ClassDef) else [])
+            if isinstance(field, ast.AnnAssign)
+            and isinstance(field.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+        }
+    return found
 
 
 def _default(field: FieldInfo, quantity: Quantity | None) -> str:

@@ -6,6 +6,8 @@ from functools import partial
 from key_tables import key_table
 from model.config.sections import Section
 from model.rig import sections
+from model.rig.era_section import EraSection
+from model.rig.exciter_section import ExciterSection
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,
@@ -13,7 +15,8 @@ SECTIONS: Mapping[str, type[Section]] = {
     "layers": sections.LayerSection,
     "air_gap": sections.AirGapSection,
     "material": sections.MaterialSection,
-    "eras": sections.EraSection,
+    "eras": EraSection,
+    "exciters": ExciterSection,
     "masses": sections.MassSection,
     "amplifiers": sections.AmplifierSection,
     "limits": sections.LimitsSection,

@@ -16,7 +16,7 @@ from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
 from model.finger.perception import decibels
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.transients.base_motion import Envelopes
 from model.vibration.excitation import Excitation
 
@@ -176,7 +176,7 @@ class Answer:
     tones: Tones
     held: tuple[tuple[int, float, bool], ...]
     applied: tuple[str, ...]
-    eras: tuple[Era, ...]
+    eras: tuple[Source, ...]
     frequencies: FloatArray
     thresholds: Float32Array
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()

@@ -202,7 +202,7 @@ def _envelopes_as_json(
         return None
 
     def shown(name: str, amplitude: complex) -> dict[str, float]:
-        level = abs(amplitude) / table.strokes[name]
+        level = abs(amplitude) / table.full_levels[name]
         return {"level": level, "phase_deg": math.degrees(cmath.phase(amplitude))}
 
     return {

@@ -271,7 +271,7 @@ class RingingUnderFingers:
 
     def over_drive(self, drive: Drive) -> OverDuration:
         """What fingers feel of a drive, as `over`; solved once."""
-        hertz, strokes = self.table.frequencies, [era.stroke for era in self.table.eras]
+        hertz, strokes = self.table.frequencies, [era.full_level for era in self.table.eras]
         key = tuple([(row, weights.tobytes()) for row, weights in drive])
         if key not in self._solved:
             self._solved[key] = self.over(

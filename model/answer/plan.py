@@ -206,7 +206,7 @@ class _Answering:
 
         Where a finger would not be served any more, by the rule again at the lower levels.
         """
-        strokes = self.table.strokes
+        strokes = self.table.full_levels
         for stream in found.contents.streams:
             if stream.duration is not None:
                 found = as_ramps_allow(self.table, found, self.limits)

@@ -27,7 +27,7 @@ from model.answer.course import Course
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, Point
 from model.choice import NEARLY
 from model.drive_modes import UNRESTRICTED
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.vibration.excitation import Excitation, Tone
 
 PROMISED_PERCENTILE = 9
@@ -165,7 +165,7 @@ class Tones:
     is_apart: bool
 
     def excitations(
-        self, content: int, eras: Sequence[Era], frequencies: FloatArray
+        self, content: int, eras: Sequence[Source], frequencies: FloatArray
     ) -> list[Excitation]:
         """What plays a content, a tone of each ERA for each of its tones, its carrier first.
 
@@ -187,7 +187,7 @@ class Tones:
                     w = value * factor
                     if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
                         w = w.real
-                    amplitude = gain * min(abs(w), 1.0) * era.stroke
+                    amplitude = gain * min(abs(w), 1.0) * era.full_level
                     tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
             found.append(tones)
         return found

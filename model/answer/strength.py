@@ -95,7 +95,7 @@ def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> A
 
     None is raised where one is as strong as the others allow, which they feel as long.
     """
-    contents, tones, strokes = found.contents, found.tones, table.strokes
+    contents, tones, strokes = found.contents, found.tones, table.full_levels
     if contents.is_shaped or all(stream.duration is None for stream in contents.streams):
         return found
     ramp = max([tone / strokes[name] for name, tone in found.amplitudes.items()]) / limits.slew

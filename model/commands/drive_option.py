@@ -41,7 +41,7 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
             raise InputError(f"--drive {text!r}: level must be between 0 and 1, got {level:g}")
         if frequency <= 0:
             raise InputError(f"--drive {text!r}: frequency must be positive, got {frequency:g} Hz")
-        stroke = rig.era(name).stroke
+        stroke = rig.era(name).full_level
         excitation[name] = Tone(frequency, level * stroke, math.radians(phase))
     return excitation
 

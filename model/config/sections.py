@@ -1,14 +1,21 @@
 """Sections of configuration files as pydantic models; all problems are reported at once."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from types import UnionType
 from typing import Annotated, Any, Generic, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError
-from pydantic_core import CoreSchema, ErrorDetails, core_schema
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
 
 from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
 from model.config.units import Dimension, quantity, shown
@@ -79,6 +86,46 @@ class Quantity:
         unit = self.dimension.unit or "no unit"
         description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
         return {"type": ["number", "string"], "description": description}
+
+
+class ByKind:
+    """Annotation of a union of sections, one of which a mapping's `kind` chooses, or the first."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        sections = get_args(source)
+        return core_schema.no_info_plain_validator_function(
+            partial(_validated_by_kind, sections), metadata={"sections": sections}
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        sections = schema["metadata"]["sections"]
+        return {"anyOf": [handler(each.__pydantic_core_schema__) for each in sections]}
+
+
+def _validated_by_kind(sections: Sequence[type[Section]], value: Any) -> Section:
+    kinds = [kind for each in sections for kind in _kinds(each)]
+    given = value.get("kind", kinds[0]) if isinstance(value, dict) else kinds[0]
+    if given not in kinds:
+        expected = " or ".join(repr(kind) for kind in kinds)
+        error = InitErrorDetails(
+            type="literal_error", loc=("kind",), input=given, ctx={"expected": expected}
+        )
+        raise ValidationError.from_exception_data("kind", [error])
+    return section_by_kind(sections, value).model_validate(value)
+
+
+def _kinds(section: type[Section]) -> tuple[str, ...]:
+    return get_args(section.model_fields["kind"].annotation)
+
+
+def section_by_kind(sections: Sequence[type[PartT]], value: object) -> type[PartT]:
+    """The section whose `kind` a mapping has; the first of them for any other, or none."""
+    given = value.get("kind") if isinstance(value, dict) else None
+    return next((each for each in sections if given in _kinds(each)), sections[0])
 
 
 class Validation(Generic[SectionT]):
@@ -163,7 +210,7 @@ def _problem(
         case "missing":
             message = "missing; add it"
         case "extra_forbidden":
-            message = _unknown_key(str(path[-1]), _section_at(root, path[:-1]))
+            message = _unknown_key(str(path[-1]), _section_at(root, path[:-1], document))
         case "value_error":
             message = str(context["error"])
         case "model_type" | "dict_type":
@@ -220,17 +267,18 @@ def _unknown_key(key: str, section: type[Section]) -> str:
     return f"unknown key; {did_you_mean(key, known)}known are {', '.join(known)}"
 
 
-def _section_at(root: type[Section], path: KeyPath) -> type[Section]:
-    """The section at a path."""
+def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[Section]:
+    """The section at a path, of several kinds that of the document."""
     kind: Any = root
-    for part in path:
+    for number, part in enumerate(path, start=1):
         if get_origin(kind) in (dict, list):
             kind = get_args(kind)[-1]
         else:
             kind = kind.model_fields[part].annotation
-        if get_origin(kind) in (Union, UnionType):  # of a field that may be left out
-            kind = get_args(kind)[0]
-        if get_origin(kind) is Annotated:
-            kind = get_args(kind)[0]
+        while get_origin(kind) in (Annotated, Union, UnionType):
+            annotations = getattr(kind, "__metadata__", ())
+            kind = get_args(kind)[0]  # of a field that may be left out
+            if any(isinstance(each, ByKind) for each in annotations):
+                kind = section_by_kind(get_args(kind), document.value(path[:number]))
     section: type[Section] = kind
     return section

@@ -34,9 +34,9 @@ import numpy as np
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
-    Era,
     Fingertip,
     PointLoad,
+    Source,
     attached_stiffness,
     coupled_forces,
     drive_forces,
@@ -59,7 +59,8 @@ class Mounts:
 
     - minus_omega2: (f,) [rad²/s²]
     - stiffness: (f, b) dynamic stiffness of the attachments [N/m]
-    - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m]
+    - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m], by which
+      errors of its spring and damper act
     - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
       deviation [N/m]
     """
@@ -73,12 +74,11 @@ class Mounts:
 
 
 def mounts_of(
-    eras: Sequence[Era], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
+    eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
 ) -> Mounts:
     """ERAs and masses at w (f,) [rad/s], wherever they are."""
-    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
-    by_damping = math.log(uncertainty.damping) * 1j * w[:, None] * c
-    by_stiffness = np.broadcast_to(uncertainty.stiffness * k, by_damping.shape)
+    by_stiffness = uncertainty.stiffness * np.array([era.by_stiffness(w) for era in eras]).T
+    by_damping = math.log(uncertainty.damping) * np.array([era.by_damping(w) for era in eras]).T
     strokes = np.array([era.base(w) for era in eras]).T
     each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes
     single = (part.astype(np.complex64) for part in (*each, by_stiffness, by_damping))
@@ -158,7 +158,7 @@ def attach(
     losses: FloatArray,
     shapes: FloatArray,
     *,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     masses: Sequence[PointLoad],
     fingertip: Fingertip | None,
     uncertainty: Uncertainty,
@@ -184,10 +184,14 @@ def attach(
     )
 
 
-def at_harmonics(plate: AttachedPlate, twice: AttachedPlate) -> AttachedPlate:
-    """A plate at twice the frequencies of one, whose bases move as far as they do there."""
-    forces = twice.forces * (plate.strokes / twice.strokes)
-    return replace(twice, forces=forces, strokes=plate.strokes)
+def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:
+    """A plate at twice the frequencies, whose sources are driven by the gains of once these."""
+    gains, own = (
+        np.array([each.gain(factor * twice.frequencies) for each in sources]).T
+        for factor in (0.5, 1.0)
+    )
+    share = (gains / own).astype(np.complex64)
+    return replace(twice, forces=twice.forces * share, strokes=twice.strokes * share)
 
 
 MODELLED = 0
@@ -267,7 +271,8 @@ class PlateOnEras:
         by_one = np.linalg.norm(self.by_force[:, MODELLED, :n], axis=2)
         by_one = by_one * np.linalg.norm(deformed, axis=2)
         changed = [_by_places(self, row, shifts) for row in range(len(by_one))]
-        by_stiffness = np.hypot(plate.by_stiffness.real, changed / by_one)
+        by_stiffness = np.hypot(np.abs(plate.by_stiffness), changed / by_one)
+        by_stiffness = by_stiffness * np.exp(1j * np.angle(plate.by_stiffness))
         found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
         return replace(self, plate=found)
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from model.rig.rig import Rig
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.structure.plate import Plate
 from model.vibration.excitation import G
 from model.vibration.maps import PlateMap
@@ -28,7 +28,9 @@ def raster(plate: Plate) -> tuple[int, int]:
     return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
 
 
-def draw_eras(axes: Axes, eras: Sequence[Era], *, active: Collection[str], size: float = 9) -> None:
+def draw_eras(
+    axes: Axes, eras: Sequence[Source], *, active: Collection[str], size: float = 9
+) -> None:
     """Mark ERAs, red if driven and green if not; axes in centimetres, size in points."""
     for era in eras:
         color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
@@ -42,7 +44,7 @@ class MapPanel:
 
     title: str
     plate_map: PlateMap
-    eras: Sequence[Era]
+    eras: Sequence[Source]
     active: Collection[str]
 
 

@@ -23,7 +23,7 @@ from model.finger.grid import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike, diagonal_pair, edge_pair
 from model.rig.rig import Rig
-from model.structure.attachments import Era
+from model.structure.actuators import Actuator
 from model.structure.plate import Plate
 from model.vibration.excitation import G, Tone
 from model.vibration.maps import plate_map
@@ -208,13 +208,12 @@ def _stiffnesses(rig: Rig, free: FreePlate) -> PaperFigure:
     return _maps("figure_13_maps", panels, columns=2, caption=f"{names} at 250 Hz")
 
 
-def with_stiffness(eras: Sequence[Era], stiffness: float) -> tuple[Era, ...]:
+def with_stiffness(eras: Sequence[Actuator], stiffness: float) -> tuple[Actuator, ...]:
     """The same ERAs with another stiffness [N/m]; each keeps its damping ratio, c / sqrt(k_b)."""
+    factors = [stiffness / era.stiffness for era in eras]
     return tuple(
-        replace(
-            era, stiffness=stiffness, damping=era.damping * math.sqrt(stiffness / era.stiffness)
-        )
-        for era in eras
+        era.varied(stiffness=factor, damping=math.sqrt(factor))
+        for era, factor in zip(eras, factors, strict=True)
     )
 
 
@@ -227,7 +226,7 @@ def pair_map(
 ) -> MapPanel:
     """The map of a pair of ERAs at full stroke; the title may contain {names} and {tones}."""
     excitation = {
-        rig.eras[number].name: Tone(frequency, rig.eras[number].stroke)
+        rig.eras[number].name: Tone(frequency, rig.eras[number].full_level)
         for number, frequency in zip(pair, frequencies, strict=True)
     }
     tones = ", ".join(f"{name} {tone.frequency:g} Hz" for name, tone in excitation.items())

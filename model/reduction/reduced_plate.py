@@ -10,7 +10,8 @@ On its ERAs it has the matrices of mass, damping and stiffness
 M = I + sum m_b phi phi^T, K = diag(omega²) + sum k_b phi phi^T, C = C_s + sum c phi phi^T; phi are
 the free plate's shapes at an ERA. Point masses add in the same way. A fingertip adds its contact
 mass, and one coordinate, the displacement x [m] of its phalanx: m_p x'' + c_j x' + k_j x is the
-force of the pulp, a spring and a damper between the plate and the phalanx.
+force of the pulp, a spring and a damper between the plate and the phalanx. So does an exciter whose
+magnet is free: its spring and damper end at a mass.
 
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
@@ -41,7 +42,14 @@ from model.errors import InputError
 from model.files.csv_file import as_frame
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad, footprints_of
+from model.structure.attachments import (
+    Fingertip,
+    FingertipLoad,
+    InTime,
+    PointLoad,
+    Source,
+    footprints_of,
+)
 from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import Dispersion, ModalElasticity, loss_factors
 from model.structure.plate import Plate
@@ -183,49 +191,70 @@ def _products(truncated_terms: FloatArray, *, power: int) -> FloatArray:
 
 def modal_matrices(
     reduced: ReducedPlate,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     *,
     loads: Sequence[PointLoad] = (),
     contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r + n, r + n) of the plate on its ERAs with its loads under n fingertips.
+    """M, C, K (r + m + n, ...) of the plate on its ERAs with its loads under n fingertips.
 
-    The last n coordinates are the phalanges', in the order of contacts. attachment_shapes: shapes
-    at the ERAs, loads and contacts where known already. Raises InputError for ERAs that do not
-    support the plate.
+    After the plate's coordinates come those of m far ends of the sources, and the phalanges' in the
+    order of contacts. attachment_shapes: shapes at the ERAs, loads and contacts where known
+    already. Raises InputError for ERAs and loads that do not support the plate.
     """
     check_supported(reduced.plate, eras, loads=loads)
-    fixed = [*(era.support for era in eras), *loads]
+    fixed = len(eras) + len(loads)
     phi = (
-        reduced.at(footprints_of(fixed, contacts))
+        reduced.at(footprints_of(eras, loads, contacts))
         if attachment_shapes is None
         else attachment_shapes
     )
-    elasticity, (M, C, K) = on_springs(reduced, fixed, phi[: len(fixed)])
+    parts = [*(era.in_time for era in eras), *(load.in_time for load in loads)]
+    elasticity, (M, C, K) = on_springs(reduced, parts, phi[:fixed])
     eigenvalues, psi = linalg.eigh(K, M)
-    omega = np.sqrt(eigenvalues)
-    lossy = (psi.T * elasticity.eigenvalues * elasticity.relative_loss) @ psi
+    omega, own = np.sqrt(eigenvalues), psi[: len(reduced.omega)]
+    lossy = (own.T * elasticity.eigenvalues * elasticity.relative_loss) @ own
     share = np.sqrt(loss_factors(reduced.plate, omega))
-    lost = lossy * np.outer(share, share) + (psi.T * elasticity.losses) @ psi
+    lost = lossy * np.outer(share, share) + (own.T * elasticity.losses) @ own
     viscous = lost / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T
-    return _under_fingertips((M, C, K), phi[len(fixed) :], [each.fingertip for each in contacts])
+    return _under_fingertips((M, C, K), phi[fixed:], [each.fingertip for each in contacts])
 
 
 def on_springs(
-    reduced: ReducedPlate, loads: Sequence[PointLoad], phi: FloatArray
+    reduced: ReducedPlate, parts: Sequence[InTime], phi: FloatArray
 ) -> tuple[ModalElasticity, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Elasticity of the free plate, and M, C, K (r, r) with loads of shapes phi (n, r).
+    """Elasticity of the free plate, and M, C, K (r + m, r + m) with n parts of shapes phi (n, r).
 
-    C is of the loads alone.
+    The last m coordinates are those of the far ends that have a mass. C is of the parts alone.
     """
     elasticity = ModalElasticity.of(reduced.plate, reduced.omega**2, reduced.losses)
-    values = ([getattr(load, key) for load in loads] for key in ("mass", "damping", "stiffness"))
-    mass, damping, stiffness = ((phi.T * each) @ phi for each in values)
-    M, K = mass + np.eye(len(mass)), stiffness + np.diag(elasticity.eigenvalues)
+    keys = ("mass", "inertance", "damping", "stiffness")
+    values = (np.array([getattr(part, key) for part in parts]) for key in keys)
+    stretched, r = stretches(parts, phi), len(reduced.omega)
+    own = stretched.copy()
+    own[:, r:] = 0.0  # of what moves with the plate alone
+    mass, inertance, damping, stiffness = (
+        (shapes.T * each) @ shapes
+        for shapes, each in zip((own, *[stretched] * 3), values, strict=True)
+    )
+    free = [part.far_mass for part in parts if part.far_mass is not None]
+    M = mass + inertance + np.diag([*np.ones(r), *free])
+    K = stiffness + np.diag(np.pad(elasticity.eigenvalues, (0, len(free))))
     return elasticity, (M, damping, K)
+
+
+def stretches(parts: Sequence[InTime], phi: FloatArray) -> FloatArray:
+    """By how much each coordinate stretches n parts of shapes phi (n, r), (n, r + m).
+
+    The displacement of the plate less that of the far end, where that has a mass.
+    """
+    free = [number for number, part in enumerate(parts) if part.far_mass is not None]
+    found = np.pad(phi, ((0, 0), (0, len(free))))
+    found[free, phi.shape[1] + np.arange(len(free))] = -1.0
+    return found
 
 
 def _under_fingertips(
@@ -233,11 +262,11 @@ def _under_fingertips(
     phi: FloatArray,
     fingertips: Sequence[Fingertip],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M, C, K (r + n, r + n) with n fingertips at points of shapes phi (n, r)."""
-    n = len(fingertips)
-    M, C, K = (np.pad(matrix, (0, n)) for matrix in plate)
-    for phalanx, (shape, tip) in enumerate(zip(phi, fingertips, strict=True), start=len(phi.T)):
-        contact = np.pad(shape, (0, n))
+    """M, C, K with n more coordinates for n fingertips at points of shapes phi (n, r)."""
+    before = len(plate[0])
+    M, C, K = (np.pad(matrix, (0, len(fingertips))) for matrix in plate)
+    for phalanx, (shape, tip) in enumerate(zip(phi, fingertips, strict=True), start=before):
+        contact = np.pad(shape, (0, len(M) - len(shape)))
         pulp = contact.copy()
         pulp[phalanx] = -1.0  # its stretch is the displacement of the plate less the phalanx's
         M += tip.contact_mass * np.outer(contact, contact)
@@ -290,7 +319,7 @@ class SupportedModes:
 
 def supported_modes(
     reduced: ReducedPlate,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     *,
     loads: Sequence[PointLoad] = (),
     frequency_max: float,
@@ -305,4 +334,5 @@ def supported_modes(
     low = omega <= 2 * np.pi * frequency_max
     omega, psi = omega[low], psi[:, low]
     ratios = np.einsum("rn,rs,sn->n", psi, C, psi) / (2 * omega)
-    return SupportedModes(omega / (2 * np.pi), ratios, reduced, psi)
+    own = psi[: len(reduced.omega)]
+    return SupportedModes(omega / (2 * np.pi), ratios, reduced, own)

@@ -1,15 +1,17 @@
 """Checks of a rig across its sections."""
 
 import math
+from typing import Any
 
 from model.config.document import key_name
-from model.config.sections import Validation
+from model.config.sections import Validation, section_by_kind
 from model.errors import InputError
+from model.rig.actuator_section import ActuatorSection
+from model.rig.actuators import KINDS, kind_of
 from model.rig.meshes import mesh_of
 from model.rig.parts import laminate_of, plate_of
 from model.rig.rig import SAME_POINT
 from model.rig.sections import (
-    EraSection,
     LimitsSection,
     MassSection,
     PlateSection,
@@ -18,13 +20,6 @@ from model.rig.sections import (
 from model.spectral.mesh import SpectralMesh
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
-
-STIFF_MOUNT = 1e6
-"""Stiffness [N/m] from which the dent of a point force in the plate counts beside the mount's own.
-
-On the paper's plate a radius of 5 mm in place of a point changes the response by 2 % at 400 Hz and
-16 % near a resonance (`docs/decisions/0049-stiff-mounts-have-a-size.md`).
-"""
 
 
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
@@ -45,25 +40,20 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
 
 def _check_era(validation: Validation[RigSection], name: str) -> None:
     """Check what keys of an ERA require of each other."""
-    given = _given(validation, ("eras", name))
-    if {"damping", "damping_ratio"} <= validation.mapping(("eras", name)).keys():
-        validation.add(
-            ("eras", name, "damping"),
-            "must not be given with damping_ratio; remove one of the two",
-        )
-    for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
-        if other in given and key not in given:
-            validation.add(
-                ("eras", name, key),
-                f"missing; add it, or remove {other} too for an ERA that only supports",
-            )
-    stiffness = validation.field(("eras", name, "stiffness"), EraSection)
-    if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in given:
-        validation.add(
-            ("eras", name, "foot"),
-            f"missing; add the radius of the patch on which it holds the plate: at "
-            f"{stiffness:g} N/m, {STIFF_MOUNT:g} N/m or more, the response depends on it",
-        )
+    section, path = _section(validation, name), ("eras", name)
+
+    def read(key: str) -> Any:
+        return validation.field((*path, key), section)
+
+    given = _given(validation, path)
+    for key, problem in kind_of(section).problems(given, read) if given else ():
+        validation.add((*path, key), problem)
+
+
+def _section(validation: Validation[RigSection], name: str) -> type[ActuatorSection]:
+    """The section of an ERA, or of another kind of actuator."""
+    sections = [kind.section for kind in KINDS.values()]
+    return section_by_kind(sections, validation.mapping(("eras", name)))
 
 
 def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
@@ -130,7 +120,9 @@ def _check_places(
 ) -> None:
     placed: dict[str, tuple[float, float]] = {}
     for name in names:
-        place = _check_on_plate(validation, ("eras", name), EraSection, plate, what="ERA")
+        place = _check_on_plate(
+            validation, ("eras", name), _section(validation, name), plate, what="ERA"
+        )
         if place is None:
             continue
         for other, taken in placed.items():
@@ -145,7 +137,7 @@ def _check_places(
 def _check_on_plate(
     validation: Validation[RigSection],
     path: tuple[str, ...],
-    section: type[EraSection | MassSection],
+    section: type[ActuatorSection | MassSection],
     plate: Plate | None,
     *,
     what: str,
@@ -173,8 +165,9 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
     if names and not any("amplifier" in _given(validation, ("eras", name)) for name in names):
         validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
     for name in names:
+        section = _section(validation, name)
         amplifier, channel = (
-            validation.field(("eras", name, key), EraSection) for key in ("amplifier", "channel")
+            validation.field(("eras", name, key), section) for key in ("amplifier", "channel")
         )
         if amplifier is not None and amplifier not in amplifiers:
             known = ", ".join(key_name((key,)) for key in amplifiers) or "none"

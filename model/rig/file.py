@@ -8,10 +8,10 @@ from model.config.document import Document, parse_document, read_document
 from model.config.kinds import check_is_rig
 from model.config.sections import Validation
 from model.errors import InputError
+from model.rig.actuators import kind_of
 from model.rig.checks import check_across
 from model.rig.meshes import mesh_of
 from model.rig.parts import (
-    era_of,
     fingertip_of,
     laminate_of,
     limits_of,
@@ -51,7 +51,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     everything = {
-        name: era_of(name, era, plate, era_count=len(section.eras))
+        name: kind_of(era).make(name, era, plate, len(section.eras))
         for name, era in section.eras.items()
     }
     wiring = {
@@ -66,7 +66,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
             wanted,
             plate,
             frequency_max=section.limits.frequency[1],
-            stiffness=max(era.stiffness for era in everything.values()),
+            stiffness=max(era.in_time.stiffness for era in everything.values()),
             foot=min(era.foot for era in everything.values()),
         ),
         eras=tuple(era for name, era in everything.items() if name in wiring),

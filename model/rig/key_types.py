@@ -1,5 +1,6 @@
 """Values of the keys of a rig file: names, places, rows of numbers, with their bounds."""
 
+import math
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,6 +11,8 @@ from pydantic import AfterValidator, Strict
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, LENGTH
 from model.finger.perception import THRESHOLDS
+from model.structure.attachments import Gain
+from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 
@@ -89,3 +92,14 @@ Place = Annotated[tuple[Coordinate, Coordinate], Strict(strict=False)]  # a list
 Foot = Annotated[float, Quantity(LENGTH, at_least=0, at_most=0.2)]
 Thickness = Annotated[float, Quantity(LENGTH, at_least=1e-6, at_most=1)]
 Frequency = Annotated[float, Quantity(FREQUENCY, at_least=1, at_most=2000)]
+
+
+def place_on(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:
+    """A place clipped to the plate, off whose edge rounding may have put it."""
+    x, y = place
+    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
+
+
+def gains_of(rows: Sequence[GainRow] | None) -> tuple[Gain, ...]:
+    """Gains of rows with phases in degrees."""
+    return tuple((f, size, math.radians(phase)) for f, size, phase in rows or ())

@@ -13,7 +13,8 @@ import numpy as np
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.errors import InputError
-from model.structure.attachments import Era
+from model.structure.actuators import OneKind
+from model.structure.attachments import Source
 from model.structure.plate import Plate
 
 Place = tuple[float, float]
@@ -61,7 +62,7 @@ def named_layouts(era_count: int) -> tuple[EraLayout, ...]:
     return tuple(layout for layout in layouts if len(layout.places) == era_count)
 
 
-def alike(era: Era, positions: FloatArray) -> tuple[Era, ...]:
+def alike(era: OneKind, positions: FloatArray) -> tuple[OneKind, ...]:
     """Copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
     return tuple(
         replace(era, name=f"E{number}", x=float(x), y=float(y))
@@ -69,7 +70,7 @@ def alike(era: Era, positions: FloatArray) -> tuple[Era, ...]:
     )
 
 
-def edge_pair(eras: Sequence[Era]) -> tuple[int, int]:
+def edge_pair(eras: Sequence[Source]) -> tuple[int, int]:
     """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
 
     def order(pair: tuple[int, int]) -> tuple[float, float]:
@@ -79,19 +80,19 @@ def edge_pair(eras: Sequence[Era]) -> tuple[int, int]:
     return min(_pairs(eras), key=order)
 
 
-def diagonal_pair(eras: Sequence[Era]) -> tuple[int, int]:
+def diagonal_pair(eras: Sequence[Source]) -> tuple[int, int]:
     """The two ERAs that are furthest apart; the first of several such pairs."""
     pairs = _pairs(eras)
     return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
 
 
-def _pairs(eras: Sequence[Era]) -> list[tuple[int, int]]:
+def _pairs(eras: Sequence[Source]) -> list[tuple[int, int]]:
     if len(eras) < 2:
         raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
     return list(combinations(range(len(eras)), 2))
 
 
-def _apart(eras: Sequence[Era], pair: tuple[int, int]) -> FloatArray:
+def _apart(eras: Sequence[Source], pair: tuple[int, int]) -> FloatArray:
     first, second = (eras[index] for index in pair)
     return np.array([second.x - first.x, second.y - first.y])
 

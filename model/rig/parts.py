@@ -3,20 +3,19 @@
 import math
 from dataclasses import fields, replace
 
+from model.rig.key_types import place_on
 from model.rig.sections import (
-    EraSection,
     FingertipSection,
     LimitsSection,
     MassSection,
     PlateSection,
 )
-from model.structure.attachments import Era, Fingertip, PointLoad, damping_from_ratio
+from model.structure.attachments import Fingertip, PointLoad
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from registry.limits import GuardLimits
 
 _OF_PLATE = {each.name for each in fields(Plate)} - {"thickness", "material", "air_gap"}
-_OF_ERA = {each.name for each in fields(Era)} - {"damping", "gains"}
 """Fields that have the values of the keys of their names."""
 
 
@@ -55,30 +54,9 @@ def laminate_of(section: PlateSection) -> Laminate | None:
     return Laminate(tuple(layers), bond=section.bond)
 
 
-def era_of(name: str, section: EraSection, plate: Plate, *, era_count: int) -> Era:
-    """An ERA; era_count: of the rig, for the damping from a ratio."""
-    damping = section.damping
-    if damping is None:
-        damping = damping_from_ratio(
-            section.damping_ratio,
-            stiffness=section.stiffness,
-            plate_mass=plate.mass,
-            era_count=era_count,
-        )
-    x, y = _onto(plate, section.at)
-    return Era(
-        name=name,
-        x=x,
-        y=y,
-        damping=damping,
-        gains=tuple((f, size, math.radians(phase)) for f, size, phase in section.gains or ()),
-        **section.model_dump(include=_OF_ERA),
-    )
-
-
 def mass_of(section: MassSection, plate: Plate) -> PointLoad:
     """A mass on the plate."""
-    x, y = _onto(plate, section.at)
+    x, y = place_on(plate, section.at)
     return PointLoad(x, y, **section.model_dump(exclude={"at"}))
 
 
@@ -92,9 +70,3 @@ def limits_of(section: LimitsSection) -> GuardLimits:
 def fingertip_of(section: FingertipSection | str) -> Fingertip | None:
     """The load of a fingertip; None for weightless ones."""
     return None if isinstance(section, str) else Fingertip(**section.model_dump())
-
-
-def _onto(plate: Plate, place: tuple[float, float]) -> tuple[float, float]:
-    """A place clipped to the plate, off whose edge rounding may have put it."""
-    x, y = place
-    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)

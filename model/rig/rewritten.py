@@ -12,6 +12,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from model.config.document import Document, KeyPath, parse_document
 from model.config.editing import edited_text
 from model.errors import InputError
+from model.rig.actuators import KINDS
 from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -22,7 +23,6 @@ _Written: TypeAlias = "float | tuple[Any, ...] | Material | Uncertainty"
 _PER_LINE = 4
 _SAME = 1e-4  # relative; of phases and of what modes deviate, absolute
 _SAME_PLACE = 1e-6  # m
-_IN_ANY_CASE = ("loss_factor", "stiffness", "damping", "bolt_mass")
 
 # ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
 _ROWS_OF = "rows-of-"
@@ -45,8 +45,10 @@ def rewritten_text(
     def change(data: CommentedMap) -> None:
         own = _values(before)
         for path, value in _values(after).items():
-            if value != own[path] or path[-1] in _IN_ANY_CASE:
+            if value != own[path] or path in _restated(after):
                 _put(data, path, value, rows)
+        for era in after.eras:
+            _drop_replaced(data["eras"][era.name], KINDS[type(era)].instead)
         for mass in after.masses[len(before.masses) :]:
             masses = data.setdefault("masses", CommentedMap())
             masses[_free_name(masses)] = _flow(
@@ -86,9 +88,23 @@ def _values(rig: Rig) -> dict[KeyPath, _Written]:
     found["plate", "modes"] = plate.mode_deviations
     for era in rig.eras:
         found["eras", era.name, "at"] = (era.x, era.y)
-        for key in ("stiffness", "damping", "bolt_mass", "gains"):
-            found["eras", era.name, key] = getattr(era, key)
+        for field, key in KINDS[type(era)].keys.items():
+            found["eras", era.name, key] = getattr(era, field)
     return found
+
+
+def _restated(rig: Rig) -> set[KeyPath]:
+    """Where values are that are written in any case: others of the file would change them."""
+    kinds = [(era.name, KINDS[type(era)]) for era in rig.eras]
+    own = {("eras", name, key) for name, kind in kinds for key in kind.restated}
+    return {("plate", "loss_factor"), *own}
+
+
+def _drop_replaced(entry: CommentedMap, instead: Mapping[str, tuple[str, ...]]) -> None:
+    """Remove keys in whose place others have been written."""
+    for key, others in instead.items():
+        for other in others if key in entry else ():
+            entry.pop(other, None)
 
 
 def _numbers(rig: Rig) -> Iterator[tuple[float, float]]:

@@ -17,7 +17,8 @@ from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
-from model.structure.attachments import Era, Fingertip, PointLoad
+from model.structure.actuators import Actuator
+from model.structure.attachments import Fingertip, PointLoad
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.suggestions import did_you_mean
@@ -55,7 +56,7 @@ class Rig:
 
     plate: Plate
     mesh: PlateMesh
-    eras: tuple[Era, ...]
+    eras: tuple[Actuator, ...]
     wiring: Mapping[str, Channel]
     amplifiers: Mapping[str, str]
     limits: GuardLimits
@@ -93,7 +94,7 @@ class Rig:
                         f"({era.x:g}, {era.y:g}) m; move one of them"
                     )
 
-    def era(self, name: str) -> Era:
+    def era(self, name: str) -> Actuator:
         """The ERA of a name; raises InputError for an unknown one."""
         eras = {era.name: era for era in self.eras}
         if name not in eras:
@@ -104,9 +105,9 @@ class Rig:
         return eras[name]
 
     @cached_property
-    def strokes(self) -> dict[str, float]:
-        """Stroke of each ERA [m], by its name."""
-        return {era.name: era.stroke for era in self.eras}
+    def full_levels(self) -> dict[str, float]:
+        """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""
+        return {era.name: era.full_level for era in self.eras}
 
     def replaced(self, **changes: Any) -> "Rig":
         """Make a rig with other keys, as thickness=0.002, plate={"thickness": 0.002}, or sections.
@@ -119,6 +120,11 @@ class Rig:
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made
+
+    @property
+    def largest_stiffness(self) -> float:
+        """That of the stiffest spring of an actuator [N/m], for the accuracy of a mesh."""
+        return max(era.in_time.stiffness for era in self.eras)
 
     @property
     def channel_counts(self) -> Counter[str]:

@@ -30,8 +30,8 @@ from model.config.units import (
     Dimension,
 )
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
+from model.rig.actuators import ActuatorOfAnyKind
 from model.rig.key_types import (
-    GAINS,
     MODES,
     MODULI,
     Foot,
@@ -210,62 +210,6 @@ class PlateSection(Section):
     """
 
 
-class EraSection(Section):
-    """One ERA; without an amplifier it only supports the plate.
-
-    Defaults of damping and stroke are assumed, the paper prints neither.
-    """
-
-    model_config = ConfigDict(
-        json_schema_extra={
-            "dependentRequired": {"amplifier": ["channel"], "channel": ["amplifier"]}
-        }
-    )
-
-    at: Place
-    """`[x, y]` where it supports the plate; on the plate, at most one ERA per position."""
-
-    stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)]
-    """Of its spring, k_b."""
-
-    damping_ratio: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] = 0.05
-    """Zeta of its damper: c = 2 zeta sqrt(k_b m / n), m the bare plate's mass, n the number of
-    ERAs.
-    """
-
-    damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
-    """C itself, instead of `damping_ratio`."""
-
-    bolt_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] = 0.0
-    """Mass that moves with the plate, m_b."""
-
-    stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
-    """Amplitude of its base at level 1, where its gain is 1."""
-
-    foot: Foot = 0.0
-    """Radius of the disc on which it presses, 0 for a point as in the paper; only the part on the
-    plate counts. Required from a stiffness of 1 MN/m: [points and
-    feet](../concepts/plate-model.md#points-and-feet).
-    """
-
-    gains: Annotated[list[GainRow], Field(max_length=2000), GAINS] | None = None
-    """`[[frequency in Hz, magnitude, phase in degrees], ...]`: motion of its base by a level, in
-    strokes, measured by `era calibrate` ([calibration](../how-to/calibration.md)); linear in
-    between, constant outside, 1 without rows.
-
-    Limits: rows by ascending frequency
-    """
-
-    amplifier: Identifier | None = None
-    """The amplifier that drives it; none for an ERA that only supports the plate.
-
-    Limits: a name under `amplifiers`
-    """
-
-    channel: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Its channel; unique per ERA, none without an amplifier."""
-
-
 class MassSection(Section):
     """A mass on the plate, at a point or on a disc."""
 
@@ -378,7 +322,7 @@ class LimitsSection(Section):
     """Lowest and highest mechanical frequency that may be driven."""
 
     level: Annotated[float, Quantity(RATIO, at_least=0, at_most=1)] = 1.0
-    """Share of an ERA's stroke."""
+    """Share of the full level, as of an ERA's stroke."""
 
     slew: Annotated[float, Quantity(SLEW, above=0, at_most=1e6)] | None = None
     """Maximum rise of a level; `2 %/ms` is from rest to full stroke in 50 ms. Ramps are lengthened
@@ -429,8 +373,8 @@ class RigSection(Section):
     ELEMENT`, or `NXxNY ELEMENT with strips of W`
     """
 
-    eras: Annotated[dict[Identifier, EraSection], Field(min_length=1, max_length=64)]
-    """ERAs by name, see [eras](#eras)."""
+    eras: Annotated[dict[Identifier, ActuatorOfAnyKind], Field(min_length=1, max_length=64)]
+    """ERAs, or exciters, by name, see [eras](#eras) and [exciters](#exciters)."""
 
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
     """Point masses by name, see [masses](#masses)."""

@@ -14,7 +14,7 @@ import cmath
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from model.errors import InputError
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""
+
+Factor: TypeAlias = float | FloatArray
+"""Of a parameter that deviates, one or several."""
 
 
 class Support(Protocol):
@@ -49,15 +52,105 @@ class Support(Protocol):
         """Force on it per displacement [N/m] at omega [rad/s], of its shape."""
 
 
+@dataclass(frozen=True)
+class InTime:
+    """A source in time: a spring and a damper from the plate to its far end, and what drives it.
+
+    mass [kg]: moves with the plate; stiffness [N/m], damping [N s/m]; inertance [kg]: force by the
+    relative acceleration of both ends; far_mass [kg]: of the far end, None where that moves by
+    itself or is held; by_drive, by_rate: force that pushes the plate and the far end apart per unit
+    of the drive and of its rate.
+    """
+
+    mass: float
+    stiffness: float
+    damping: float
+    far_mass: float | None = None
+    by_drive: float = 0.0
+    by_rate: float = 0.0
+    inertance: float = 0.0
+
+
 class Source(Support, Protocol):
-    """What drives the plate, and supports it: an ERA, or a force with an impedance."""
+    """What drives the plate, and supports it: an actuator.
+
+    Its drive is in a unit of its own, metres of an ERA's base or volts of an exciter. Errors of its
+    spring and damper act on the plate with the change of D times the base less the plate's motion.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its name in the rig."""
+
+    @property
+    def full_level(self) -> float:
+        """Amplitude of its drive at level 1."""
+
+    @property
+    def gains(self) -> tuple[Gain, ...]:
+        """Its measured gain."""
+
+    @property
+    def support(self) -> "PointLoad":
+        """What it is at rest to a plate that moves slowly."""
+
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time."""
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain of its drive at frequencies [Hz], of their shape."""
 
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
 
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Dynamic stiffness [N/m], and force by its drive without its gain, of one that deviates.
+
+        stiffness, damping: by factors; all arguments broadcast.
+        """
+
+    def base(self, omega: FloatArray) -> ComplexArray:
+        """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
+
+    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of its stiffness [N/m]."""
+
+    def by_damping(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of its damping [N/m]."""
+
+    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
+        """The source with another stiffness and damping, by factors."""
+
+
+class MeasuredGains:
+    """The measured gain of a source: gains at ascending frequencies, empty for a gain of 1."""
+
+    gains: tuple[Gain, ...]
+
+    def gain(self, frequencies: FloatArray) -> ComplexArray:
+        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
+
+        Linear between measured frequencies, constant outside. At negative frequencies, as in the
+        lower sideband of a fast ramp, the conjugate: what is driven is real.
+        """
+        if not self.gains:
+            return np.ones(np.shape(frequencies), dtype=complex)
+        measured = [frequency for frequency, _, _ in self.gains]
+        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
+        found = np.interp(np.abs(frequencies), measured, values)
+        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+
+    def _tuples_of_gains(self) -> None:
+        """Keep gains as tuples: a file gives lists, which cannot be compared and hashed."""
+        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
+        object.__setattr__(self, "gains", gains)
+
 
 @dataclass(frozen=True)
-class Era:
+class Era(MeasuredGains):
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
     x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
@@ -65,6 +158,9 @@ class Era:
     point. An ERA that is not driven still supports and damps.
     gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
     """
+
+    LEARNED: ClassVar = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
+    """Fields that measurements of a plate change."""
 
     name: str
     x: float
@@ -85,31 +181,34 @@ class Era:
             at_least="damping bolt_mass foot",
             finite="x y",
         )
-        # A file gives lists; only tuples can be compared and hashed with the rest.
-        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
-        object.__setattr__(self, "gains", gains)
+        self._tuples_of_gains()
 
-    def gain(self, frequencies: FloatArray) -> ComplexArray:
-        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
-
-        Linear between measured frequencies, constant outside. At negative frequencies, as in the
-        lower sideband of a fast ramp, the conjugate: the base's motion is real.
-        """
-        if not self.gains:
-            return np.ones(np.shape(frequencies), dtype=complex)
-        measured = [frequency for frequency, _, _ in self.gains]
-        values = np.array([cmath.rect(size, phase) for _, size, phase in self.gains])
-        found = np.interp(np.abs(frequencies), measured, values)
-        return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
+    @property
+    def full_level(self) -> float:
+        """Amplitude of its base at level 1, its stroke [m]."""
+        return self.stroke
 
     @property
     def support(self) -> "PointLoad":
         """The ERA at rest, as a load of the plate."""
         return PointLoad(self.x, self.y, self.stiffness, self.damping, self.bolt_mass, self.foot)
 
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time; the base moves by itself."""
+        k, c = self.stiffness, self.damping
+        return InTime(self.bolt_mass, k, c, by_drive=k, by_rate=c)
+
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k_b + i omega c - omega² m_b [N/m] at omega [rad/s], of its shape."""
         return self.support.dynamic_stiffness(omega)
+
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """D and k_b + i omega c [N/m] of one with another stiffness and damping, by factors."""
+        spring = stiffness * self.stiffness + 1j * omega * (damping * self.damping)
+        return np.asarray(spring - omega**2 * self.bolt_mass), np.asarray(spring)
 
     def base(self, omega: FloatArray) -> ComplexArray:
         """Amplitude of the base at full stroke [m] at omega [rad/s], its own gain included."""
@@ -118,6 +217,18 @@ class Era:
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
         return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
+
+    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of k_b, k_b [N/m]."""
+        return np.full(np.shape(omega), self.stiffness, dtype=complex)
+
+    def by_damping(self, omega: FloatArray) -> ComplexArray:
+        """Change of D with the logarithm of c, i omega c [N/m]."""
+        return np.asarray(1j * omega * self.damping)
+
+    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
+        """An ERA that is stiffer and damps more by factors."""
+        return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
 
 
 def damping_from_ratio(
@@ -243,6 +354,11 @@ class PointLoad:
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
         expect_values(self, "point load", at_least="stiffness damping mass foot", finite="x y")
+
+    @property
+    def in_time(self) -> InTime:
+        """Its equations in time."""
+        return InTime(self.mass, self.stiffness, self.damping)
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""

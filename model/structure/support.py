@@ -6,7 +6,7 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.structure.attachments import Era, PointLoad
+from model.structure.attachments import PointLoad, Source
 from model.structure.plate import Plate
 
 GRAVITY = 9.81  # m/s²
@@ -16,7 +16,7 @@ MIN_RIGID_BODY_FREQUENCY = 1.0
 
 
 def rigid_body_frequencies(
-    plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    plate: Plate, eras: Sequence[Source], *, loads: Sequence[PointLoad] = ()
 ) -> FloatArray:
     """Natural frequencies (3,) [Hz] of the rigid plate on its springs, ascending.
 
@@ -32,9 +32,11 @@ def rigid_body_frequencies(
 
 
 def static_loads(
-    plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    plate: Plate, eras: Sequence[Source], *, loads: Sequence[PointLoad] = ()
 ) -> FloatArray:
     """Weight [N] of the rigid plate on each ERA, and then on each spring among the loads.
+
+    An exciter whose magnet is free carries nothing: it is left out, and weighs.
 
     At least three springs are not in one line. K q = sum of weights p, reactions k p' q.
     """
@@ -45,7 +47,7 @@ def static_loads(
 
 
 def _attached(
-    plate: Plate, eras: Sequence[Era], loads: Sequence[PointLoad]
+    plate: Plate, eras: Sequence[Source], loads: Sequence[PointLoad]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Factors p (3, n), stiffness [N/m] and mass [kg] (n,) of what is attached.
 
@@ -59,7 +61,7 @@ def _attached(
 
 
 def support_problem(
-    plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()
+    plate: Plate, eras: Sequence[Source], *, loads: Sequence[PointLoad] = ()
 ) -> str | None:
     """Why ERAs and loads do not support a plate, with the remedy; None if they do."""
     lowest = rigid_body_frequencies(plate, eras, loads=loads)[0]
@@ -67,12 +69,14 @@ def support_problem(
         return None
     return (
         f"the plate is not supported: its lowest rigid-body frequency must be at least "
-        f"{MIN_RIGID_BODY_FREQUENCY:g} Hz, got {lowest:.2g} Hz; put at least three ERAs under it, "
-        "stiff enough and not in one line"
+        f"{MIN_RIGID_BODY_FREQUENCY:g} Hz, got {lowest:.2g} Hz; put at least three ERAs or feet "
+        "under it, stiff enough and not in one line; a free exciter holds nothing"
     )
 
 
-def check_supported(plate: Plate, eras: Sequence[Era], *, loads: Sequence[PointLoad] = ()) -> None:
+def check_supported(
+    plate: Plate, eras: Sequence[Source], *, loads: Sequence[PointLoad] = ()
+) -> None:
     """Raise InputError for a plate that its ERAs and loads do not support."""
     if (problem := support_problem(plate, eras, loads=loads)) is not None:
         raise InputError(problem)

@@ -175,7 +175,7 @@ def _responses(
     rows = table.rows_of(frequencies)
     at = table.attached, rows, bases[:, None]
     found = accelerations_on(table, discs, fingers, *at, plates)[:, :, 0]
-    weights = np.abs(bases) / [era.stroke for era in table.eras]
+    weights = np.abs(bases) / [era.full_level for era in table.eras]
     size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))
     deviation = np.repeat(plates.deviation, discs.shape[1], axis=1)
     return rows, (found + np.multiply.outer(deviation, size).swapaxes(1, 2)).transpose(1, 2, 0)
@@ -198,13 +198,12 @@ def accelerations_on(
     """
     check_scales(table.plate, plates.thickness, plates.modulus)
     w, eras = attached.omega[rows], table.eras
-    k, c, bolts = (np.array([getattr(era, key) for era in eras]) for key in _ERA_KEYS)
-    damping = plates.damping[:, None, None] * c
-    springs = plates.stiffness[:, None] * k + 1j * w[:, None] * damping
+    of_each = zip(eras, plates.stiffness.T, strict=True)
+    each = [era.deviating(w, by[:, None], plates.damping[:, None]) for era, by in of_each]
+    at_eras, pushes = (np.stack(part, axis=-1) for part in zip(*each, strict=True))
     loads = plates.load[:, : len(fingers)]
     factors = np.pad(loads, ((0, 0), (len(table.masses), 0)), constant_values=1.0)
     resting = attached_stiffness(w, table.masses, fingers)
-    at_eras = springs - (w**2)[:, None] * bolts
     stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
     nominal = attached.modal[rows]
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
@@ -216,7 +215,7 @@ def accelerations_on(
     shapes = shapes[:, None]
     receptance = np.asarray((modal * shapes) @ shapes.swapaxes(2, 3), dtype=complex)
     gains = np.array([era.gain(table.frequencies[rows]) for era in eras]).T
-    driven = (springs * plates.gain[:, None] * gains)[:, :, None] * bases
+    driven = (pushes * plates.gain[:, None] * gains)[:, :, None] * bases
     still = ((0, 0), (0, 0), (0, 0), (0, shapes.shape[2] - len(eras)))
     forces = coupled_forces(receptance, stiffness, np.pad(driven, still).swapaxes(2, 3))
     moved = modal * (forces.swapaxes(2, 3) @ shapes)
@@ -232,6 +231,3 @@ def _shifts(table: LocalizationTable, places: FloatArray) -> FloatArray:
     moved[:, :, :2] = np.clip(moved[:, :, :2] + places, 0.0, sides)
     there = table.shapes_at(moved.reshape(-1, known.shape[1]))
     return np.asarray(there.reshape(*moved.shape[:2], -1) - table.shapes_at(known))
-
-
-_ERA_KEYS = ("stiffness", "damping", "bolt_mass")

@@ -13,14 +13,14 @@ import numpy as np
 
 from model.answer.plan import query
 from model.arrays import Complex64Array
-from model.config.sections import Quantity
+from model.config.sections import Quantity, Section
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
+from model.rig.actuators import KINDS
 from model.rig.rig import PHYSICS
 from model.rig.sections import (
     AirGapSection,
-    EraSection,
     FingertipSection,
     LayerSection,
     MassSection,
@@ -125,8 +125,13 @@ def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
     return [str(value) for value in values]
 
 
-_SECTIONS = (PlateSection, LayerSection, MaterialSection, AirGapSection, EraSection, MassSection)
-_NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad"}
+_SECTIONS: tuple[type[Section], ...] = (
+    *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection),
+    *(kind.section for kind in KINDS.values()),
+)
+_NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
+    "voltage": "voltage_v"
+}
 
 
 def _physics(table: LocalizationTable) -> dict[str, Any]:
@@ -161,9 +166,10 @@ def _exported(value: Any, names: Mapping[str, str]) -> Any:
 
 
 def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
-    """A struct array (n, 1) of rows of the same names."""
-    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in rows[0]])
+    """A struct array (n, 1) of rows; what a row has not is empty."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names])
     for number, row in enumerate(rows):
-        for name, value in row.items():
-            structs[name][number, 0] = value
+        for name in names:
+            structs[name][number, 0] = row.get(name, np.zeros((0, 0)))
     return structs

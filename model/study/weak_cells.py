@@ -22,7 +22,8 @@ from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
 from model.finger.grid import Grid
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
-from model.structure.attachments import Era, PointLoad
+from model.structure.actuators import Actuator
+from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
 from model.study.random_contacts import MIN_DISTANCE
 from model.table.table import LocalizationTable
@@ -229,13 +230,13 @@ def _reflected(at: Point, table: LocalizationTable, along: tuple[bool, bool]) ->
 
 
 def _placed(
-    attached: Iterable[Era | PointLoad], table: LocalizationTable, along: tuple[bool, bool]
-) -> Counter[Era | PointLoad]:
+    attached: Iterable[Actuator | PointLoad], table: LocalizationTable, along: tuple[bool, bool]
+) -> Counter[Actuator | PointLoad]:
     """What is attached, without names, at its reflected places."""
-    found: Counter[Era | PointLoad] = Counter()
+    found: Counter[Actuator | PointLoad] = Counter()
     for each in attached:
         x, y = _reflected((each.x, each.y), table, along)
-        nameless = replace(each, name="") if isinstance(each, Era) else each
+        nameless = each if isinstance(each, PointLoad) else replace(each, name="")
         found[replace(nameless, x=x, y=y)] += 1
     return found
 

@@ -84,7 +84,7 @@ class TableProblem:
             self.rig.plate,
             self.rig.mesh,
             frequency_max=self.rig.limits.frequency_max,
-            stiffness=max(era.stiffness for era in self.rig.eras),
+            stiffness=self.rig.largest_stiffness,
         )
 
     @cached_property

@@ -14,12 +14,13 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig, differences
-from model.structure.attachments import Era, footprints_of
+from model.structure.actuators import Actuator
+from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import check_scales
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
-_Part = TypeVar("_Part", Plate, Era)
+_Part = TypeVar("_Part", bound=Plate | Actuator)
 
 _SAME_PLACE = 1e-9  # m
 _MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
@@ -27,8 +28,10 @@ _MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not fo
 
 _FOLLOWED = ("masses", "uncertainty", "fingertip", "threshold")
 _FOLLOWED_OF_PLATE = ("loss_factor", "loss_exponent", "mode_deviations")
-_FOLLOWED_OF_ERA = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
-"""Fields of a rig, its plate and its ERAs that may differ; all others must be the table's."""
+"""Fields of a rig and its plate that may differ, beside `LEARNED` of its ERAs.
+
+All others must be the table's.
+"""
 
 
 def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
@@ -45,7 +48,7 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     like = replace(
         table,
         plate=_taking(before.scaled(modulus=stiffer, thickness=thicker), after, _FOLLOWED_OF_PLATE),
-        eras=tuple(_taking(era, others.get(era.name, era), _FOLLOWED_OF_ERA) for era in table.eras),
+        eras=tuple(_taking(era, others.get(era.name, era), era.LEARNED) for era in table.eras),
         **{name: getattr(rig, name) for name in _FOLLOWED},
     )
     if different := differences(like, rig):
@@ -72,7 +75,9 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
 
 
 def _taking(own: _Part, other: _Part, names: Sequence[str]) -> _Part:
-    """A part of a rig with some fields of another."""
+    """A part of a rig with some fields of another, unless that is of another kind."""
+    if type(other) is not type(own):
+        return own
     return replace(own, **{name: getattr(other, name) for name in names})
 
 

@@ -50,8 +50,8 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import fingerprint_of
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
+from model.structure.actuators import Actuator
 from model.structure.attachments import (
-    Era,
     Fingertip,
     PointLoad,
     fingertip_loads,
@@ -109,7 +109,7 @@ class LocalizationTable:
     """
 
     plate: Plate
-    eras: tuple[Era, ...]
+    eras: tuple[Actuator, ...]
     masses: tuple[PointLoad, ...]
     uncertainty: Uncertainty
     fingertip: Fingertip | None
@@ -191,7 +191,7 @@ class LocalizationTable:
     ) -> tuple[FloatArray, Complex64Array]:
         """Frequencies (k,) [Hz] of an excitation, and its field by unit fields (f, eras, ...)."""
         frequencies, bases = base_amplitudes(excitation, self.eras)
-        weights = (bases / [era.stroke for era in self.eras]).astype(np.complex64)
+        weights = (bases / [era.full_level for era in self.eras]).astype(np.complex64)
         rows = self.rows_of(frequencies)
         return frequencies, (weights[:, None] @ fields[rows])[:, 0]
 
@@ -214,16 +214,16 @@ class LocalizationTable:
         return self.raster.at(self.shapes, np.array(points)).astype(float)
 
     @cached_property
-    def strokes(self) -> dict[str, float]:
-        """Stroke of each ERA [m], by its name."""
-        return {era.name: era.stroke for era in self.eras}
+    def full_levels(self) -> dict[str, float]:
+        """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""
+        return {era.name: era.full_level for era in self.eras}
 
     def drive_of(self, excitation: Excitation) -> dict[str, dict[str, float]]:
         """Frequency, level 0..1 of the stroke and phase of an excitation, by ERA."""
         return {
             name: {
                 "frequency_hz": tone.frequency,
-                "level": tone.amplitude / self.strokes[name],
+                "level": tone.amplitude / self.full_levels[name],
                 "phase_deg": math.degrees(tone.phase),
             }
             for name, tone in excitation.items()
@@ -360,7 +360,7 @@ class LocalizationTable:
         """The same at twice the drive frequencies, of those thicknesses that come first there."""
         twice = self._attached(2 * self.frequencies)
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.bases}
-        return PlateOnEras.of(at_harmonics(self.attached, twice), *sorted(counts))
+        return PlateOnEras.of(at_harmonics(twice, self.eras), *sorted(counts))
 
     @cached_property
     def error_power(self) -> Float32Array:

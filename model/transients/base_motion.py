@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.vibration.excitation import Excitation
 
 
@@ -183,18 +183,18 @@ Bases: TypeAlias = tuple[tuple[Term, ...], ...]
 """Motion of every base of a rig, in the order of its ERAs."""
 
 
-def ramped_onset(excitation: Excitation, eras: Sequence[Era], *, ramp: float) -> Bases:
+def ramped_onset(excitation: Excitation, eras: Sequence[Source], *, ramp: float) -> Bases:
     """Motion of the bases when an excitation starts at time 0 along a raised cosine of ramp [s]."""
     return _faded(excitation, eras, ramp=ramp, gains=(0.0, 1.0))
 
 
-def ramped_ending(excitation: Excitation, eras: Sequence[Era], *, ramp: float) -> Bases:
+def ramped_ending(excitation: Excitation, eras: Sequence[Source], *, ramp: float) -> Bases:
     """Motion of the bases when an excitation ends at time 0 along a raised cosine of ramp [s]."""
     return _faded(excitation, eras, ramp=ramp, gains=(1.0, 0.0))
 
 
 def ramped_pulse(
-    excitation: Excitation, eras: Sequence[Era], *, ramp: float, duration: float
+    excitation: Excitation, eras: Sequence[Source], *, ramp: float, duration: float
 ) -> Bases:
     """Motion of the bases when an excitation starts at time 0 and ends after a duration [s].
 
@@ -207,14 +207,14 @@ def ramped_pulse(
     return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
 
 
-def shaped(envelopes: Envelopes, eras: Sequence[Era]) -> Bases:
+def shaped(envelopes: Envelopes, eras: Sequence[Source]) -> Bases:
     """Motion of the bases when envelopes begin at time 0."""
     return tuple(envelopes[era.name].terms() if era.name in envelopes else () for era in eras)
 
 
 def _faded(
     excitation: Excitation,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     *,
     ramp: float,
     gains: tuple[float, float],

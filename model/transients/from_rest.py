@@ -33,7 +33,7 @@ def from_rest(
     period = continued.shape[1]
     spectrum: ComplexArray = factors * np.fft.rfft(continued).T
     s = np.asarray(2j * np.pi * np.fft.rfftfreq(period, 1 / sample_rate), dtype=np.complex128)
-    points = plate.with_phalanges(shapes)
+    points = plate.with_far_ends(shapes)
     by_forced, by_free = (points @ plate.displacement).T, (points @ plate.free_acceleration).T
     forced = np.empty((len(s), len(points)), dtype=complex)
     start = np.zeros(len(plate.eigenvalues), dtype=complex)

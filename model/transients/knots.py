@@ -290,7 +290,7 @@ def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
     mass-normalised coordinates |q''|^2 is the plate's mass times its mean square acceleration.
     """
     rates = plate.eigenvalues.conj()[:, None] + plate.eigenvalues
-    shapes = plate.acceleration.conj().T @ plate.acceleration
+    shapes = plate.own_acceleration.conj().T @ plate.own_acceleration
     return np.asarray(shapes * np.expm1(rates * duration) / (rates * duration))
 
 

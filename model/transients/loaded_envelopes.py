@@ -83,8 +83,8 @@ def _held_by(
     """Accelerations (m, p) at complex frequencies s (m,) by bases (eras,), held by fingers."""
     single, p, k = np.complex64, len(points), len(fingers)
     gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
-    driven = np.array([gains * bases * each for each in (plate.springs, plate.dampers)])
-    shapes = np.vstack([points, *(shape for shape, _ in fingers)])
+    driven = np.array([gains * bases * each for each in (plate.by_drive, plate.by_rate)])
+    shapes = plate.with_far_ends(np.vstack([points, *(shape for shape, _ in fingers)]))
     at = (shapes @ plate.displacement).astype(single)  # (p + k, 2 r)
     forced = (shapes[p:] @ plate.forced.T).astype(single)  # (k, 2 r)
     modal = (1 / (s[:, None] - plate.eigenvalues)).astype(single)

@@ -132,7 +132,8 @@ class Transients:
             for piece in self._pieces(bases, steady, end_time):
                 left = piece.last
             remaining += float((left.conj() @ self._mean_square @ left).real)
-            size = float(np.linalg.norm(self._plate.displacement @ steady))
+            moved = (self._plate.displacement @ steady)[: len(self._plate.reduced.omega)]
+            size = float(np.linalg.norm(moved))
             power += (2 * math.pi * frequency) ** 4 * size**2
         return 10 * math.log10(remaining / power)
 
@@ -154,5 +155,5 @@ class Transients:
             tone = excitation.get(era.name)
             if tone is not None:
                 unit = steady_states(self._plate, 2 * math.pi * tone.frequency)[number]
-                state += unit * (tone.phasor / era.stroke)
+                state += unit * (tone.phasor / era.full_level)
         return state

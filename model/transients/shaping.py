@@ -64,7 +64,7 @@ class Shaper:
         self._read_fingertips = fingertips or partial(_fingertips_on, plate)
         self._gain_variance = gain_variance
         self._names = [era.name for era in plate.eras]
-        self._strokes = np.array([era.stroke for era in plate.eras])
+        self._strokes = np.array([era.full_level for era in plate.eras])
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
@@ -175,7 +175,7 @@ class Shaper:
         for each in [*known][:-_KEPT]:
             known.pop(each, None)
         weights, shapes = map(np.stack, zip(*map(found.__getitem__, positions), strict=True))
-        return weights, shapes
+        return weights, self._plate.with_far_ends(shapes)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
         """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""

@@ -4,8 +4,9 @@
 
 q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers
 on it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
-`model.reduction.reduced_plate`. The first-order system is
-diagonalised once for each set of attachments; the base moves in terms with closed-form
+`model.reduction.reduced_plate`. Of exciters y is the voltage, k_b and c what pushes plate and
+magnet apart by it and its rate, and q has the displacements of their magnets. The first-order
+system is diagonalised once for each set of attachments; the base moves in terms with closed-form
 particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
 with time.
 
@@ -23,8 +24,8 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.reduction.reduced_plate import ReducedPlate, modal_matrices
-from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
+from model.reduction.reduced_plate import ReducedPlate, modal_matrices, stretches
+from model.structure.attachments import FingertipLoad, PointLoad, Source, footprints_of
 from model.transients.base_motion import BaseMotions
 
 
@@ -87,12 +88,13 @@ class PlateInTime:
     """The plate on its ERAs as z' = diag(eigenvalues) z + participation f, f [N] per ERA.
 
     eigenvalues (2 r,) [1/s], in conjugate pairs; vectors (2 r, 2 r): displacement and velocity of
-    the r coordinates, the reduced plate's and one for each phalanx, are vectors @ z; inverse: of
-    the vectors; participation (2 r, eras); forced (2 r, r): z' by a force on each coordinate.
+    the r coordinates, the reduced plate's and one for each free magnet and each phalanx, are
+    vectors @ z; inverse: of the vectors; participation (2 r, eras); forced (2 r, r): z' by a force
+    on each coordinate.
     """
 
     reduced: ReducedPlate
-    eras: tuple[Era, ...]
+    eras: tuple[Source, ...]
     eigenvalues: ComplexArray
     vectors: ComplexArray
     inverse: ComplexArray
@@ -101,12 +103,15 @@ class PlateInTime:
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Shapes of all coordinates at points (p, 2) [m], (p, r)."""
-        return self.with_phalanges(self.reduced.at(points))
+        return self.with_far_ends(self.reduced.at(points))
 
-    def with_phalanges(self, shapes: FloatArray) -> FloatArray:
-        """Shapes (p, r) of all coordinates, from those of the reduced plate's, which come first."""
-        phalanges = len(self.vectors) // 2 - shapes.shape[1]
-        return np.pad(shapes, ((0, 0), (0, phalanges))) if phalanges else shapes
+    def with_far_ends(self, shapes: FloatArray) -> FloatArray:
+        """Shapes (..., r) of all coordinates, from those of the reduced plate's, which come first.
+
+        Magnets and phalanges are not on the plate.
+        """
+        others = len(self.vectors) // 2 - shapes.shape[-1]
+        return np.pad(shapes, (*[(0, 0)] * (shapes.ndim - 1), (0, others))) if others else shapes
 
     @cached_property
     def displacement(self) -> ComplexArray:
@@ -126,8 +131,8 @@ class PlateInTime:
         era, each = motions.era[active], motions.omega[active]
         tau, s = moments[number] - motions.start[active], 1j * each
         phase_factor = np.exp(s * tau)
-        c = self.dampers[era]
-        impedance = self.springs[era] + c * s  # force by displacement
+        c = self.by_rate[era]
+        impedance = self.by_drive[era] + c * s  # force by displacement, or by voltage
         is_first = np.ones(len(each), dtype=bool)
         is_first[1:] = (each[1:] != each[:-1]) | (number[1:] != number[:-1])
         omegas = each[is_first]
@@ -162,14 +167,14 @@ class PlateInTime:
         return [number for number, era in enumerate(self.eras) if era.gains]
 
     @cached_property
-    def springs(self) -> FloatArray:
-        """Stiffness [N/m] of each ERA."""
-        return np.array([era.stiffness for era in self.eras])
+    def by_drive(self) -> FloatArray:
+        """Force by the drive of each ERA: its stiffness [N/m], or [N/V] of an exciter."""
+        return np.array([era.in_time.by_drive for era in self.eras])
 
     @cached_property
-    def dampers(self) -> FloatArray:
-        """Damping [N s/m] of each ERA."""
-        return np.array([era.damping for era in self.eras])
+    def by_rate(self) -> FloatArray:
+        """Force by the rate of the drive of each ERA: its damping [N s/m], or [N s/V]."""
+        return np.array([era.in_time.by_rate for era in self.eras])
 
     def following(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """z (f, eras, 2 r) of each ERA alone at full stroke times exp(s t), s (f,) [1/s].
@@ -180,25 +185,31 @@ class PlateInTime:
         base rises is not modelled.
         """
         bases = self._bases(s)
-        forces = bases * (self.springs + s[:, None] * self.dampers)
+        forces = bases * (self.by_drive + s[:, None] * self.by_rate)
         away = s[:, None, None] - self.eigenvalues
         z = forces[..., None] * self.participation.T / away
-        by_velocity = (bases * self.dampers)[..., None] * self.participation.T
+        by_velocity = (bases * self.by_rate)[..., None] * self.participation.T
         return z, (by_velocity - z) / away
 
     def following_all(self, s: ComplexArray, weights: ComplexArray) -> ComplexArray:
         """z (f, 2 r) of all ERAs together, of weights (f, eras) in full strokes; s (f,) [1/s]."""
-        forces = weights * self._bases(s) * (self.springs + s[:, None] * self.dampers)
+        forces = weights * self._bases(s) * (self.by_drive + s[:, None] * self.by_rate)
         return np.asarray(forces @ self.participation.T / (s[:, None] - self.eigenvalues))
 
     def _bases(self, s: ComplexArray) -> ComplexArray:
-        """Motion of each ERA's base at full stroke [m], its own gain included, (f, eras)."""
-        return np.stack([era.base(s.imag) for era in self.eras], axis=1)
+        """Drive of each ERA at full level, its own gain included, (f, eras)."""
+        drives = [era.full_level * era.gain(s.imag / (2 * np.pi)) for era in self.eras]
+        return np.stack(drives, axis=1)
 
     @cached_property
     def acceleration(self) -> ComplexArray:
         """Acceleration of the reduced coordinates in each eigenvector left free, (r, 2 r)."""
         return self.displacement * self.eigenvalues**2
+
+    @property
+    def own_acceleration(self) -> ComplexArray:
+        """The same of the reduced plate's coordinates alone."""
+        return self.acceleration[: len(self.reduced.omega)]
 
     @cached_property
     def half(self) -> NDArray[np.intp]:
@@ -243,7 +254,7 @@ class PlateInTime:
 
 def plate_in_time(
     reduced: ReducedPlate,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     *,
     loads: Sequence[PointLoad] = (),
     contacts: Sequence[FingertipLoad] = (),
@@ -272,8 +283,9 @@ def plate_in_time(
             "the plate's equations of motion cannot be separated into modes: a mode is damped "
             "critically; change an ERA's damping by a per mille"
         )
-    input_shapes = np.zeros((r, len(eras)))
-    input_shapes[: attachment_shapes.shape[1]] = attachment_shapes[: len(eras)].T
+    parts = [era.in_time for era in eras]
+    pushed = stretches(parts, attachment_shapes[: len(eras)])
+    input_shapes = np.pad(pushed, ((0, 0), (0, r - pushed.shape[1]))).T
     forced: ComplexArray = inverse_vectors[:, r:] @ inverse
     return PlateInTime(
         reduced,

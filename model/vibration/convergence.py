@@ -22,7 +22,8 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
-from model.structure.attachments import Era, PointLoad
+from model.structure.actuators import Actuator
+from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
 from model.vibration.natural_modes import natural_modes
 
@@ -88,7 +89,7 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     in place of meshes of elements.
     """
     plate, high = rig.plate, rig.limits.frequency_max
-    stiffness = max(era.stiffness for era in rig.eras)
+    stiffness = rig.largest_stiffness
     foot = min(era.foot for era in rig.eras)
     automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
     if plate.is_layered and isinstance(automatic, SpectralMesh):
@@ -129,7 +130,7 @@ def study_convergence(
             f"{checked.max():g} Hz; take lower frequencies or raise the limit"
         )
 
-    def response(of: FreePlate, eras: Sequence[Era]) -> ComplexArray:
+    def response(of: FreePlate, eras: Sequence[Actuator]) -> ComplexArray:
         return of.acceleration(eras, checked, points, loads=rig.masses)
 
     reference = _solved(rig, _reference(rig))
@@ -172,7 +173,7 @@ def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.norm(found - exact, axis=2) / size)
 
 
-def _nearer_the_middle(era: Era, plate: Plate) -> Era:
+def _nearer_the_middle(era: Actuator, plate: Plate) -> Actuator:
     """An ERA moved by MOVED along both sides."""
     x, y = (
         at + MOVED * np.sign(side / 2 - at)
@@ -231,7 +232,7 @@ def finer_mesh(
 def estimate_error(
     free: FreePlate,
     finer: PlateMesh,
-    eras: Sequence[Era],
+    eras: Sequence[Actuator],
     frequencies: FloatArray,
     points: FloatArray,
     *,

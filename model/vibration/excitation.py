@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ NULL_SHARE = 0.1
 
 
 def base_amplitudes(
-    excitation: Excitation, eras: Sequence[Era], *others: Excitation
+    excitation: Excitation, eras: Sequence[Source], *others: Excitation
 ) -> tuple[FloatArray, ComplexArray]:
     """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
 
@@ -69,7 +69,7 @@ def base_amplitudes(
 
 def tone_fields(
     excitation: Excitation,
-    eras: Sequence[Era],
+    eras: Sequence[Source],
     response: Callable[[FloatArray], ComplexArray],
     *others: Excitation,
 ) -> tuple[FloatArray, ComplexArray]:
@@ -79,7 +79,7 @@ def tone_fields(
     excitations that play at the same time.
     """
     frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
-    weights = amplitudes / np.array([era.stroke for era in eras])
+    weights = amplitudes / np.array([era.full_level for era in eras])
     return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
 
 

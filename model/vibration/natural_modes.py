@@ -19,7 +19,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import PlateMesh, SpectralMesh
-from model.structure.attachments import PointLoad, footprints_of
+from model.structure.attachments import PointLoad, Source, footprints_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +71,9 @@ def natural_modes(
     chosen = mesh or rig.mesh
     if support == "simply-supported":
         return _simply_supported(rig, count, chosen)
-    attached = list(rig.masses)
+    attached: list[Source | PointLoad] = [*rig.masses]
     if support == "eras":
-        attached += [era.support for era in rig.eras]
+        attached += rig.eras
     gap = rig.plate.air_gap
     # Air sealed in resists motion up and down; it only flows to and fro under tilts.
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
@@ -93,13 +93,14 @@ def natural_modes(
     return modes.only(slice(rigid, rigid + count))
 
 
-def _modes_with(free: FreePlate, attached: list[PointLoad]) -> NaturalModes:
+def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalModes:
     """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
-    reduced = reduce_free_plate(free, footprints_of(attached))
-    _, (M, _, K) = on_springs(reduced, attached, reduced.at(footprints_of(attached)))
+    places = footprints_of(attached)
+    reduced = reduce_free_plate(free, places)
+    _, (M, _, K) = on_springs(reduced, [each.in_time for each in attached], reduced.at(places))
     squares, coordinates = linalg.eigh(K, M)
     frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
-    return NaturalModes(frequencies, reduced.at, coordinates, free.mesh)
+    return NaturalModes(frequencies, reduced.at, coordinates[: len(reduced.omega)], free.mesh)
 
 
 def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:

@@ -21,7 +21,7 @@ from model.arrays import FloatArray
 from model.fem.mesh import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
-from model.structure.attachments import Era, FingertipLoad, PointLoad, check_loads, footprints_of
+from model.structure.attachments import FingertipLoad, PointLoad, Source, check_loads, footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import clock
@@ -362,7 +362,7 @@ class Bench:
 
     def _motion(self, index: int, playing: Voices, clock: StraightClock) -> Motion:
         """The base motion of an ERA by the output of its channel, imperfections included."""
-        stroke, delay = self.rig.eras[index].stroke, self._delays[index]
+        stroke, delay = self.rig.eras[index].full_level, self._delays[index]
         errors = self._errors[index]
         moving = [*playing, *second_harmonic.of_voices(playing, errors.harmonic)]
         return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
@@ -400,7 +400,7 @@ def _plant_of(real: Rig, time: float) -> Plant:
 def _reduced(
     plate: Plate,
     mesh: Mesh,
-    eras: tuple[Era, ...],
+    eras: tuple[Source, ...],
     loads: tuple[PointLoad, ...],
     frequency_max: float,
 ) -> ReducedPlate:

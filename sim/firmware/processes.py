@@ -227,7 +227,7 @@ class FirmwareBench(Bench):
             self._start = now - last / RATE
         times: FloatArray = self._start + np.arange(self._count + 0.5, last) / RATE
         self._count, self.time = last, float(times[-1])
-        bases = levels * self._gains * [era.stroke for era in self.rig.eras]
+        bases = levels * self._gains * [era.full_level for era in self.rig.eras]
         shapes = self._listening()
         felt = self._sampled.advance(bases, shapes=np.concatenate(shapes))
         self._pass_on(times, felt, shapes)

@@ -29,7 +29,7 @@ from model.finger.perception import (
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
-from model.structure.attachments import Era
+from model.structure.attachments import Source
 from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.from_rest import from_rest
 from model.transients.measures import ONSET_WINDOW
@@ -360,7 +360,7 @@ def _records(
     )
 
 
-def _bases(layer: Layer, eras: Sequence[Era], harmonics: Mapping[str, complex]) -> Bases:
+def _bases(layer: Layer, eras: Sequence[Source], harmonics: Mapping[str, complex]) -> Bases:
     """Motion of the bases when a layer starts, its side bands included.
 
     harmonics: second harmonic of each ERA, relative to its motion, by name.

@@ -20,8 +20,8 @@ from model.errors import InputError
 from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
 from model.spectral.mesh import PlateMesh
+from model.structure.actuators import Actuator
 from model.structure.attachments import (
-    Era,
     Fingertip,
     FingertipLoad,
     PointLoad,
@@ -81,14 +81,15 @@ class PlateErrors:
     def realised(self, rig: Rig) -> Rig:
         """The rig whose plate and ERAs have these errors."""
 
-        def of(era: Era) -> Era:
+        def of(era: Actuator) -> Actuator:
             x, y = np.add((era.x, era.y), self.places.get(era.name, (0.0, 0.0)))
+            varied = era.varied(
+                stiffness=self.stiffness.get(era.name, 1.0), damping=self.era_damping
+            )
             return replace(
-                era,
+                varied,
                 x=float(np.clip(x, 0.0, rig.plate.length)),
                 y=float(np.clip(y, 0.0, rig.plate.width)),
-                stiffness=self.stiffness.get(era.name, 1.0) * era.stiffness,
-                damping=self.era_damping * era.damping,
             )
 
         plate = replace(
@@ -272,10 +273,9 @@ def _drawn(
 def _other_mesh(rig: Rig) -> PlateMesh:
     """A mesh as accurate as `mesh: auto` or more, and not the rig's."""
     highest = rig.limits.frequency_max
-    stiffest = max(era.stiffness for era in rig.eras)
     mesh = finer_mesh(
         rig.plate,
-        mesh_of("auto", rig.plate, frequency_max=highest, stiffness=stiffest),
+        mesh_of("auto", rig.plate, frequency_max=highest, stiffness=rig.largest_stiffness),
         frequency_max=highest,
     )
     return mesh if mesh != rig.mesh else finer_mesh(rig.plate, mesh, frequency_max=highest)

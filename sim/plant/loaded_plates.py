@@ -12,13 +12,14 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
+from itertools import chain
 from typing import TypeAlias
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import Era, FingertipLoad, PointLoad
+from model.structure.attachments import FingertipLoad, PointLoad, Source
 from model.transients.time_response import PlateInTime, plate_in_time
 from sim.plant.fingers import Position
 
@@ -67,19 +68,20 @@ Under: TypeAlias = tuple[LoadedPlate, Mapping[str, FingertipLoad]]
 def carried_state(state: FloatArray, before: Under, after: Under) -> FloatArray:
     """Displacement and velocity of all coordinates, (2 r,), carried to another set of contacts.
 
-    Those of the plate, and of the phalanges of fingers that stay, are continuous; a new finger's
-    phalanx is at rest.
+    Those of the plate and of magnets, and of the phalanges of fingers that stay, are continuous; a
+    new finger's phalanx is at rest.
     """
     (plate, contacts), (other, wanted) = before, after
-    count = len(plate.reduced.omega)
-    halves = np.split(state, 2)
-    moving = dict(zip(contacts, np.transpose([half[count:] for half in halves]), strict=True))
+    halves, count = np.split(state, 2), len(plate.reduced.omega)
+    fixed = len(halves[0]) - len(contacts)
+    moving = dict(zip(contacts, np.transpose([half[fixed:] for half in halves]), strict=True))
     phalanges = np.reshape([moving.get(id, (0.0, 0.0)) for id in wanted], (-1, 2)).T
     motion = [half[:count] for half in halves]
     if other.reduced is not plate.reduced:
         carried = other.reduced.projection_from(plate.reduced)
         motion = [carried @ half for half in motion]
-    return np.concatenate([motion[0], phalanges[0], motion[1], phalanges[1]])
+    magnets = [half[count:fixed] for half in halves]
+    return np.concatenate([*chain.from_iterable(zip(motion, magnets, phalanges, strict=True))])
 
 
 class LoadedPlateCache:
@@ -89,7 +91,7 @@ class LoadedPlateCache:
     """
 
     def __init__(
-        self, reduced: ReducedPlate, eras: Sequence[Era], loads: Sequence[PointLoad]
+        self, reduced: ReducedPlate, eras: Sequence[Source], loads: Sequence[PointLoad]
     ) -> None:
         self._unloaded = reduced
         self._eras = tuple(eras)
@@ -135,7 +137,7 @@ class LoadedPlateCache:
 
 @lru_cache(maxsize=2)  # successive benches of one rig share it
 def _solve_unloaded(
-    reduced: ReducedPlate, eras: tuple[Era, ...], loads: tuple[PointLoad, ...]
+    reduced: ReducedPlate, eras: tuple[Source, ...], loads: tuple[PointLoad, ...]
 ) -> PlateInTime:
     return plate_in_time(reduced, eras, loads=loads)
 

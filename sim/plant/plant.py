@@ -13,7 +13,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.attachments import Era, FingertipLoad, PointLoad
+from model.structure.attachments import FingertipLoad, PointLoad, Source
 from model.transients.base_motion import BaseMotions, Motion
 from model.transients.time_response import ForcedVibration
 from sim.plant.loaded_plates import LoadedPlate, LoadedPlateCache, carried_state
@@ -60,7 +60,7 @@ class Plant:
     def __init__(
         self,
         reduced: ReducedPlate,
-        eras: Sequence[Era],
+        eras: Sequence[Source],
         *,
         loads: Sequence[PointLoad] = (),
         time: float = 0.0,
@@ -142,7 +142,7 @@ class Plant:
         first = np.floor(self.time * sample_rate) + 1
         last = np.floor(to_time * sample_rate)
         times = np.arange(first, last + 1) / sample_rate
-        shapes = self.loaded.plate.with_phalanges(shapes)
+        shapes = self.loaded.plate.with_far_ends(shapes)
         # Few points are sampled directly, many by way of the coordinates.
         is_direct = len(shapes) < 2 * shapes.shape[1]
         points = shapes if is_direct else np.eye(shapes.shape[1])
@@ -190,9 +190,10 @@ class Plant:
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Present displacement and velocity, (r + n,) each.
+        """Present displacement and velocity, (r + m + n,) each.
 
-        Of the coordinates of `reduced`, then of each contact's phalanx [m], [m/s].
+        Of the coordinates of `reduced`, then of free magnets and of each contact's phalanx [m],
+        [m/s].
         """
         self._advance(self.time)
         plate, since = self.loaded.plate, self._forced.times[self._solution]

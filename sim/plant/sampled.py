@@ -58,14 +58,14 @@ class SampledPlant:
             free[:, mode], _ = self._filter([one], [1.0, -one], corners[:, mode], zi=state)
         if len(bases):
             self._free, self._bases, self._slopes = free[-1], bases[-1], slopes[-1]
-        points = plate.with_phalanges(shapes) @ plate.free_acceleration
+        points = plate.with_far_ends(shapes) @ plate.free_acceleration
         halfway = free * np.exp(-plate.decay / (2 * self.rate))
         return np.asarray((halfway @ points.T).real)
 
     def _use(self, plate: LoadedPlate) -> None:
         """Go on with a plate; find its forced vibration for bases of 1 m and of 1 m/s."""
         self._current = plate
-        strokes = np.array([[era.stroke] for era in plate.plate.eras])
+        strokes = np.array([[era.full_level] for era in plate.plate.eras])
         self._by_base, self._by_slope = (
             found[0] / strokes @ plate.plate.vectors.T @ plate.plate.to_free.T
             for found in plate.plate.following(np.zeros(1, dtype=complex))

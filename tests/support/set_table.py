@@ -60,7 +60,7 @@ class SetTable:
         self.plate = plate
         self.eras: tuple[Era, ...] = ()  # whose clocks change nothing
         self.shared = shared
-        self.strokes = defaultdict[str, float](lambda: STROKE)
+        self.full_levels = defaultdict[str, float](lambda: STROKE)
         self.frequencies = np.array([90.0, 110.0, 150.0, 250.0])  # Hz
         self.prepared: list[str] = []
         self.asked: list[list[Finger]] = []

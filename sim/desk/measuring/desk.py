@@ -45,9 +45,9 @@ class Desk:
         return [sensor.input - 1 for sensor in self.sensors]
 
     @property
-    def strokes(self) -> FloatArray:
-        """Stroke of each ERA [m]."""
-        return np.array([era.stroke for era in self.rig.eras])
+    def full_levels(self) -> FloatArray:
+        """Full level of each ERA: its stroke [m], or volts of an exciter."""
+        return np.array([era.full_level for era in self.rig.eras])
 
     @property
     def sensitivities(self) -> FloatArray:
@@ -61,12 +61,12 @@ class Desk:
 
         looped (f,): of the loop-back.
         """
-        plain = values[:, self.columns, : len(self.strokes)] / converters(looped)[:, None, None]
+        plain = values[:, self.columns, : len(self.full_levels)] / converters(looped)[:, None, None]
         return Responses(
             tuple(sensor.name for sensor in self.sensors),
             np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
             frequencies,
-            plain.transpose(0, 2, 1) / self.strokes[:, None] / self.sensitivities,
+            plain.transpose(0, 2, 1) / self.full_levels[:, None] / self.sensitivities,
         )
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:

@@ -98,7 +98,7 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
 
 def _repeats(desk: Desk, found: Measured, multisine: Multisine, run: Run) -> tuple[Repeat, ...]:
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
-    bases = multisine.played(_REPEATED)[:, : len(desk.strokes)] * desk.strokes  # (f, eras)
+    bases = multisine.played(_REPEATED)[:, : len(desk.full_levels)] * desk.full_levels  # (f, eras)
     first = np.einsum("fes,fe->fs", found.responses.values, bases)
     heard = multisine.found(run.recorded)[:, desk.columns] / desk.sensitivities
     again = heard / converters(found.looped)[:, None]

@@ -113,7 +113,7 @@ def _by_amplifier(
         contents.Tone(
             rig.wiring[name].number,
             tone.frequency,
-            tone.amplitude / rig.era(name).stroke,
+            tone.amplitude / rig.era(name).full_level,
             float(np.degrees(tone.phase)),
         )
         for name, tone in promise.layer.excitation.items()
@@ -145,7 +145,7 @@ def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> Float
     for number, era in enumerate(desk.rig.eras):
         if (tone := excitation.get(era.name)) is not None:
             angle = 2 * np.pi * tone.frequency * times + tone.phase
-            sources[:, number] = tone.amplitude / era.stroke * np.sin(angle)
+            sources[:, number] = tone.amplitude / era.full_level * np.sin(angle)
     sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
     played = desk.on_outputs(ramped(sources, round(_RAMP * card.rate)))
     start, count = (round(each * card.rate) for each in (_SETTLING, _WINDOW))

@@ -105,7 +105,7 @@ def test_a_level_out_of_reach_is_lowered_to_one_in_reach(targets, quiet, mode):
     assert 20 < felt.promised_level_db_sl < 60
     assert not found.is_reached
     assert ["lowered" in each for each in found.applied][-1]
-    full = max(found.amplitudes[name] / table.strokes[name] for name in found.amplitudes)
+    full = max(found.amplitudes[name] / table.full_levels[name] for name in found.amplitudes)
     assert full == pytest.approx(1.0, abs=1e-5)
     assert query(table, placed, felt.promised_level_db_sl - 0.2, **low).is_reached
 

@@ -244,12 +244,12 @@ def test_side_bands_are_within_the_stroke(table, priorities):
     others = [Finger(at) for at in places[len(requests) :]]
     found = answer(table, requests, others, min_contrast_db=-99.0)
     assert any(layer.side_bands for layer in found.layers)
-    stroke = dict.fromkeys(table.strokes, 0.0)
+    stroke = dict.fromkeys(table.full_levels, 0.0)
     for layer in found.layers:
         for name, tone in chain(
             *(tones.items() for tones in (layer.excitation, *layer.side_bands))
         ):
-            stroke[name] += tone.amplitude / table.strokes[name]
+            stroke[name] += tone.amplitude / table.full_levels[name]
     assert max(stroke.values()) == pytest.approx(1.0, abs=1e-5)
     levels = [felt.promised_level_db_sl for felt in found.fingers[: len(requests)]]
     assert found.stroke_factor == pytest.approx(10 ** ((min(levels) - 40.0) / 20), rel=1e-4)

@@ -124,7 +124,7 @@ def test_drive_stays_within_its_limits(limits: Limits, duration: float | None) -
     table = small_table()
     finger = Finger(TARGET, Stimulus(60.0, duration=duration))
     found = answer(table, [finger], drive_mode="phased", limits=limits)
-    strokes = table.strokes
+    strokes = table.full_levels
     assert limits.factor_within(found.amplitudes, strokes) == pytest.approx(1.0, abs=1e-6)
     used = [
         amplitude / (limits.amplitudes or strokes)[name]
@@ -144,7 +144,7 @@ def test_ramp_is_as_long_as_the_rise_of_levels_allows() -> None:
         answer(table, [finger], drive_mode="phased", limits=Limits(slew=slew))
         for slew in (math.inf, 3.0)
     )
-    rise = max(free.amplitudes[name] / table.strokes[name] for name in free.amplitudes) / 3.0
+    rise = max(free.amplitudes[name] / table.full_levels[name] for name in free.amplitudes) / 3.0
     assert slow.layers[0].ramp == pytest.approx(rise)
     assert slow.layers[0].ramp > 0.02
     assert slow.fingers[0].level_db_sl == pytest.approx(40.0, abs=0.1)

@@ -121,7 +121,7 @@ def test_promises_of_a_known_plate_are_the_direct_solution(
         exact = min(felt_contrast(rig, promise), 25.0)  # deeper nulls show the error of the mesh
         assert min(promise.contrast_db, 25.0) == pytest.approx(exact, abs=0.5)
         assert min(promise.median_db, 25.0) == pytest.approx(exact, abs=0.5)
-        strokes = rig.strokes
+        strokes = rig.full_levels
         tones = promise.layer.excitation.items()
         assert max(t.amplitude / strokes[n] for n, t in tones) == pytest.approx(LEVEL)
 

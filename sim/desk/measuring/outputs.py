@@ -104,7 +104,7 @@ def judged(desk: Desk, frequencies: FloatArray, found: Sequence[Estimate]) -> li
     columns, names = desk.columns, [era.name for era in desk.rig.eras]
     points = np.array([[sensor.x, sensor.y] for sensor in desk.sensors])
     model = sensed_plate(desk.rig, points, frequencies).responses().transpose(1, 0, 2)
-    model = model * desk.strokes[:, None, None]
+    model = model * desk.full_levels[:, None, None]
     audible = [n for n, each in enumerate(found) if _moves(each, columns)]
     if not audible:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")

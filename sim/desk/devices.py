@@ -8,7 +8,7 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.desk.libjack import JackClient, jack_name
-from sim.desk.soft_amp.output import sounddevice, usual_block
+from sim.desk.soft_amp.output import default_block, sounddevice
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def portaudio_devices() -> Iterator[Device]:
             each["max_output_channels"],
             each["max_input_channels"],
             round(each["default_samplerate"]),
-            usual_block(),
+            default_block(),
         )
 
 

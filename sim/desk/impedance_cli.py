@@ -80,9 +80,9 @@ def impedance(
     from model.files.replacing import check_ending, check_place
     from sim.desk.measuring.impedance import exciter_values, fitted
     from sim.desk.measuring.impedance_run import (
+        default_lines,
         measured_impedance,
         read_impedance,
-        usual_lines,
         write_impedance,
     )
     from sim.desk.measuring.sound_card import open_card
@@ -125,7 +125,7 @@ def impedance(
             output.with_stem("glued"), "--weight", "GRAMS",
         )  # fmt: skip
     rows = [
-        f"{len(usual_lines())} frequencies; wrote {output}" if output else None,
+        f"{len(default_lines())} frequencies; wrote {output}" if output else None,
         *_rows(circuits, values),
         following,
     ]

@@ -28,12 +28,12 @@ def outputs(
             metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
         ),
     ],
-    sensors_file: Annotated[
-        Path | None,
+    beside: Annotated[
+        int | None,
         typer.Option(
-            "--sensors",
-            metavar="SENSORS.csv",
-            help="Accelerometers, one is enough, that tell what moved; else the terminal asks.",
+            metavar="INPUT",
+            help="Listen with an accelerometer on this input, put beside each actuator in turn.",
+            min=1,
         ),
     ] = None,
     output: Annotated[
@@ -57,29 +57,28 @@ def outputs(
 ) -> None:
     """Find which output drives which actuator.
 
-    Play a soft tone on one output after the other, and ask which actuator moved, or listen with an
-    accelerometer, which also tells what is dead, loose or wired backwards. Exit status 1 for those,
-    and for channels that are not those of the rig and not written.
+    Play a soft tone on one output after the other, and ask which actuator moved. Or listen with an
+    accelerometer, whose sensitivity does not matter, which also tells what is dead, loose or wired
+    backwards. Exit status 1 for those, and for channels that are not those of the rig and not
+    written.
     """
     from model.commands.fitted_rig_cli import check_rig_output
     from model.rig.file import load_rig
     from sim.desk.measuring.desk import Desk
     from sim.desk.measuring.outputs import listen
     from sim.desk.measuring.sound_card import open_card
-    from sim.sensors.sensor_file import read_sensors
 
     if output is not None:
         check_rig_output(output, rig_file)
     rig = load_rig(rig_file)
-    desk = Desk(rig, read_sensors(sensors_file, rig.plate) if sensors_file else ())
+    desk = Desk(rig, ())
     desk.check(level)
     count = count or desk.output - 1
-    inputs = max((sensor.input for sensor in desk.sensors), default=0)
-    with closing(open_card(device, outputs=count, inputs=inputs, limit=level)) as card:
-        if desk.sensors:
-            heard = listen(desk, card, outputs=count, level=level)
-        else:
+    with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
+        if beside is None:
             heard = _asked(desk, card, count, level=level, frequency=frequency)
+        else:
+            heard = listen(desk, card, beside, outputs=count, level=level, move=_moved)
     channels = {each.era: each.output - 1 for each in heard if each.era}
     own = {name: at - 1 for name, at in desk.eras}
     missing = [name for name in own if name not in channels]
@@ -90,10 +89,10 @@ def outputs(
     is_wrong = is_wrong or (channels != own and not is_written)
     again: list[str | Path] = ["era", "outputs", rig_file, "--device", device]
     again += ["-o", rig_file.with_stem("wired")]
-    if sensors_file is not None:
-        again += ["--sensors", sensors_file]
+    if beside is not None:
+        again += ["--beside", str(beside)]
     rows = [
-        *_rows(heard, own, channels, missing, has_sensors=bool(desk.sensors)),
+        *_rows(heard, own, channels, missing, has_levels=beside is not None),
         f"wrote {output}" if is_written else None,
         None if missing or channels == own or is_written else next_line(*again),
     ]
@@ -102,8 +101,8 @@ def outputs(
             {
                 "output": each.output,
                 "era": each.era or None,
-                "polarity": (-1 if each.is_reversed else 1) if desk.sensors and each.era else None,
-                "relative_level": each.level if desk.sensors else None,
+                "polarity": (-1 if each.is_reversed else 1) if beside and each.era else None,
+                "relative_level": each.level if beside else None,
                 "verdict": each.verdict or "ok",
             }
             for each in heard
@@ -118,17 +117,23 @@ def outputs(
         raise typer.Exit(_WRONG)
 
 
+def _moved(name: str) -> None:
+    typer.prompt(
+        f"Put the accelerometer beside {name}, and press Enter", "", show_default=False, err=True
+    )
+
+
 def _asked(
     desk: "Desk", card: "SoundCard", count: int, *, level: float, frequency: float | None
 ) -> "list[Heard]":
     """What each output drives, as is said on the terminal."""
-    from sim.desk.measuring.outputs import Heard, tone, usual_tone
+    from sim.desk.measuring.outputs import Heard, default_tone, tone
 
     names, found = [name for name, _ in desk.eras], list[Heard]()
     for number in range(1, count + 1):
         signal = tone(
             desk, number, outputs=count, rate=card.rate, level=level,
-            frequency=frequency or usual_tone(desk.rig),
+            frequency=frequency or default_tone(desk.rig),
         )  # fmt: skip
         taken = [each.era for each in found if each.era]
         said = _said(partial(card.run, signal), number, count, names, taken)
@@ -183,14 +188,14 @@ def _rows(
     channels: Mapping[str, int],
     missing: Sequence[str],
     *,
-    has_sensors: bool,
+    has_levels: bool,
 ) -> Iterator[str]:
     import math
 
-    yield "output  drives      channel" + ("  polarity    level" if has_sensors else "")
+    yield "output  drives      channel" + ("  polarity    level" if has_levels else "")
     for each in heard:
         more = ""
-        if has_sensors and each.era:
+        if has_levels and each.era:
             sign = "-" if each.is_reversed else "+"
             more = f"  {sign:>8s}  {20 * math.log10(each.level):+5.1f} dB"
         channel = str(channels[each.era]) if each.era else "-"

@@ -27,7 +27,7 @@ _FULL = 0.999  # of full scale
 _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
 
 
-def usual_lines() -> FloatArray:
+def default_lines() -> FloatArray:
     """Whole frequencies [Hz] from 10 to 1000, nearly at equal ratios."""
     return np.unique(np.geomspace(LOW, HIGH, _LINES).round())
 
@@ -46,7 +46,7 @@ def measured_impedance(
     inputs: before and over the resistor, counted from 1, or one that is moved: move is then called
     with where to, before each run. Raises InputError, LinkError.
     """
-    sines = Multisine(usual_lines(), 1, card.rate, level)
+    sines = Multisine(default_lines(), 1, card.rate, level)
     voltages = []
     for n, place in enumerate(("before the exciter", "over the resistor")):
         if len(inputs) == 1:

@@ -1,26 +1,29 @@
 """Which output of a sound card drives which actuator: one output after the other plays.
 
-A soft tone is felt or seen by whoever stands there. An accelerometer anywhere on the plate tells it
-by the rig's model: of two octaves, above which models of an unmeasured plate say little, responses
-are compared with those to each actuator. The delay of the sound card is unknown: that by which all
-outputs together fit best is taken, and polarities are those relative to the majority.
+A soft tone is felt or seen by whoever stands there. An accelerometer that is put beside each
+actuator in turn tells it by itself, also of a plate that is hardly known: an actuator moves its own
+place more than others do, and by the velocity there it gives power to the plate. Responses at all
+places are compared with those of the rig's model, each frequency by its own size. The delay of the
+sound card is unknown: that by which all outputs together fit best is taken, and polarities are
+those relative to the majority.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.calibration.sensed_plate import sensed_plate
 from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels
 from sim.desk.measuring.multisine import Estimate, Multisine, estimate, ramped
 from sim.desk.measuring.single_run import run_time, settled
 from sim.desk.measuring.sound_card import SoundCard
+from sim.sensors.sensor_file import WiredSensor
 
 TONE = 160.0
 """Usual frequency [Hz] of the tone: felt well, and soft in air."""
@@ -58,7 +61,7 @@ def tone(
     return found
 
 
-def usual_tone(rig: Rig) -> float:
+def default_tone(rig: Rig) -> float:
     """The usual frequency [Hz], or the nearest one within the rig's limits."""
     return float(np.clip(TONE, rig.limits.frequency_min, rig.limits.frequency_max))
 
@@ -77,66 +80,76 @@ class Heard:
     verdict: str = ""
 
 
-def listen(desk: Desk, card: SoundCard, *, outputs: int, level: float) -> list[Heard]:
-    """Play on each output for a few seconds and tell by the sensors what it drives.
+def listen(
+    desk: Desk,
+    card: SoundCard,
+    beside: int,
+    *,
+    outputs: int,
+    level: float,
+    move: Callable[[str], None],
+) -> list[Heard]:
+    """Play on each output for a few seconds at each place, and tell what it drives.
 
-    Raises InputError, LinkError for clipped or silent sensors; InputError where the sensors do not
-    tell outputs apart.
+    beside: input, counted from 1, of the accelerometer that is put beside each actuator; move:
+    called with the name of the next one. Raises InputError, LinkError for an input that is clipped
+    or silent; InputError where outputs are not told apart.
     """
     limits = desk.rig.limits
     low, high = limits.frequency_min, min(limits.frequency_max, _OCTAVES * limits.frequency_min)
     lines = np.arange(1.0, high + 1e-6, _STEP)
     sines = Multisine(lines[lines >= low], 1, card.rate, level)
     desk.check_times(seconds=run_time(_PERIODS), slew=sines.slew)
-    runs = [
-        settled(card, sines, output, outputs=outputs, periods=_PERIODS)
-        for output in range(1, outputs + 1)
-    ]
-    check_levels(np.concatenate(runs), desk.sensors)
-    return judged(desk, sines.frequencies, [estimate(sines, [run]) for run in runs])
+    found: list[list[Estimate]] = []
+    for era in desk.rig.eras:
+        move(era.name)
+        runs = [
+            settled(card, sines, output, outputs=outputs, periods=_PERIODS)[:, [beside - 1]]
+            for output in range(1, outputs + 1)
+        ]
+        sensor = WiredSensor(f"beside {era.name}", era.x, era.y, 1, 1.0)
+        check_levels(np.concatenate(runs), [sensor])
+        found.append([estimate(sines, [run]) for run in runs])
+    return judged(desk, sines.frequencies, found)
 
 
-def judged(desk: Desk, frequencies: FloatArray, found: Sequence[Estimate]) -> list[Heard]:
-    """What each output drives, by the responses of the sensors to it at frequencies (f,) [Hz].
+def judged(desk: Desk, frequencies: FloatArray, found: Sequence[Sequence[Estimate]]) -> list[Heard]:
+    """What each output drives, by the responses beside each actuator at frequencies (f,) [Hz].
 
-    Raises InputError where the sensors do not tell outputs apart.
+    found: by actuator and output. Raises InputError where outputs are not told apart.
     """
-    columns, names = desk.columns, [era.name for era in desk.rig.eras]
-    points = np.array([[sensor.x, sensor.y] for sensor in desk.sensors])
-    model = sensed_plate(desk.rig, points, frequencies).responses().transpose(1, 0, 2)
-    model = model * desk.full_levels[:, None, None]
-    sounding = [n for n, each in enumerate(found) if _moves(each, columns)]
-    if not sounding:
+    rig = desk.rig
+    points = np.array([[era.x, era.y] for era in rig.eras])
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
+    model = free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
+    by_output = list(zip(*found, strict=True))
+    audible = [n for n, each in enumerate(by_output) if _moves(each)]
+    if not audible:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")
-    values = np.array([found[n].values[:, columns, 0] / desk.sensitivities for n in sounding])
+    values = np.array(
+        [[place.values[:, 0, 0] for place in by_output[n]] for n in audible]
+    ).transpose(0, 2, 1)
     rows, eras, signs = matched(values, model, frequencies)
     levels = _size(values[rows]) / _size(model[eras])
     levels = levels / np.median(levels)
-    drives = {
-        sounding[row]: (int(era), bool(sign < 0), float(level))
-        for row, era, sign, level in zip(rows, eras, signs, levels, strict=True)
+    heard = {
+        n: Heard(n + 1, "", level=0.0, verdict="dead: moves nothing; check its cable and amplifier")
+        for n in range(len(by_output))
     }
-    heard = []
-    for n, each in enumerate(found):
-        if n not in drives:
-            verdict = "dead: moves nothing; check its cable and amplifier"
-            heard.append(Heard(n + 1, "", level=0.0, verdict=verdict))
-            continue
-        era, is_reversed, level = drives[n]
-        verdict = _verdict(each, columns, is_reversed=is_reversed, level=level)
-        heard.append(Heard(n + 1, names[era], is_reversed, level, verdict))
-    return heard
+    for row, era, sign, level in zip(rows, eras, signs, levels, strict=True):
+        n, is_reversed = audible[row], bool(sign < 0)
+        verdict = _verdict(by_output[n][era], is_reversed=is_reversed, level=level)
+        heard[n] = Heard(n + 1, rig.eras[era].name, is_reversed, float(level), verdict)
+    return list(heard.values())
 
 
-def _moves(found: Estimate, columns: Sequence[int]) -> bool:
-    share = np.abs(found.values[:, columns, 0]) / found.std[:, columns]
-    return bool(np.median(share, axis=0).max() >= _MOVED)
+def _moves(places: Sequence[Estimate]) -> bool:
+    return any(np.median(np.abs(each.values) / each.std[..., None]) >= _MOVED for each in places)
 
 
-def _verdict(found: Estimate, columns: Sequence[int], *, is_reversed: bool, level: float) -> str:
+def _verdict(beside: Estimate, *, is_reversed: bool, level: float) -> str:
     """What is wrong with an output that moves the plate, "" for nothing."""
-    rattles = found.even[columns].min() > _RATTLE
-    if rattles or np.median(found.coherence[:, columns], axis=0).max() < _COHERENT:
+    if beside.even[0] > _RATTLE or np.median(beside.coherence) < _COHERENT:
         return "loose: it rattles; fasten it"
     if level < _WEAK:
         return "loose, or its gain is low: fasten it, and check the amplifier's knob"
@@ -151,7 +164,7 @@ def matched(
     Signs are relative to the majority. Raises InputError where another assignment fits nearly
     as well.
     """
-    one, other = values / _size(values)[:, None, None], model / _size(model)[:, None, None]
+    one, other = _even(values), _even(model)
     late = np.exp(2j * np.pi * np.outer(_DELAYS, frequencies))
     alike = np.einsum("tf,ofs,efs->toe", late, one, other.conj(), optimize=True).real
     best, rows, eras, moment = _assigned(np.abs(alike))
@@ -160,9 +173,9 @@ def matched(
         without[:, row, era] = 0
         if best - _assigned(without)[0] < _MARGIN * len(rows):
             raise InputError(
-                "outputs must differ at the sensors, got two assignments that fit nearly as well; "
-                "put a sensor nearer to a corner and off the plate's symmetry lines, take more "
-                "than one, or omit --sensors and say which moved"
+                "outputs must differ beside their actuators, got two assignments that fit nearly "
+                "as well; check that the accelerometer was moved each time, or omit --beside and "
+                "say which moved"
             )
     signs = np.sign(alike[moment, rows, eras])
     return rows, eras, np.asarray(signs * (1 if signs.sum() >= 0 else -1), dtype=int)
@@ -179,3 +192,9 @@ def _assigned(alike: FloatArray) -> tuple[float, IntArray, IntArray, int]:
 def _size(values: ComplexArray) -> FloatArray:
     """The norm of each response (n, f, s)."""
     return np.asarray(np.linalg.norm(values, axis=(1, 2)))
+
+
+def _even(values: ComplexArray) -> ComplexArray:
+    """Responses (n, f, s) of one size, to which each frequency contributes as much."""
+    scaled = values / np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))[:, None]
+    return np.asarray(scaled / _size(scaled)[:, None, None])

@@ -24,7 +24,7 @@ from sim.desk.soft_amp.output import Output, open_output
 from sim.desk.soft_amp.settings import Settings
 
 REFUSED, LOST, OTHER_RATE = 2, 75, 76
-_USUAL_RATE = 48_000  # Hz; until the device says its own
+_DEFAULT_RATE = 48_000  # Hz; until the device says its own
 _POLL = 0.02  # s
 _RETRY = 0.5  # s
 _FIRST_BLOCK = 5.0  # s
@@ -64,7 +64,7 @@ def main() -> None:
         if output is not None:
             engine = start(output.rate, is_recovering=False)
         else:  # hosts are to hear of the fault before the device is there
-            assumed = rate or settings.rate or _USUAL_RATE
+            assumed = rate or settings.rate or _DEFAULT_RATE
             engine = start(assumed, is_recovering=True)
             output = _awaited(settings, rate=assumed)
             if output.rate != assumed:

@@ -175,7 +175,7 @@ def may_be_realtime() -> bool:
     return limit != 0 or os.geteuid() == 0
 
 
-def usual_block() -> int:
+def default_block() -> int:
     """Frames of a block of PortAudio, unless stated."""
     return _WITH_PRIORITY if may_be_realtime() else _WITHOUT
 
@@ -195,7 +195,7 @@ class PortAudioOutput:
         device = portaudio_device(settings.device, outputs=settings.channels)
         self.name, self._number = device["name"], device["index"]
         self.rate = check_rate(settings.rate or device["default_samplerate"], what=self.name)
-        self.block = settings.block or usual_block()
+        self.block = settings.block or default_block()
         try:
             self._library.check_output_settings(
                 self._number, settings.channels, "float32", samplerate=self.rate

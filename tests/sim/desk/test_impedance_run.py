@@ -16,9 +16,11 @@ from typer.testing import CliRunner
 from benchmarks.desk_plate.jack_plate import JackPlate
 from drivers.errors import LinkError
 from exciter_circuit import ExciterCircuit
+from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
-from sim.cli import app
+from model.rig.file import parse_rig
+from sim.desk.impedance_cli import app
 from sim.desk.libjack import JackClient
 from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
@@ -67,7 +69,7 @@ def measured(
 ) -> tuple[int, str]:
     """Exit status of the command with a card in memory, and its last line."""
     monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
-    words = ["measure", "--impedance", "--device", "x", "--json", *map(str, arguments)]
+    words = ["--impedance", "--device", "x", "--json", *map(str, arguments)]
     done = CliRunner().invoke(app, words, input=typed)
     return done.exit_code, done.stdout.splitlines()[-1] if done.stdout else str(done.exception)
 
@@ -89,11 +91,29 @@ def test_parts_come_from_two_runs_and_a_scale(
     _check(json.loads(told))
     done = CliRunner().invoke(
         app,
-        ["measure", "--impedance", "--free", str(free), "--glued", str(glued), "--weight", "110.9"],
+        ["--impedance", "--free", str(free), "--glued", str(glued), "--weight", "110.9"],
     )
     assert done.exit_code == 0
-    assert "resonance_is: mounted" in done.stdout
-    assert "force_factor: 3.6" in done.stdout
+    assert exciter_of_lines(done.stdout) == pytest.approx(
+        {
+            "stiffness": ExciterCircuit.STIFFNESS,
+            "damping": ExciterCircuit.DAMPING,
+            "force_factor": ExciterCircuit.FORCE_FACTOR,
+            "coil_mass": ExciterCircuit.COIL,
+            "magnet_mass": ExciterCircuit.MAGNET,
+            "inductance": ExciterCircuit.INDUCTANCE,
+            "resistance": ExciterCircuit.RESISTANCE,
+        },
+        rel=0.01,
+    )
+
+
+def exciter_of_lines(told: str) -> dict[str, float]:
+    """The exciter of a rig in which the printed keys are pasted, in SI units."""
+    keys = [line.partition("#")[0].strip() for line in told.splitlines() if line[:4] == "    "]
+    rig = parse_rig("pasted.yaml", exciter_rig_text(", ".join([*keys, "power: 1 W"])))
+    names = "stiffness damping force_factor coil_mass magnet_mass inductance resistance"
+    return {name: getattr(rig.eras[0], name) for name in names.split()}
 
 
 def test_wrong_circuits_write_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

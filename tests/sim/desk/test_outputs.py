@@ -2,43 +2,54 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
-from model.arrays import Float32Array, FloatArray
+from exciter_rig import exciter_rig
+from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.config.document import read_document
 from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from sim.cli import app
 from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.outputs import Heard, listen, tone
+from sim.desk.measuring.outputs import Heard, listen, matched, tone
+from sim.desk.outputs_cli import outputs
 from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
-SENSOR = WiredSensor("A", 0.09, 0.06, 1, 0.01)  # off the lines of symmetry
-MIDDLE = WiredSensor("M", 0.1524, 0.1143, 1, 0.01)
+SENSITIVITY = 0.01  # that the command does not know
 
 
 class Cabled(DeskCard):
-    """Outputs wired to ERAs in another order, each with a gain; negative: wires exchanged."""
+    """Outputs wired to ERAs in another order, each with a gain; negative: wires exchanged.
+
+    One input, of an accelerometer that is moved from place to place.
+    """
 
     order: Sequence[int]
     gains: Sequence[float]
+    place = -1
+
+    def move(self, _name: str) -> None:
+        """To the next place."""
+        self.place += 1
 
     def run(self, played: FloatArray) -> Float32Array:
         """The loop-back's output is silent."""
         wired = np.zeros((len(played), 5))
         wired[:, self.order] = played * np.asarray(self.gains)
-        return super().run(wired)
+        return super().run(wired)[:, [self.place]]
 
 
 def cabled(
@@ -46,21 +57,26 @@ def cabled(
     *,
     order: Sequence[int] = (0, 1, 2, 3),
     gains: Sequence[float] = (1, 1, 1, 1),
-    sensor: WiredSensor = SENSOR,
+    apart: float = 0.02,
 ) -> Cabled:
-    """The deviating plate with one accelerometer."""
-    plate = DeskPlate(truth, [sensor], rate=RATE, converters=Converters(), seed=1)
+    """The deviating plate with a place as far [m] from each ERA, towards the middle."""
+    sensors = []
+    for n, era in enumerate(truth.rig.eras, start=1):
+        way = np.array([truth.rig.plate.length / 2 - era.x, truth.rig.plate.width / 2 - era.y])
+        x, y = np.array([era.x, era.y]) + min(apart / np.linalg.norm(way), 1) * way
+        sensors.append(WiredSensor(f"A{n}", x, y, n, SENSITIVITY))
+    plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
     card = Cabled(plate, rate=RATE)
     card.order, card.gains = order, gains
     return card
 
 
-def heard(rig: Rig, card: Cabled, sensor: WiredSensor = SENSOR) -> list[Heard]:
-    """What one sensor tells."""
-    return listen(Desk(rig, (sensor,)), card, outputs=4, level=0.1)
+def heard(rig: Rig, card: Cabled) -> list[Heard]:
+    """What an accelerometer beside each ERA tells."""
+    return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
 
 
-def test_one_sensor_tells_swapped_and_backwards(rig: Rig, truth: Truth) -> None:
+def test_accelerometer_tells_swapped_and_backwards(rig: Rig, truth: Truth) -> None:
     """Of a plate that deviates from the rig, with an unknown delay: as it was wired here."""
     names = [era.name for era in rig.eras]
     found = heard(rig, cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
@@ -78,10 +94,42 @@ def test_dead_and_weak_outputs_are_said(rig: Rig, truth: Truth) -> None:
     assert 20 * np.log10(found[3].level) == pytest.approx(-12, abs=3)
 
 
-def test_sensor_that_cannot_tell_is_refused(rig: Rig, truth: Truth) -> None:
+def test_accelerometer_that_stays_is_refused(rig: Rig, truth: Truth) -> None:
     """In the middle all four corners of a symmetric plate are alike."""
-    with pytest.raises(InputError, match="off the plate's symmetry lines"):
-        heard(rig, cabled(truth, sensor=MIDDLE), MIDDLE)
+    with pytest.raises(InputError, match="was moved each time"):
+        heard(rig, cabled(truth, apart=1.0))
+
+
+def test_exciters_are_told_apart_on_a_board_of_the_shop() -> None:
+    """12 boards that deviate: 10 % of E, 20 % of springs, 40 % of gains, 10 degrees, 25 mm."""
+    nominal = exciter_rig()
+    frequencies = np.arange(81.0, 261.0, 20.0)
+    points = np.array([[each.x, each.y] for each in nominal.eras])
+    rng = np.random.default_rng(0)
+    model = _responses(nominal, points, frequencies)
+    for _ in range(12):
+        board = nominal.plate.material
+        plate = replace(
+            nominal.plate, material=replace(board, E=board.E * (1 + 0.1 * rng.normal()))
+        )
+        eras = tuple(each.varied(stiffness=np.exp(0.2 * rng.normal())) for each in nominal.eras)
+        away = 0.025 * np.exp(2j * np.pi * rng.uniform(size=4))
+        real = replace(nominal, plate=plate, eras=eras)
+        values = _responses(real, points + np.stack([away.real, away.imag], axis=1), frequencies)
+        order, signs = rng.permutation(4), rng.permutation([1, 1, 1, -1])
+        gains = rng.uniform(0.6, 1.4, 4) * np.exp(1j * np.radians(10) * rng.normal(size=4))
+        late = np.exp(-2j * np.pi * frequencies * 0.0042)
+        played = values[order] * (signs * gains)[:, None, None] * late[:, None]
+        rows, found, polarities = matched(played, model, frequencies)
+        assert rows.tolist() == [0, 1, 2, 3]
+        assert found.tolist() == order.tolist()
+        assert polarities.tolist() == signs.tolist()
+
+
+def _responses(rig: Rig, points: FloatArray, frequencies: FloatArray) -> ComplexArray:
+    """Of each exciter, each frequency, at each place."""
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
+    return free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
 
 
 def test_tone_is_soft_on_one_output_within_the_limits(rig: Rig) -> None:
@@ -115,9 +163,11 @@ def test_said_channels_are_written(
     card = cabled(truth)
     monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
     output = tmp_path / "wired.yaml"
+    app = typer.Typer()
+    app.command()(outputs)
     done = CliRunner().invoke(
         app,
-        ["outputs", str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
+        [str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
         input=said,
     )
     assert done.exit_code == status

@@ -35,6 +35,7 @@ from model.calibration.variable_projection import (
     row_rms,
 )
 from model.identification.least_squares import Minimum
+from model.identification.viscous_loss import viscous_difference
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _ROUNDS = 8
@@ -71,6 +72,12 @@ class CalibrationProblem:
         searched[groups["sensor_place"]] &= np.repeat(~sensors, 2)
         values = np.where(sensors, np.nan, self.values)
         return replace(self, values=values, searched=searched)
+
+    def with_law_at(self, z: FloatArray) -> Self:
+        """The same where losses may be viscous, as at z (p,): that changes little with z."""
+        model = self.plate.model
+        model = replace(model, law=viscous_difference(replace(model, law=None), z))
+        return replace(self, plate=replace(self.plate, model=model))
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -173,6 +180,7 @@ def solve(problem: CalibrationProblem, start: FitStart) -> Fit:
     finite = np.isfinite(problem.values)
     z, noise, used = start.z, start.noise, start.used & finite
     for _ in range(_ROUNDS):
+        problem = problem.with_law_at(z)
         weight, before = used / noise[:, :, None], noise
         found = _search(problem, z, weight)
         z = found.x

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.identification.forward import Sensor
+from model.identification.measurement import Measurement
 from model.rig.rig import Rig
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
@@ -69,6 +71,18 @@ class Responses:
     def measured(self) -> NDArray[np.bool_]:
         """Mask of the ERAs that were driven (e,)."""
         return np.asarray(np.isfinite(self.values).any(axis=(0, 2)))
+
+    @property
+    def sensor_masses(self) -> FloatArray:
+        """Mass of the sensor at each place while it measures there, (s,) [kg]."""
+        return np.zeros(len(self.sensors)) if self.masses is None else self.masses
+
+    def as_measurement(self) -> Measurement:
+        """The same for an identification, of drives that lag as actuators behind a card do."""
+        places = zip(self.sensors, self.points.tolist(), self.sensor_masses.tolist(), strict=True)
+        sensors = [Sensor(name, x=x, y=y, mass=mass) for name, (x, y), mass in places]
+        values = self.values.swapaxes(1, 2)
+        return replace(Measurement.of(sensors, self.frequencies, values), drives_lag=True)
 
     def without(self, sensors: NDArray[np.bool_]) -> "Responses":
         """Remove some of the sensors (s,)."""

@@ -106,7 +106,7 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
 
 def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
     """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
-    masses = np.zeros(len(responses.sensors)) if responses.masses is None else responses.masses
+    masses = responses.sensor_masses
     notes = [f"{MASS}={1e3 * mass:.10g} {SETTING}={setting}" for mass in masses]
     positions = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]

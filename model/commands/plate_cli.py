@@ -325,7 +325,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     print_report(rows, summary, as_json=as_json)
 
 
-_MOST_NAMED = 6  # of masses and supports, which a frame has many of
+_MAX_NAMED = 6  # of masses and supports, which a frame has many of
 
 
 def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
@@ -342,7 +342,7 @@ def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
 
 def _mass_rows(masses: list[dict[str, Any]]) -> Iterator[str]:
     """Yield what the plate carries."""
-    if len(masses) > _MOST_NAMED:
+    if len(masses) > _MAX_NAMED:
         together = 1e3 * sum(each["mass_kg"] for each in masses)
         yield f"    carries {together:g} g at {len(masses)} points"
         return
@@ -352,7 +352,7 @@ def _mass_rows(masses: list[dict[str, Any]]) -> Iterator[str]:
 
 def _support_rows(supports: list[dict[str, Any]]) -> Iterator[str]:
     """Yield what holds the plate without driving it."""
-    if len(supports) > _MOST_NAMED:
+    if len(supports) > _MAX_NAMED:
         together = sum(each["stiffness_n_m"] for each in supports) / 1e3
         yield f"    held by {together:.4g} kN/m at {len(supports)} points"
         return

@@ -101,7 +101,7 @@ def _by_modes(plate: PlateAt) -> Columns:
 
 
 def _by_form(plate: PlateAt) -> Columns:
-    """By foreign mass and what stretches the plate, which couple its modes."""
+    """By foreign mass and what stretches the plate, which couple its modes, and their losses."""
     model, functions = plate.model, plate.functions
     if model.form is None:
         return {}
@@ -114,8 +114,10 @@ def _by_form(plate: PlateAt) -> Columns:
         _responses(plate, factor * (seen @ slope @ driven)) for slope in model.form.stiffening
     ]
     sides = np.array([model.rig.plate.length, model.rig.plate.width])
+    law = np.zeros(plate.scale.shape) if model.law is None else plate.scale * model.law
     return {
         "foreign_mass": by_mass - by_mass.mean(axis=-1, keepdims=True),
+        "loss_law": law[..., None],
         "side": np.stack(stretched[:2], axis=-1) / sides,
         "poisson": stretched[2][..., None],
     }
@@ -205,7 +207,7 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
     _by_plate: ("thickness", "modulus", "loss", "loss_added", "loss_exponent"),
     _by_modes: ("mode_shifts", "mode_losses"),
     _by_places: ("place", "masses", "sensor_place"),
-    _by_form: ("foreign_mass", "side", "poisson"),
+    _by_form: ("foreign_mass", "loss_law", "side", "poisson"),
     _by_attachments: (
         "stiffness",
         "damping",
@@ -254,7 +256,7 @@ def _responses(plate: PlateAt, change: ComplexArray) -> ComplexArray:
     found = change[:, :, :n]
     if plate.lightness is not None:
         assert plate.model.sensor_inertia is not None  # noqa: S101  there is a mass
-        loaded = plate.model.sensor_inertia[:, :, None] * plate.seen
+        loaded = plate.model.sensor_inertia[:, :, None] * plate.loaded
         own = change[:, at, n + at][:, :, None]
         found = found + loaded.reshape(*loaded.shape, *further) * own
         found = found * plate.lightness.reshape(*plate.lightness.shape, 1, *further)

@@ -76,7 +76,8 @@ class ForwardModel:
 
     frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
     others; space: what may differ; form: the plate in coordinates in which it may have form errors;
-    amplifiers: those whose clocks may be off, in the order of the delays.
+    amplifiers: those whose clocks may be off, in the order of the delays; law (f, s, n): change of
+    the receptance where losses are viscous, None for none.
     Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
     """
 
@@ -88,6 +89,7 @@ class ForwardModel:
     fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
     amplifiers: Sequence[str] = ()
+    law: ComplexArray | None = None
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -234,7 +236,8 @@ class PlateAt:
 
     values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
     by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
-    factor, and of all that a mode loses; bending (f, r, r), added (r, r): stiffness and mass
+    factor, and of all that a mode loses; eta (f,): loss factor; modulus: relative to that solved;
+    further (f, r, r): stiffness between modes beside all else [rad²/s²], None for none; bending (f, r, r), added (r, r): stiffness and mass
     between modes by form errors; sources: the ERAs; force (f, n): of each on a plate that is held,
     per unit of its drive; stiffness (f, a): of what is attached; free_receptance A, receptance T, of the plate
     with its attachments, and left factor L (f, a, a); moved (f, r, a): coordinates of the free
@@ -242,8 +245,11 @@ class PlateAt:
     parts (f, 4).
     """
 
-    def __init__(self, model: ForwardModel, x: FloatArray) -> None:
+    def __init__(
+        self, model: ForwardModel, x: FloatArray, further: ComplexArray | None = None
+    ) -> None:
         self.model, self.values = model, Values.of(model.rig, model.space, x)
+        self.further = further
         self.functions = self._functions()
         self.located = model.places(self.values)
         w, values = model.omega[:, None], self.values
@@ -288,6 +294,7 @@ class PlateAt:
         system = h**2 * self.bending - omega2[:, None] * self.added
         diagonal = np.arange(len(shapes.T))
         system[:, diagonal, diagonal] += h**2 * functions.elastic - omega2
+        system += 0.0 if self.further is None else self.further
         return np.asarray(np.linalg.solve(system, shapes.T.astype(complex)) / h)
 
     @cached_property
@@ -319,10 +326,17 @@ class PlateAt:
         return np.asarray(np.exp(-1j * self.model.omega[:, None, None] * delays))
 
     @cached_property
-    def seen(self) -> ComplexArray:
+    def loaded(self) -> ComplexArray:
         """Receptance between sensors and ERAs, each sensor's mass on the plate (f, s, n) [m/N]."""
         found = self.receptance[:, self.model.observed, : self.force.shape[1]]
         return found if self.lightness is None else self.lightness[:, :, None] * found
+
+    @cached_property
+    def seen(self) -> ComplexArray:
+        """The same of a plate whose losses follow the law that x says (f, s, n) [m/N]."""
+        if self.model.law is None:
+            return self.loaded
+        return np.asarray(self.loaded + self.values.loss_law * self.model.law)
 
     @cached_property
     def lightness(self) -> ComplexArray | None:
@@ -364,6 +378,7 @@ class PlateAt:
             for each in (own, own + further)
         )
         self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
+        self.eta, self.modulus = eta, modulus
         self.bending: ComplexArray | None = None
         if model.form is not None:
             stretched = np.einsum("g,grq->rq", values.stretch, model.form.stiffening)

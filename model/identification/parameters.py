@@ -97,6 +97,8 @@ KINDS = {
     "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
     "poisson": Kind(0.015, "", "", 1.0),
+    # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.viscous_loss`).
+    "loss_law": Kind(1.0, "", "", 1.0),
 }
 """Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead.
 
@@ -107,7 +109,7 @@ theory: on plates of 1.5 mm without shear deformation, with viscous losses
 EXCITER_KINDS = ("magnet_mass", "force_factor")
 """Kinds of which exciters alone have parameters; a rig without any has none."""
 
-FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson")
+FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
 """Kinds of which a plate with form errors alone has parameters."""
 
 VALUE_UNITS = {
@@ -315,6 +317,7 @@ def space_of(
     add("foreign_mass", [f"mass {n}" for n in range(MASS_CELLS.cell_count) if has_form])
     add("side", ["length", "width"] if has_form else [])
     add("poisson", ["Poisson's ratio"] if has_form else [])
+    add("loss_law", ["loss law"] if has_form else [])
     return space
 
 

@@ -32,7 +32,8 @@ class Values:
     sensor_scales (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs;
     foreign_mass (c,): in cells, as shares of the plate's and none in all; stretch (3,): of length
     and width, relative,
-    and what is added to Poisson's ratio.
+    and what is added to Poisson's ratio. loss_law: 0 for losses that are hysteretic, 1 for viscous
+    ones.
     """
 
     thickness: float
@@ -58,6 +59,7 @@ class Values:
     sensor_places: FloatArray
     foreign_mass: FloatArray
     stretch: FloatArray
+    loss_law: float
 
     @classmethod
     def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
@@ -100,6 +102,7 @@ class Values:
             sensor_places=own("sensor_place").reshape(-1, 2),
             foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
             stretch=np.append(own("side") / sides[: len(own("side"))], own("poisson")),
+            loss_law=float(own("loss_law").sum()),
         )
 
     def sources(self, rig: Rig) -> list[Source]:

@@ -143,11 +143,11 @@ def measure_places(
                 break
             case "s":
                 todo.pop(0)
-            case "r" if last is None:
-                tell("no place was measured just before; Enter, s or q")
-            case "r":
+            case "r" if last is not None:
                 todo.insert(0, last)
                 last = None
+            case "r":
+                tell("no place was measured just before; Enter, s or q")
             case "":
                 try:
                     measured = measure(

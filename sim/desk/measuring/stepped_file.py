@@ -117,14 +117,14 @@ def _era(desk: Desk, output: str, place: str) -> str:
 def _value(
     desk: Desk, era: str, sensor: WiredSensor, frequency: float, ratio: complex, place: str
 ) -> MeasuredValue:
-    stroke = desk.rig.era(era).stroke
+    full_level = desk.rig.era(era).full_level
     return MeasuredValue(
         era,
         sensor.name,
         (sensor.x, sensor.y),
         None,
         frequency,
-        ratio / stroke / sensor.sensitivity,
+        ratio / full_level / sensor.sensitivity,
         place,
         sensor.mass,
     )

@@ -149,6 +149,7 @@ def test_refused_device_is_one_message(
         ({"rate": 96_000}, "--rate"),
         ({"block": 2 * BLOCK}, "--block"),
         ({"device": "jack:nothing"}, "--device"),
+        ({"device": "jack:crad"}, "did you mean jack:card"),
     ],
 )
 def test_unsuitable_device_is_refused(
@@ -157,7 +158,7 @@ def test_unsuitable_device_is_refused(
     changed: dict[str, object],
     key: str,
 ) -> None:
-    """By the option at fault."""
+    """By the option at fault; a client that was mistyped by the one that was meant."""
     monkeypatch.setenv("JACK_DEFAULT_SERVER", sound[1]["JACK_DEFAULT_SERVER"])
     with pytest.raises(InputError, match=key):
         open_output(replace(SETTINGS, **changed))

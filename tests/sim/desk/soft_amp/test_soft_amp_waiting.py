@@ -1,5 +1,6 @@
 """A software amplifier without its sound server: it waits, and hosts see a fault meanwhile."""
 
+import asyncio
 import json
 import os
 import shutil
@@ -41,6 +42,7 @@ async def test_amplifier_waits_for_its_server_and_plays_by_the_clock_of_that(
     status = await amplifier.read_status()
     assert (status["state"], status["fault"]) == (STATES["FAULT"], FAULTS["INTERNAL"])
     wait_for(lambda: "no server is running" in amp.log)
+    await asyncio.sleep(1.5)  # two more attempts
     with jack_server(name, rate=RATE):
         capture = capture_on(name, "card", CHANNELS)
         wait_for(lambda: f"{RATE} Hz, blocks of {BLOCK} frames" in amp.log)

@@ -96,14 +96,14 @@ class ByKind:
     ) -> CoreSchema:
         sections = get_args(source)
         return core_schema.no_info_plain_validator_function(
-            partial(_validated_by_kind, sections),
-            metadata={"sections": [handler.generate_schema(each) for each in sections]},
+            partial(_validated_by_kind, sections), metadata={"sections": sections}
         )
 
     def __get_pydantic_json_schema__(
         self, schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        return {"anyOf": [handler(each) for each in schema["metadata"]["sections"]]}
+        sections = schema["metadata"]["sections"]
+        return {"anyOf": [handler(each.__pydantic_core_schema__) for each in sections]}
 
 
 def _validated_by_kind(sections: Sequence[type[Section]], value: Any) -> Section:

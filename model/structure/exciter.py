@@ -150,11 +150,20 @@ class Exciter(MeasuredGains):
         w = np.asarray(omega)
         return np.asarray(self._share(w) ** 2 * 1j * w * self.damping)
 
-    def excursion_at(self, omega: FloatArray) -> FloatArray:
-        """Amplitude of the coil in the magnet at full level on a plate that is held [m]."""
-        w = np.asarray(omega)
-        own = -self._spring(w) if self.held else w**2 * self.magnet_mass - self._spring(w)
-        return np.abs(self._pull(w) / own)
+    @property
+    def quality(self) -> float:
+        """Q = sqrt(k M) / (c + Bl² / R) of the magnet on the coil that is held, driven."""
+        return math.sqrt(self.stiffness * self.magnet_mass) / self.in_time.damping
+
+    @property
+    def largest_force(self) -> float:
+        """Force Bl V / R [N] at full level well above the resonance of the magnet, without L."""
+        return self.in_time.by_drive * self.voltage
+
+    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
+        """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
+        share = self._share(np.asarray(omega))
+        return np.asarray(share.reshape(-1, *[1] * (moved.ndim - 1)) * moved)
 
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An exciter whose suspension is stiffer and damps more by factors."""

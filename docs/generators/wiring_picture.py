@@ -61,7 +61,6 @@ def _computer_and_card() -> Iterator[str]:
         yield _text((352, y + 4), f"output {number}", anchor="end")
         yield _line([(360, y), (440, y)], BLUE)
         yield _text((366, y - 5), name, color=BLUE)
-    yield _text((352, 256), "output 5", anchor="end")
     yield _text((352, 292), "input 1", anchor="end")
     yield _text((352, 328), "input 2", anchor="end")
 
@@ -108,7 +107,8 @@ def _sensor_and_loop() -> Iterator[str]:
     yield _line([(360, 288), (440, 288), (440, 306), (670, 306), (670, 141), (795, 141)], GREEN)
     yield _text((676, 300), "accelerometer with its supply,", color=GREEN)
     yield _text((676, 316), "moved from place to place, arrow upwards", color=GREEN)
-    yield _line([(360, 252), (400, 252), (400, 324), (360, 324)], BLUE)
-    yield _text((408, 342), "cable of the delay reference, past the amplifier", color=BLUE)
+    yield _line([(400, 212), (400, 324), (360, 324)], BLUE)
+    yield '<circle cx="400" cy="212" r="4" fill="#1565c0"/>'
+    yield _text((408, 342), "Y-cable: output 4 back to input 2, the delay reference", color=BLUE)
     text = "red +, black −: an exciter whose pair is exchanged pushes where the others pull"
     yield _text((16, 376), text)

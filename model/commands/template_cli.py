@@ -45,7 +45,8 @@ def template(
 
     check_picture(output)
     rig = load_rig(rig_file)
-    columns, wired = ("sensor", "x_m", "y_m"), ("input", "mv_per_m_s2", "gain", "full_scale_v")
+    wired = ("input", "mv_per_m_s2", "gain", "full_scale_v", "mass_g")
+    columns = ("sensor", "x_m", "y_m")
     lines = read_lines(sensors_file, columns, optional=wired) if sensors_file else []
     sensors = {each.cells["sensor"]: (each.number("x_m"), each.number("y_m")) for each in lines}
     drawn = Template(rig, sensors, is_below=side is Side.BELOW)

@@ -72,6 +72,12 @@ def measure(
         bool,
         typer.Option("--resume", help="One sensor is moved: go on from what --output has."),
     ] = False,
+    y_cable: Annotated[
+        bool,
+        typer.Option(
+            "--y-cable", help="No output is left: that of the last ERA is the cable's, too."
+        ),
+    ] = False,
     stepped: Annotated[
         bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
     ] = False,
@@ -89,9 +95,10 @@ def measure(
     """Measure a plate through a sound card.
 
     Play on all ERAs at once and record accelerometers. A cable leads from the output after those of
-    the ERAs to the input after those of the sensors: it tells the delay, and lost blocks, whose run
-    is repeated. Where all lines of --sensors have one input, one sensor is moved from line to line:
-    the terminal says where to. The file is for era calibrate, and for era rig identify --measured.
+    the ERAs, or beside the last of them (--y-cable), to the input after those of the sensors: it
+    tells the delay, and lost blocks, whose run is repeated. Where all lines of --sensors have one
+    input, one sensor is moved from line to line: the terminal says where to. The file is for era
+    calibrate, and for era rig identify --measured.
     """
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
@@ -104,7 +111,7 @@ def measure(
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")
     rig = load_rig(rig_file)
     lines = parse_frequencies(frequencies) if frequencies else None
-    desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True))
+    desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True), y_cable)
     is_moved = are_places(desk.sensors)
     if (device is None) == (source is None):
         raise InputError("give --device, a sound card, or --from, what another has measured")
@@ -114,6 +121,8 @@ def measure(
         ("--resume", source is not None and resume, "--device"),
         ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
         ("--stepped", stepped and is_moved, "sensors that stay where they are"),
+        ("--stepped", stepped and y_cable, "an output of the cable's own"),
+        ("--y-cable", source is not None and y_cable, "--device"),
     ):
         if is_wrong:
             raise InputError(f"{option} needs {needs}; leave it out")

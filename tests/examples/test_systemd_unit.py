@@ -46,8 +46,8 @@ def test_unit_is_valid_and_hardened(tmp_path: Path, is_allowed: bool) -> None:
 def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -> None:
     """systemd accepts them as a user's; each wants and follows the one before it.
 
-    The link is that of the rig; the card has an output for each exciter and one for the cable, and
-    an input for the sensor and one for the cable.
+    The link is that of the rig; the card has an output for each exciter, an input for the sensor
+    and one for the cable.
     """
     program = installed_program("systemd-analyze", package="systemd")
     texts = {}
@@ -71,5 +71,5 @@ def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -
     (link,) = re.findall(r"--link (\S+)", texts["era-soft-amp"])
     assert amplifier["url"] == f"serial://{link}"
     outputs, inputs = map(int, re.findall(r"--(?:out|in)channels (\d+)", texts["era-sound-server"]))
-    assert (outputs, inputs) == (len(rig["eras"]) + 1, 2)
+    assert (outputs, inputs) == (len(rig["eras"]), 2)
     assert f"--channels {len(rig['eras'])} " in texts["era-soft-amp"]

@@ -159,35 +159,39 @@ def check_wiring(
 ) -> None:
     """Raise InputError where the loop-back shows inputs or outputs to be swapped.
 
-    eras: name and output of each source, in order; the loop-back is the last one.
+    eras: name and output of each source, in order; the loop-back is the last one, or of the ERA
+    that has its output.
     """
     came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
     named = {sensor.input: f"of sensor {sensor.name}" for sensor in sensors}
-    *_, second, first = np.sort(came[loopback - 1])
+    own = next((n for n, (_, at) in enumerate(eras) if at == output), len(eras))
+    first, others = came.max(axis=1), np.sort(came, axis=1)[:, -2]
+    alone = (first > _LOOPED) & (others < _CROSSTALK * first)  # of one output, as cables are
     source = int(came[loopback - 1].argmax())
-    if source < len(eras) and first > _LOOPED and second < _CROSSTALK * first:
+    if source != own and alone[loopback - 1]:
         name, at = eras[source]
         raise InputError(
             f"input {loopback} must bring back output {output}, got output {at} of ERA {name}: "
             "outputs are swapped; exchange their cables"
         )
-    back = int(came[:, -1].argmax()) + 1
-    if back != loopback and came[back - 1, -1] > _LOOPED:
+    back = int(np.where(alone & (came.argmax(axis=1) == own), first, 0).argmax()) + 1
+    if back != loopback and came[back - 1, own] > _LOOPED and alone[back - 1]:
         raise InputError(
             f"the loop-back of output {output} must come back at input {loopback}, got it at input "
             f"{back}, {named.get(back, 'of no sensor')}: inputs are swapped; exchange their cables"
         )
-    if came[loopback - 1, -1] < _LOOPED:
+    looped = came[loopback - 1, own]
+    if looped < _LOOPED:
         raise InputError(
             f"input {loopback} must bring back output {output} as the loop-back, got "
-            f"{came[loopback - 1, -1]:.2g} of it; connect them by a cable"
+            f"{looped:.2g} of it; connect them by a cable"
         )
-    others = came[loopback - 1, : len(eras)]
-    if others.max(initial=0) > _CROSSTALK * came[loopback - 1, -1]:
-        name, at = eras[int(others.argmax())]
+    crosstalk = np.where(np.arange(len(eras)) == own, 0, came[loopback - 1, : len(eras)])
+    if crosstalk.max(initial=0) > _CROSSTALK * looped:
+        name, at = eras[int(crosstalk.argmax())]
         raise InputError(
-            f"the loop-back must be output {output} alone, got {others.max():.2g} of output {at} "
-            f"of ERA {name} too; check mixers and monitoring of the sound card"
+            f"the loop-back must be output {output} alone, got {crosstalk.max():.2g} of output "
+            f"{at} of ERA {name} too; check mixers and monitoring of the sound card"
         )
 
 

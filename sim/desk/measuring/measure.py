@@ -71,7 +71,9 @@ def play_run(
         kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
         check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
         looped = kept[:, desk.input - 1]
-        gain = multisine.found(looped) / multisine.played(number)[:, -1]
+        gain = (
+            multisine.found(looped) / multisine.played(number)[:, desk.sources.index(desk.output)]
+        )
         # The cable decides: drivers report losses that were none, and miss others.
         same = is_whole(looped, samples=multisine.samples)
         same = same and (before is None or is_as_late(gain, before))
@@ -144,7 +146,7 @@ def open_desk(
     desk.check_frequencies(frequencies, what="--frequencies")
     opened = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     with closing(opened) as card:
-        yield card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)
+        yield card, Multisine(frequencies, len(desk.sources), card.rate, level, seed)
 
 
 def measure(
@@ -181,8 +183,9 @@ def measure(
     if is_lost:
         raise blocks_lost()
     check_coherence(found, recorded, desk.sensors, desk.eras)
-    looped, columns = found.values[:, desk.input - 1, -1], desk.columns
-    rms = np.sqrt((np.abs(found.values[:, columns, :-1]) ** 2).mean(axis=(0, 2)))
+    looped, columns = found.values[:, desk.input - 1, desk.sources.index(desk.output)], desk.columns
+    of_eras = found.values[:, columns, : len(desk.eras)]
+    rms = np.sqrt((np.abs(of_eras) ** 2).mean(axis=(0, 2)))
     return Measured(
         desk.responses(multisine.frequencies, found.values, looped),
         found.coherence[:, columns],

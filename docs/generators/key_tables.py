@@ -12,12 +12,12 @@ from enum import Enum
 from itertools import pairwise
 from textwrap import dedent
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from typing import Literal, get_args, get_origin
 
 from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
-from model.config.sections import Quantity, Section
+from model.config.sections import Quantity, Section, quantities
 
 HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
 
@@ -67,18 +67,6 @@ def in_cell(docstring: str) -> str:
     text = " ".join(docstring.split("\n\n")[0].split()).removesuffix(".")
     first = text.split(" ")[0]
     return text[0].lower() + text[1:] if first.istitle() and "'" not in first else text
-
-
-def quantities(field: FieldInfo) -> list[Quantity]:
-    """Every Quantity that a field's type carries, however deep."""
-
-    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
-        found = [part for part in metadata if isinstance(part, Quantity)]
-        for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
-            found += [part] if isinstance(part, Quantity) else within(part)
-        return found
-
-    return within(field.annotation, field.metadata)
 
 
 def bounds_in_words(asked: Quantity) -> str:

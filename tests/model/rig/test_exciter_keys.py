@@ -91,6 +91,8 @@ def test_what_is_wrong_is_found_at_its_key() -> None:
             parse_rig("board.yaml", wrong)
         problem = error.value.problems[0]
         assert (problem.line, problem.key) == (3, f"eras.SW.{key}")
+        said = "must be era or exciter, got 'exiter'; did you mean exciter?"
+        assert key != "kind" or problem.message == said
 
 
 def checked(keys: str, frequency: str) -> tuple[list[str], list[str]]:

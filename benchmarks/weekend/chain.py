@@ -133,7 +133,7 @@ class BuiltBoard:
 
 @dataclass(frozen=True)
 class Touch:
-    """A touch [dB]: what was promised after calibration, and felt by that and by exact knowledge."""
+    """A touch [dB]: promised after calibration, felt by that, and felt by exact knowledge."""
 
     quiet: int
     promised: float
@@ -228,8 +228,9 @@ def main() -> None:
     text = table(found)
     print(f"\n{text}")
     if options.report:
-        run = f"python -m benchmarks.weekend.chain --boards {options.boards} --touches {options.touches}"
-        write_parts(PAGE, {"chain": f"Printed by `{run} --report`.\n\n{text}"})
+        counts = f"--boards {options.boards} --touches {options.touches}"
+        run = f"Printed by `python -m benchmarks.weekend.chain {counts} --report`."
+        write_parts(PAGE, {"chain": f"{run}\n\n{text}"})
 
 
 if __name__ == "__main__":

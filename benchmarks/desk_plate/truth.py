@@ -9,6 +9,7 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.rig.meshes import parse_mesh
 from model.rig.rig import Rig
+from model.structure.attachments import Era
 from model.structure.plate import Plate
 
 MESH = "16x12 Q3"
@@ -56,7 +57,7 @@ class Truth:
                     "at_m": [era.x, era.y],
                     "stiffness": era.stiffness,
                     "damping": era.damping,
-                    "bolt_mass": era.bolt_mass,
+                    "bolt_mass": era.in_time.mass,
                     "resonance_hz": actuator.resonance,
                     "damping_ratio": actuator.ratio,
                     "gain": actuator.gain,
@@ -92,6 +93,7 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
             gains=(),
         )
         for era in rig.eras
+        if isinstance(era, Era)
         for x, y in (_near((era.x, era.y), plate, rng),)
     )
     actuators = tuple(

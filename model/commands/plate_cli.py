@@ -323,6 +323,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             for mass in summary["point_masses"]
         ),
         *_exciter_rows(summary["exciters"], summary.get("reach")),
+        *_type_rows(summary["exciter_types"]),
     ]
     print_report(rows, summary, as_json=as_json)
 
@@ -394,6 +395,15 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
     ]
     if short:
         yield f"    falls short at {', '.join(short)} of the places"
+
+
+def _type_rows(types: dict[str, Any]) -> Iterator[str]:
+    """What is assumed of the types of exciters."""
+    for name, known in types.items():
+        yield f"    {name}: {known['note']}"
+        assumed = [f"{key} {low:g} to {high:g}" for key, (low, high) in known["assumed"].items()]
+        if assumed:
+            yield f"        assumed, measure yours: {', '.join(assumed)}"
 
 
 def _frequency(key: str) -> str:

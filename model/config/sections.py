@@ -15,6 +15,7 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
 
 from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
@@ -86,6 +87,18 @@ class Quantity:
         unit = self.dimension.unit or "no unit"
         description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
         return {"type": ["number", "string"], "description": description}
+
+
+def quantities(field: FieldInfo) -> list[Quantity]:
+    """Every Quantity that a field's type carries, however deep."""
+
+    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
+        found = [part for part in metadata if isinstance(part, Quantity)]
+        for part in get_args(annotation):
+            found += [part] if isinstance(part, Quantity) else within(part)
+        return found
+
+    return within(field.annotation, field.metadata)
 
 
 class ByKind:

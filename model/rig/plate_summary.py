@@ -5,9 +5,9 @@ from typing import Any
 
 from model.config.sections import Quantity
 from model.rig.exciter_checks import exciters_of
+from model.rig.exciter_summary import summary_of, types_of
 from model.rig.rig import Rig
 from model.rig.sections import PlateSection
-from model.structure.exciter import Exciter
 from model.structure.laminate_section import (
     bending,
     freely_sliding,
@@ -56,22 +56,8 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
         ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
-        "exciters": [_exciter(one) for one in exciters_of(rig)],
-    }
-
-
-def _exciter(one: Exciter) -> dict[str, Any]:
-    """An exciter by itself, on a plate that is held."""
-    one_watt = one.force_factor * math.sqrt(2 / one.resistance)
-    return {
-        "name": one.name,
-        "magnet": "held" if one.held else "free",
-        "magnet_resonance_hz": one.magnet_frequency,
-        "q": one.quality,
-        "force_at_1_w_n": one_watt,
-        "full_level_v": one.voltage,
-        "full_level_force_n": one.largest_force,
-        "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
+        "exciters": [summary_of(one) for one in exciters_of(rig)],
+        "exciter_types": types_of(rig),
     }
 
 

@@ -175,6 +175,9 @@ class Era(MeasuredGains):
     LEARNED: ClassVar = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
     """Fields that measurements of a plate change."""
 
+    UNIT: ClassVar = "m"
+    """Of its drive."""
+
     name: str
     x: float
     y: float

@@ -45,6 +45,9 @@ class Exciter(MeasuredGains):
     )
     """Fields that measurements of a plate change."""
 
+    UNIT: ClassVar = "V"
+    """Of its drive."""
+
     name: str
     x: float
     y: float

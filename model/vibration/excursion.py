@@ -34,12 +34,12 @@ def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> Comp
 
 def excursions_of(rig: Rig) -> Excursions:
     """The excursions within the rig's frequencies and by its level."""
-    limits, most = rig.limits, np.array([one.excursion for one in exciters_of(rig)])
+    limits, allowed_by = rig.limits, np.array([one.excursion for one in exciters_of(rig)])
     low, high = limits.frequency_min, limits.frequency_max
     frequencies = np.append(np.arange(low, high, _STEP), high)
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=high)
     found = limits.level * np.abs(relative_motions(rig, free, frequencies)).sum(axis=1)
-    passed = found > most
+    passed = found > allowed_by
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low
     if len(rows):

@@ -77,7 +77,7 @@ def reach_of(rig: Rig) -> Reach:
         )
     )
     between = relative_motions(rig, free, frequencies)
-    most = np.array([one.excursion for one in exciters_of(rig)])
+    allowed = np.array([one.excursion for one in exciters_of(rig)])
     threshold = detection_threshold(frequencies, rig.threshold)[:, None]
     found = []
     for few in np.array_split(places, math.ceil(len(places) / _AT_ONCE)):
@@ -89,7 +89,7 @@ def reach_of(rig: Rig) -> Reach:
         ).reshape(len(frequencies), len(rig.eras), *weights.shape)
         phases = fields[..., 0].conj() / np.abs(fields[..., 0])
         moved = np.abs(np.einsum("fep,fem->fmp", phases, between))
-        level = np.minimum((most[:, None] / moved).min(axis=1), limits.level)
+        level = np.minimum((allowed[:, None] / moved).min(axis=1), limits.level)
         together = np.abs((fields * phases[..., None]).sum(axis=1))
         felt = level * (together * weights).sum(axis=-1)
         found.append(felt / _held(rig, free, few, frequencies) / threshold)

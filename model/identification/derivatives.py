@@ -198,7 +198,9 @@ def _by_scale(plate: PlateAt) -> ComplexArray:
     """By the scale of each sensor, which may be zero."""
     count = len(plate.values.sensor_scales)
     plain = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late
-    return np.asarray((plain * plate.seen)[..., None] * np.eye(len(plate.model.observed), count)[:, None])
+    return np.asarray(
+        (plain * plate.seen)[..., None] * np.eye(len(plate.model.observed), count)[:, None]
+    )
 
 
 _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {

@@ -25,7 +25,7 @@ def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
     own, viscous = _lossy(plate), _viscous(plate)
     change = 1j * plate.eta[:, None, None] * (model.omega[:, None, None] * viscous - own)
     columns = plate.force.shape[1]
-    other = PlateAt(model, x, change)
+    other = PlateAt(model, x, np.asarray(change))
     return np.asarray((other.receptance - plate.receptance)[:, model.observed, :columns])
 
 

@@ -206,9 +206,9 @@ class Exciter(MeasuredGains):
         by_factor, of_force = by_spring(electric)
         return {
             "stiffness": by_spring(self.stiffness),
-            "damping": by_spring(1j * w),
+            "damping": by_spring(np.asarray(1j * w)),
             "force_factor": (by_factor, of_force + force),
-            "magnet_mass": (self._spring(w) * share * still, force * still),
+            "magnet_mass": (np.asarray(self._spring(w) * share * still), np.asarray(force * still)),
             "bolt_mass": (-(w**2) + 0j, np.zeros(w.shape, dtype=complex)),
         }
 

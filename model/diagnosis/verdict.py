@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
 from model.calibration.sensed_plate import SensedPlate, sensed_plate
-from model.choice import best_by
+from model.choice import best_by, best_of
 from model.diagnosis.assignment import (
     ChannelPhase,
     ShapeMatch,
@@ -239,7 +239,8 @@ def diagnose(
         )
         for number in range(len(rig.eras))
     )
-    channels = tuple(_loose(each, rig, explanations) for each in channels)
+    if not matches:
+        channels = tuple(_loose(each, rig, match, explanations) for each in channels)
     return Verdict(
         channels,
         matches,
@@ -331,14 +332,20 @@ def _channel(
 
 
 def _loose(
-    channel: ChannelVerdict, rig: Rig, explanations: Sequence[Explanation]
+    channel: ChannelVerdict, rig: Rig, match: Match, explanations: Sequence[Explanation]
 ) -> ChannelVerdict:
-    """The same, loose where the likeliest explanation of the plate is its exciter's contact."""
+    """The same, loose where its exciter is what is farthest off, or the likeliest explanation.
+
+    And acts with less than it would.
+    """
     drives = channel.drives
-    if not explanations or drives is None or explanations[0].cause.era != drives:
+    if drives is None or isinstance(rig.era(drives), Era):
         return channel
-    share = explanations[0].value / explanations[0].expected
-    if share > LOOSE or isinstance(rig.era(drives), Era):
+    shares = [each.value / each.expected for each in explanations[:1] if each.cause.era == drives]
+    if match.plate.rows[best_of(np.abs(match.z))].era == drives:
+        acts = [row for row in match.plate.rows if row.era == drives and row.is_factor]
+        shares += [row.of(match.rig) / row.of(rig) for row in acts]
+    if min(shares, default=1.0) > LOOSE:
         return channel
     states = ("loose", *(each for each in channel.states if each not in ("well", "weak")))
     return replace(channel, states=states)

@@ -18,7 +18,7 @@ Of that of a plate that was not measured, where the rig states less: answers nee
 """
 
 SUSPENSION_FELT = 120.0
-"""Hz; above it the suspension of an exciter changes fields by less than 5 %, though it is 20 % off."""
+"""Hz; above it fields change by less than 5 % with a suspension that is 20 % off."""
 
 _STEP = 20.0  # Hz between the tones that are considered
 _NOISE = 0.01

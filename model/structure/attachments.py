@@ -276,7 +276,8 @@ class Era(MeasuredGains):
         w, base = np.asarray(omega), self.base(omega)
         held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
         bolt = -(w**2) + 0j, np.zeros(w.shape, dtype=complex)
-        return {kind: (own, own * base) for kind, own in held.items()} | {"bolt_mass": bolt}
+        found = {kind: (np.asarray(own), np.asarray(own * base)) for kind, own in held.items()}
+        return found | {"bolt_mass": bolt}
 
 
 def damping_from_ratio(

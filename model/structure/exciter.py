@@ -198,12 +198,17 @@ class Exciter(MeasuredGains):
         w, share, force = np.asarray(omega), self._share(omega), self.force(omega)
         base, still = self.base(w), 1 - share
         electric = 2j * w * self.force_factor**2 / self._impedance(w)
-        changes = {"stiffness": self.stiffness, "damping": 1j * w, "force_factor": electric}
-        found = {kind: (share**2 * dS, share**2 * dS * base) for kind, dS in changes.items()}
-        by_factor, of_force = found["force_factor"]
-        return found | {
+
+        def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
+            found = share**2 * change
+            return np.asarray(found), np.asarray(found * base)
+
+        by_factor, of_force = by_spring(electric)
+        return {
+            "stiffness": by_spring(self.stiffness),
+            "damping": by_spring(np.asarray(1j * w)),
             "force_factor": (by_factor, of_force + force),
-            "magnet_mass": (self._spring(w) * share * still, force * still),
+            "magnet_mass": (np.asarray(self._spring(w) * share * still), np.asarray(force * still)),
             "bolt_mass": (-(w**2) + 0j, np.zeros(w.shape, dtype=complex)),
         }
 

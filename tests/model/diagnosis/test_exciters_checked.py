@@ -121,4 +121,5 @@ def test_exciter_wired_backwards_and_sensor_upside_down_are_told_apart() -> None
         ("well",), ("inverted",), ("well",), ("well",)
     ]  # fmt: skip
     (sensor,) = verdict.bad_sensors
-    assert sensor.name == "P5" and "upside down" in sensor.why
+    assert sensor.name == "P5"
+    assert "upside down" in sensor.why

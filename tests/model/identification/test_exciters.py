@@ -149,7 +149,8 @@ def test_identified_board_has_the_parts_that_it_was_built_of() -> None:
     again = rig_of(parse_document("board.yaml", written))
     forces = []
     for true, after in zip(built.eras, again.eras, strict=True):
-        assert isinstance(true, Exciter) and isinstance(after, Exciter)
+        assert isinstance(true, Exciter)
+        assert isinstance(after, Exciter)
         assert after.stiffness == pytest.approx(true.stiffness, rel=0.02)
         assert after.magnet_mass == pytest.approx(true.magnet_mass, rel=0.05)
         omega = np.array([2 * np.pi * 200])

@@ -70,9 +70,9 @@ def _grain_shown(setting: Setting, fitted: FittedModel) -> tuple[float, float]:
     shifts = fitted.space.of("mode_shifts")
     count = int(shifts.sum())
     posterior = Posterior.of(fitted.space, fitted.best)
-    told = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
+    shown = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
     J = _slopes(setting.free, count) / KINDS["mode_shifts"].std
-    information = J.T @ told @ J + np.eye(3) / _PRIOR**2
+    information = J.T @ shown @ J + np.eye(3) / _PRIOR**2
     _, across, shear = np.linalg.solve(information, J.T @ posterior.x[shifts]).tolist()
     return across, shear
 

@@ -10,43 +10,80 @@ moduli, of a prior variance D: to first order
 where the first column, all ones, stands for a modulus that is fitted anew.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from model.arrays import FloatArray
+from model.choice import best_by
 from model.identification.parameters import KINDS
 from model.identification.posterior import Posterior
-from model.identification.stages import FittedModel, Setting
-from model.reduction.free_plate import FreePlate
-from model.rig.rig import Rig
+from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages
+from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.shape_stiffness import grain_slopes
 from model.structure.modal_elasticity import lowest_elastic
 
 _PRIOR = 0.15  # of the logarithms: of a board by its kind
 _LEAST = 3e-3  # of a change that is worth another fit
+_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
+_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
+_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
 
-ROUNDS = 3
-"""Fits of a board, each with the grain that the one before shows."""
+
+def fit_board(setting: Setting) -> tuple[Setting, FittedModel]:
+    """The most likely parameters of a measurement, and the board in whose grain they are.
+
+    Of a plate without a grain those of `fit_in_stages`.
+    """
+    if setting.rig.plate.material.orthotropy is None:
+        return setting, fit_in_stages(setting)
+    found = []
+    for start in _STARTS:
+        found += _fits_from(_with_grain(setting, start, 1.0))
+        if any(_is_good(fitted) for _, fitted in found):
+            break
+    return best_by(found, lambda each: -each[1].best.cost)
 
 
-def with_grain_of(setting: Setting, fitted: FittedModel) -> Rig | None:
-    """The rig whose board has the grain that a fit shows; None where it has, or has none."""
-    rig = setting.rig
-    grain = rig.plate.material.orthotropy
+def _fits_from(setting: Setting) -> list[tuple[Setting, FittedModel]]:
+    """Fits one after the other, each in the grain that the one before shows."""
+    found = [(setting, fit_in_stages(setting))]
+    for _ in range(_ROUNDS):
+        setting, fitted = found[-1]
+        across, shear = _grain_shown(setting, fitted)
+        if max(abs(across), abs(shear)) < _LEAST:
+            break
+        other = _with_grain(setting, math.exp(across), math.exp(shear))
+        found.append((other, fit_in_stages(other)))
+    return found
+
+
+def _is_good(fitted: FittedModel) -> bool:
+    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
+    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
+    return chi2(fitted) <= _GOOD and float((shifts**2).mean()) <= _GOOD
+
+
+def _grain_shown(setting: Setting, fitted: FittedModel) -> tuple[float, float]:
+    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
     shifts = fitted.space.of("mode_shifts")
-    if grain is None or not shifts.any():
-        return None
+    count = int(shifts.sum())
     posterior = Posterior.of(fitted.space, fitted.best)
-    told = np.eye(int(shifts.sum())) - posterior.covariance[np.ix_(shifts, shifts)]
-    J = _slopes(setting.free, int(shifts.sum())) / KINDS["mode_shifts"].std
-    information = J.T @ told @ J + np.eye(3) / _PRIOR**2
+    shown = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
+    J = _slopes(setting.free, count) / KINDS["mode_shifts"].std
+    information = J.T @ shown @ J + np.eye(3) / _PRIOR**2
     _, across, shear = np.linalg.solve(information, J.T @ posterior.x[shifts]).tolist()
-    if max(abs(across), abs(shear)) < _LEAST:
-        return None
-    other = replace(grain, e2=grain.e2 * np.exp(across), g12=grain.g12 * np.exp(shear))
-    plate = replace(rig.plate, material=replace(rig.plate.material, orthotropy=other))
-    return replace(rig, plate=plate)
+    return across, shear
+
+
+def _with_grain(setting: Setting, across: float, shear: float) -> Setting:
+    """The setting of a board with other moduli across and of shear, by factors."""
+    rig, of = setting.rig, setting.rig.plate.material.shares
+    shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
+    plate = replace(rig.plate, material=replace(rig.plate.material, orthotropy=shares))
+    free = solve_free_plate(plate, setting.free.mesh, frequency_max=setting.free.frequency_max)
+    return replace(setting, rig=replace(rig, plate=plate), free=free)
 
 
 def _slopes(free: FreePlate, count: int) -> FloatArray:

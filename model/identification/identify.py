@@ -8,12 +8,12 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
-from model.identification.grain import ROUNDS, with_grain_of
+from model.identification.grain import fit_board
 from model.identification.held_out import SHARE, HeldOutPaths, hold_out
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space
 from model.identification.posterior import Posterior
-from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages
+from model.identification.stages import FittedModel, Setting, chi2
 from model.identification.values import Values, rig_with
 from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -82,16 +82,9 @@ def identify(
     would show it.
     """
     _check(rig, measurement)
-    before, high = rig, float(measurement.frequencies[-1])
-    setting = Setting(rig, solved_for(rig, high), measurement)
-    fitted = fit_in_stages(setting)
-    for _ in range(ROUNDS):
-        board = with_grain_of(setting, fitted)
-        if board is None:
-            break
-        rig = board
-        setting = Setting(rig, solved_for(rig, high), measurement)
-        fitted = fit_in_stages(setting)
+    before, free = rig, solved_for(rig, float(measurement.frequencies[-1]))
+    setting, fitted = fit_board(Setting(rig, free, measurement))
+    rig = setting.rig
     values = Values.of(rig, fitted.space, fitted.best.x)
     posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
     found = Identification(

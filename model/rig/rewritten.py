@@ -116,7 +116,7 @@ def _numbers(rig: Rig, document: Document) -> Iterator[tuple[float, float]]:
     for path, value in _values(rig, document).items():
         match value:
             case Material():
-                yield value.E, 0.0
+                yield from ((each, 0.0) for each in value.moduli.values())
             case Uncertainty():
                 yield from ((each, 0.0) for each in asdict(value).values())
             case tuple() if path[-1] == "at":

@@ -9,7 +9,7 @@ from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
-from model.spectral.shape_stiffness import stiffness_slopes
+from model.spectral.shape_stiffness import grain_slopes, stiffness_slopes
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
 
@@ -76,6 +76,21 @@ def test_slopes_are_those_of_the_eigenvalues_of_other_plates(plate, mesh):
         np.testing.assert_allclose(
             np.diagonal(slope) / eigenvalues, expected / eigenvalues, atol=2e-3
         )
+
+
+@pytest.mark.parametrize(("number", "key"), [(0, "e2"), (1, "g12")])
+def test_slopes_by_a_grain_are_those_of_boards_of_other_moduli(number, key):
+    """Solved anew with a modulus across, or of shear in the plane, a little higher and lower."""
+    eigenvalues, unknowns = elastic_modes(BOARD, SPECTRAL)
+    slopes = grain_slopes(BOARD, DEGREES, unknowns)[number]
+
+    def board(change):
+        shares = replace(BIRCH.orthotropy, **{key: getattr(BIRCH.orthotropy, key) * (1 + change)})
+        return replace(BOARD, material=replace(BIRCH, orthotropy=shares))
+
+    more, less = (elastic_modes(board(by), SPECTRAL)[0] for by in (STEP, -STEP))
+    expected = (more - less) / (2 * STEP) / eigenvalues
+    np.testing.assert_allclose(slopes / eigenvalues, expected, atol=2e-3)
 
 
 def test_a_thin_plate_scales_with_the_fourth_power_of_its_size():

@@ -2,7 +2,8 @@
 
 Of polynomials it is `model.spectral.direct`; of finite elements one sparse factorisation for each
 frequency. What ERAs and loads do to the plate is computed here: from the motion of an ERA's base
-the force (k_b + i omega c) y of the founding paper's Eq. 25, and the dynamic stiffness of each.
+the force (k_b + i omega c) y of the founding paper's Eq. 25, and the dynamic stiffness of each; of
+an exciter by the equations of its magnet and of its current, solved beside each other.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,9 @@ from model.fem.mesh import Mesh
 from model.fem.plate import PlateMatrices, assemble, factorise
 from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh
+from model.structure.actuators import Actuator
 from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
+from model.structure.exciter import Exciter
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
 
@@ -30,7 +33,7 @@ def direct_responder(plate: Plate, mesh: PlateMesh) -> Responder:
 
 def direct_acceleration(
     matrices: PlateMatrices,
-    eras: Sequence[Era],
+    eras: Sequence[Actuator],
     frequencies: FloatArray,
     points: FloatArray,
     *,
@@ -38,7 +41,7 @@ def direct_acceleration(
 ) -> ComplexArray:
     """Acceleration [m/s²] at points (p, 2) per frequency [Hz] (f,) and driven ERA: (f, eras, p).
 
-    Each ERA alone at full stroke and phase zero, the others at rest, on finite elements.
+    Each ERA alone at full level and phase zero, the others at rest, on finite elements.
     """
     matrices.mesh.check_frequencies(matrices.plate, frequencies)
     touch = matrices.deflection_at(footprints_of(eras, loads))
@@ -59,17 +62,37 @@ def direct_acceleration(
     return result
 
 
-def _force(era: Era, omega: float) -> complex:
-    """Force [N] on a plate that is held, its base at full stroke, at omega [rad/s]."""
-    base = complex(era.stroke)
+def _force(era: Actuator, omega: float) -> complex:
+    """Force [N] on a plate that is held, driven at full level, at omega [rad/s]."""
+    drive = complex(era.full_level)
     if era.gains:
         frequencies, sizes, phases = np.transpose(era.gains)
-        base *= np.interp(omega / (2 * np.pi), frequencies, sizes * np.exp(1j * phases))
-    return (era.stiffness + 1j * omega * era.damping) * base
+        drive *= np.interp(omega / (2 * np.pi), frequencies, sizes * np.exp(1j * phases))
+    if isinstance(era, Exciter):
+        return _on_plate(era, omega, moved=0.0, voltage=drive)
+    return (era.stiffness + 1j * omega * era.damping) * drive
 
 
-def _dynamic_stiffness(each: Era | PointLoad | FingertipLoad, omega: float) -> complex:
+def _on_plate(exciter: Exciter, omega: float, *, moved: float, voltage: complex) -> complex:
+    """Force of an exciter on the plate [N], which moves by so much [m], at a voltage [V].
+
+    Unknown are the magnet's displacement x and the current: the magnet's equation, x = 0 for one
+    that is held, and that of the circuit.
+    """
+    s, bl = 1j * omega, exciter.force_factor
+    spring = exciter.stiffness + s * exciter.damping
+    coil = exciter.resistance + exciter.source_resistance + s * exciter.inductance
+    magnet = [1, 0] if exciter.held else [s**2 * exciter.magnet_mass + spring, bl]
+    of_plate = 0 if exciter.held else spring * moved
+    system = np.array([magnet, [-s * bl, coil]], dtype=complex)
+    x, current = np.linalg.solve(system, [of_plate, voltage - s * bl * moved])
+    return complex(bl * current - spring * (moved - x) - s**2 * exciter.coil_mass * moved)
+
+
+def _dynamic_stiffness(each: Actuator | PointLoad | FingertipLoad, omega: float) -> complex:
     """Force on what is attached by the plate's displacement there [N/m] at omega [rad/s]."""
+    if isinstance(each, Exciter):
+        return -_on_plate(each, omega, moved=1.0, voltage=0.0)
     if isinstance(each, FingertipLoad):
         tip = each.fingertip
         pulp = tip.stiffness + 1j * omega * tip.damping

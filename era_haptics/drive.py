@@ -50,10 +50,14 @@ class Drive:
 _MAX_SUM = 1 + 1e-6
 """Highest sum of levels, with the rounding of answers in single precision."""
 
-_UNITS_OF_A_TONE = {"frequency": "hertz", "amplitude": "metres", "phase": "radians"}
+_UNITS_OF_A_TONE = {
+    "frequency": "hertz",
+    "amplitude": "metres, or volts of an exciter",
+    "phase": "radians",
+}
 
 Driven: TypeAlias = float | Drive | Tone
-"""A frequency [Hz] at full stroke, a `Drive`, or a `Tone` [Hz, m, rad]."""
+"""A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V of an exciter; rad]."""
 
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
 """By ERA name: what it plays, or a list of what it plays at once."""
@@ -87,8 +91,8 @@ def layers_of(drive: Played, rig: Rig) -> tuple[Layer, ...]:
     for name, level in levels.items():
         if not level <= _MAX_SUM:  # NaN, too
             raise InputError(
-                f"level of {name}, the sum of all that it plays at once, must be at most 1, its "
-                f"stroke of {rig.era(name).full_level:g} m, got {level}"
+                f"level of {name}, the sum of all that it plays at once, must be at most 1, full "
+                f"level of {rig.era(name).full_level:g} {rig.era(name).UNIT}, got {level}"
             )
     return layers
 

@@ -28,7 +28,7 @@ from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import PlateMatrices, assemble
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.structure.attachments import PointLoad
+from model.structure.attachments import Era, PointLoad
 
 MESH = (6, 5)  # within 0.1 % of converged, with strips
 STRIP = 3e-3  # m, twice the plate's thickness
@@ -111,7 +111,7 @@ def draw_plate(
         loss_factor=float(loss_factor),
     )
     eras = []
-    for era in rig.eras:
+    for era in (each for each in rig.eras if isinstance(each, Era)):
         # Bolts of an edge can only be off inwards.
         at = np.array([era.x, era.y]) / [plate.length, plate.width]
         inwards = np.where(at > 0.5, -1.0, 1.0)
@@ -170,7 +170,7 @@ def measure(
 def true_values(rig: Rig) -> list[float]:
     """The fitted values in the order of `model.calibration.sensed_plate.SensedPlate.rows`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
-    return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
+    return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 
 
 def gains_of(rig: Rig) -> ComplexArray:

@@ -13,7 +13,7 @@ from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import PointLoad
+from model.structure.attachments import Era, PointLoad
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -59,6 +59,7 @@ def known_table(
             gains=((LOSS_FREQUENCY, float(abs(own.gain[n])), float(np.angle(own.gain[n]))),),
         )
         for n, era in enumerate(table.eras)
+        if isinstance(era, Era)
     )
     known = replace(
         table,

@@ -15,7 +15,8 @@ from model.finger.fingertip import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
-from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
+from model.structure.actuators import Actuator
+from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.transients.base_motion import raised_cosine
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant
@@ -33,7 +34,7 @@ class Rigs:
         self._paper = load_rig(RIG)
         self.reduced = cache(self._reduce)
 
-    def eras(self, count: int) -> tuple[Era, ...]:
+    def eras(self, count: int) -> tuple[Actuator, ...]:
         """The four in the corners and others along the edges."""
         length, width = self._paper.plate.length, self._paper.plate.width
         edge = [(x * length / 4, y * width) for y in (0, 1) for x in (1, 2, 3)]

@@ -12,12 +12,12 @@ from enum import Enum
 from itertools import pairwise
 from textwrap import dedent
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from typing import Literal, get_args, get_origin
 
 from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
-from model.config.sections import Quantity, Section
+from model.config.sections import Quantity, Section, quantities
 
 HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
 
@@ -69,18 +69,6 @@ def in_cell(docstring: str) -> str:
     return text[0].lower() + text[1:] if first.istitle() and "'" not in first else text
 
 
-def quantities(field: FieldInfo) -> list[Quantity]:
-    """Every Quantity that a field's type carries, however deep."""
-
-    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
-        found = [part for part in metadata if isinstance(part, Quantity)]
-        for part in (*get_args(annotation), *getattr(annotation, "__metadata__", ())):
-            found += [part] if isinstance(part, Quantity) else within(part)
-        return found
-
-    return within(field.annotation, field.metadata)
-
-
 def bounds_in_words(asked: Quantity) -> str:
     """Every finite bound of a quantity, in the words of the error."""
     bounds = {
@@ -93,17 +81,20 @@ def bounds_in_words(asked: Quantity) -> str:
 
 
 def _docstrings(of: type) -> dict[str, str]:
-    """What stands below each field of a class, by its name."""
-    (tree,) = ast.parse(dedent(inspect.getsource(of))).body
-    body = tree.body if isinstance(tree, ast.ClassDef) else []
-    return {
-        field.target.id: inspect.cleandoc(str(below.value.value))
-        for field, below in pairwise(body)
-        if isinstance(field, ast.AnnAssign)
-        and isinstance(field.target, ast.Name)
-        and isinstance(below, ast.Expr)
-        and isinstance(below.value, ast.Constant)
-    }
+    """What stands below each field of a class and of sections that it extends, by its name."""
+    classes = [each for each in reversed(of.__mro__) if each is of or issubclass(each, Section)]
+    found = dict[str, str]()
+    for each in classes:
+        (tree,) = ast.parse(dedent(inspect.getsource(each))).body
+        found |= {
+            field.target.id: inspect.cleandoc(str(below.value.value))
+            for field, below in pairwise(tree.body if isinstance(tree, ast.ClassDef) else [])
+            if isinstance(field, ast.AnnAssign)
+            and isinstance(field.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+        }
+    return found
 
 
 def _default(field: FieldInfo, quantity: Quantity | None) -> str:

@@ -239,7 +239,7 @@ def _report(
             row,
             row.of(before),
             float(value),
-            standard_error(before, row, float(value), float(error)) if free else None,
+            standard_error(before, row, float(value), float(error), fit.dampers) if free else None,
             bool(free and bound),
         )
         for row, value, error, free, bound in zip(

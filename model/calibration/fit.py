@@ -133,7 +133,8 @@ class Fit(FitStart):
 
     error (p,): standard errors of the parameters; gains, gains_error (f, e), NaN where unmeasured,
     the latter of magnitudes, phases_error (f, e) [rad]; predicted (f, e, s): with gains and scales;
-    chi2: sum of squares per degree of freedom.
+    chi2: sum of squares per degree of freedom; dampers: what those of all ERAs do to the responses,
+    relative to the plate's own losses.
     """
 
     error: FloatArray
@@ -142,6 +143,7 @@ class Fit(FitStart):
     phases_error: FloatArray
     predicted: ComplexArray
     chi2: float
+    dampers: float
 
 
 def start_at(problem: CalibrationProblem, z: FloatArray) -> FitStart:
@@ -267,7 +269,24 @@ def _result(
         phase,
         gains[:, :, None] * model,
         chi2,
+        _dampers(problem, found.x, root),
     )
+
+
+def _dampers(problem: CalibrationProblem, z: FloatArray, root: FloatArray) -> float:
+    """By how much the loss factor is off, relative, where all dampers are by a share of theirs.
+
+    root (n, k): what is searched by one standard error along each direction.
+    """
+    plate, moved = problem.plate, np.zeros((len(z), root.shape[1]))
+    moved[problem.searched] = root
+    kinds = np.array([each.kind for each in plate.rows])
+    values = plate.values(z) / plate.model.space.scale[plate.numbers]
+    relative = moved[plate.numbers] / np.where(values > 0, values, np.inf)[:, None]
+    dampers = relative[(kinds == "damping") & problem.free]
+    losses = relative[kinds == "loss_factor"][0]
+    slopes = np.linalg.lstsq(dampers @ dampers.T, dampers @ losses)[0]
+    return abs(float(slopes.sum()))
 
 
 def _noise_of(

@@ -24,8 +24,8 @@ _LEAST = 1e-4  # of an uncertainty; no fit is exact
 _HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard errors either side
 
 # Relative error of values by idealisations of the model, of any but the loss factor, and of that:
-# viscous instead of hysteretic damping changes it by 0.15 %, and what form errors leave unexplained
-# widens resonances by 0.4 % (root mean square over plates without noise).
+# what form errors leave unexplained widens resonances by 0.4 % (root mean square over plates
+# without noise).
 _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
 _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
 
@@ -81,19 +81,17 @@ def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
     )
 
 
-def standard_error(rig: Rig, parameter: Parameter, value: float, error: float) -> float:
+def standard_error(
+    rig: Rig, parameter: Parameter, value: float, error: float, dampers: float
+) -> float:
     """Standard error of a value by that of a fit, by the model's, and of the mass it goes by.
 
-    Responses tell the damping of an exciter's suspension and coil together, and that of the coil
-    is known by its force factor.
+    dampers: what they do to the responses relative to what the plate's own losses do, by which an
+    error of the model in the former looks like one of the latter.
     """
     share = math.hypot(_MODEL_ERROR, _mass_scale_error(rig))
-    if parameter.kind == "damping":
-        era = rig.era(parameter.era)
-        electric = era.in_time.damping - era.damping
-        error = math.hypot(error, 2 * electric * rig.uncertainty.stiffness)
     if parameter.kind == "loss_factor":
-        share = _LOSS_ERROR
+        share = math.hypot(_LOSS_ERROR, _MODEL_ERROR * dampers)
     return math.hypot(error, share * value)
 
 
@@ -123,7 +121,10 @@ def uncertainty_of(
     relative = {
         kind: [
             math.hypot(
-                float(error) / one.value, _LOSS_ERROR if kind == "loss_factor" else _MODEL_ERROR
+                float(error) / one.value,
+                math.hypot(_LOSS_ERROR, _MODEL_ERROR * fit.dampers)
+                if kind == "loss_factor"
+                else _MODEL_ERROR,
             )
             for one, error in zip(parameters, errors, strict=True)
             if one.parameter.kind == kind and one.is_identified and one.value > 0

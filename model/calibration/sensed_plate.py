@@ -129,6 +129,8 @@ class SensedPlate:
         """The rig with the fitted values of z."""
         own = np.zeros(len(z))
         own[self.numbers] = z[self.numbers]
+        factor = self.model.space.groups["force_factor"]
+        own[factor] = z[factor]  # with the damping that was found beside it
         values = Values.of(self.rig, self.model.space, own)
         return rig_with(self.rig, values, self.rig.uncertainty)
 

@@ -282,12 +282,22 @@ def materials(as_json: JsonOption = False) -> None:
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """Show material and rigidity of a rig's plate."""
+    """Show material and rigidity of a rig's plate, and what its exciters reach."""
     from model.quantities import in_display_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import FURTHER, plate_summary
 
-    summary = plate_summary(load_rig(rig_file))
+    rig = load_rig(rig_file)
+    summary = plate_summary(rig)
+    if summary["exciters"]:
+        from model.vibration.excursion import excursions_of
+        from model.vibration.reach import reach_of
+
+        summary["reach"] = reach_of(rig).as_json()
+        moved = excursions_of(rig)
+        for each, excursion in zip(summary["exciters"], moved.at_lowest.tolist(), strict=True):
+            each["excursion_at_lowest_m"] = excursion
+        summary["magnets_allow_from_hz"] = moved.allowed
     bare = in_display_unit(summary["mass_kg"], "kg", digits=4)
     rows = [
         f"{rig_file}: {1e3 * summary['length_m']:g} x {1e3 * summary['width_m']:g} mm",
@@ -312,6 +322,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             f"{mass['at_m'][1]:g}) m"
             for mass in summary["point_masses"]
         ),
+        *_exciter_rows(summary["exciters"], summary.get("reach")),
+        *_type_rows(summary["exciter_types"]),
     ]
     print_report(rows, summary, as_json=as_json)
 
@@ -351,6 +363,47 @@ def _air_rows(air: dict[str, Any] | None) -> list[str]:
         return [f"{gap} open"]
     stiffness = f"{air['stiffness_n_m3'] / 1e6:.4g} MN/m³"
     return [f"{gap} sealed", f"        stiffness against even motion  {stiffness}"]
+
+
+def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) -> Iterator[str]:
+    """Each exciter by itself, and from which frequency all of them reach a level."""
+    if reach is None:
+        return
+    lowest = f"{reach['frequencies_hz'][0]:g} Hz"
+    yield f"exciters, with their largest excursion at full level at {lowest}"
+    for each in exciters:
+        allowed = each["excursion_max_m"]
+        of = "" if allowed is None else f" of {1e3 * allowed:.2g}"
+        yield (
+            f"    {each['name']}  magnet {each['magnet']}, {each['magnet_resonance_hz']:.1f} Hz, "
+            f"Q {each['q']:.1f}; {each['force_at_1_w_n']:.2f} N at 1 W, "
+            f"{each['full_level_force_n']:.2f} N at full level, {each['full_level_v']:.3g} V; "
+            f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
+        )
+    level, start = f"{reach['level_db_sl']:g} dB SL", reach["from_hz"]
+    everywhere = "everywhere but 2 cm at the edges, under a finger"
+    yield (
+        f"    {level} {everywhere}: from {start:g} Hz"
+        if start is not None
+        else f"    {level} {everywhere}: at no frequency"
+    )
+    rows = zip(reach["frequencies_hz"], reach["share_of_places"], strict=True)
+    short = [
+        f"{frequency:g} Hz on {100 * (1 - share):.1f} %"
+        for frequency, share in rows
+        if share < 1 and (start is None or frequency > start)
+    ]
+    if short:
+        yield f"    falls short at {', '.join(short)} of the places"
+
+
+def _type_rows(types: dict[str, Any]) -> Iterator[str]:
+    """What is assumed of the types of exciters."""
+    for name, known in types.items():
+        yield f"    {name}: {known['note']}"
+        assumed = [f"{key} {low:g} to {high:g}" for key, (low, high) in known["assumed"].items()]
+        if assumed:
+            yield f"        assumed, measure yours: {', '.join(assumed)}"
 
 
 def _frequency(key: str) -> str:

@@ -15,6 +15,7 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
 
 from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
@@ -88,6 +89,18 @@ class Quantity:
         return {"type": ["number", "string"], "description": description}
 
 
+def quantities(field: FieldInfo) -> list[Quantity]:
+    """Every Quantity that a field's type carries, however deep."""
+
+    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
+        found = [part for part in metadata if isinstance(part, Quantity)]
+        for part in get_args(annotation):
+            found += [part] if isinstance(part, Quantity) else within(part)
+        return found
+
+    return within(field.annotation, field.metadata)
+
+
 class ByKind:
     """Annotation of a union of sections, one of which a mapping's `kind` chooses, or the first."""
 
@@ -96,14 +109,14 @@ class ByKind:
     ) -> CoreSchema:
         sections = get_args(source)
         return core_schema.no_info_plain_validator_function(
-            partial(_validated_by_kind, sections),
-            metadata={"sections": [handler.generate_schema(each) for each in sections]},
+            partial(_validated_by_kind, sections), metadata={"sections": sections}
         )
 
     def __get_pydantic_json_schema__(
         self, schema: Any, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        return {"anyOf": [handler(each) for each in schema["metadata"]["sections"]]}
+        sections = schema["metadata"]["sections"]
+        return {"anyOf": [handler(each.__pydantic_core_schema__) for each in sections]}
 
 
 def _validated_by_kind(sections: Sequence[type[Section]], value: Any) -> Section:

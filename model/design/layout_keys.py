@@ -6,7 +6,9 @@ from typing import Any
 
 from model.arrays import FloatArray
 from model.design.problem import DesignProblem
+from model.rig.actuators import KINDS
 from model.rig.rig import Channel, Rig
+from model.structure.exciter import Exciter
 
 MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
@@ -27,17 +29,21 @@ def layout_keys(
     for name, mount in zip(rig.supports, mounts, strict=True):
         eras[name] = _damped(before[name], mount.damping)
     used = {}
+    like = _damped(before[problem.like.name], problem.like.damping)
+    if problem.stiffness is not None:
+        for key in KINDS[Exciter].instead["stiffness"] if _excites(like) else ():
+            like.pop(key, None)
+        like["stiffness"] = problem.stiffness
     for era in problem.eras(positions):
         if era.name in problem.kept:
             eras[era.name] = _damped(before[era.name], era.damping)
             continue
         channel = next(channels)
         used[channel.amplifier] = True
-        eras[era.name] = _damped(before[problem.like.name], era.damping) | {
+        eras[era.name] = deepcopy(like) | {
             "at": [round(era.x, 6), round(era.y, 6)],
             "amplifier": channel.amplifier,
             "channel": channel.number,
-            **({} if problem.stiffness is None else {"stiffness": problem.stiffness}),
         }
     own = {rig.wiring[name].amplifier for name in problem.kept}
     given = {name: amplifiers[name] for name in amplifiers if name in own or name in used}
@@ -46,9 +52,17 @@ def layout_keys(
 
 
 def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
-    """A copy of an ERA's keys with its damping by itself: a ratio refers to the number of ERAs."""
-    keys = {key: value for key, value in deepcopy(section).items() if key != "damping_ratio"}
+    """A copy of an ERA's keys with its damping by itself: a ratio refers to the number of ERAs.
+
+    And a quality of an exciter to its stiffness.
+    """
+    replaced = KINDS[Exciter].instead["damping"] if _excites(section) else ("damping_ratio",)
+    keys = {key: value for key, value in deepcopy(section).items() if key not in replaced}
     return keys | {"damping": float(f"{damping:.6g}")}
+
+
+def _excites(section: Mapping[str, Any]) -> bool:
+    return section.get("kind") == "exciter"
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:

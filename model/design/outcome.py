@@ -51,7 +51,7 @@ def _row(layout: RankedLayout) -> dict[str, Any]:
     return {
         "layout": layout.name,
         "at_m": {era.name: [era.x, era.y] for era in eras},
-        "stiffness_n_m": eras[-1].stiffness,
+        "stiffness_n_m": eras[-1].in_time.stiffness,
         "supported": layout.found.is_supported,
         "expected_contrast_db": layout.expected_contrast,
         "contrast_db": layout.judged.summary if layout.judged else None,

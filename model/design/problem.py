@@ -23,7 +23,7 @@ from model.design.contacts import ContactRule
 from model.errors import InputError
 from model.rig.layouts import named_layouts
 from model.rig.rig import Rig
-from model.structure.attachments import Era
+from model.structure.actuators import Actuator
 from model.structure.support import rigid_body_frequencies, static_loads
 from model.table.table import default_drive_frequencies
 
@@ -36,7 +36,7 @@ MIN_SUPPORTING = 3
 _ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
 
 
-def shortfall(rig: Rig, eras: Sequence[Era], *, lowest: float) -> float:
+def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
     """How far ERAs are from supporting a rig's plate, 0 if they do.
 
     lowest [Hz]: least rigid-body frequency. No mount may be pulled upwards by the plate's weight,
@@ -108,11 +108,11 @@ class DesignProblem:
         return np.array([[era.x, era.y] for era in self.rig.eras])
 
     @property
-    def like(self) -> Era:
+    def like(self) -> Actuator:
         """The rig's ERA like which those are that do not stay."""
         return next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
 
-    def eras(self, positions: FloatArray) -> tuple[Era, ...]:
+    def eras(self, positions: FloatArray) -> tuple[Actuator, ...]:
         """ERAs at positions [m] (n, 2): those kept, and more like the first of the others.
 
         Named E1, E2, ... by names that no kept ERA has.

@@ -27,7 +27,7 @@ from model.progress import Progress, unseen
 from model.rig.file import rig_of
 from model.rig.from_keys import stated
 from model.rig.rig import Rig
-from model.structure.attachments import Era
+from model.structure.actuators import Actuator
 from model.structure.support import support_problem
 from model.table.build import build_table
 from model.table.table import LocalizationTable
@@ -148,7 +148,7 @@ class RankedLayout:
         return self.answers.mean_db
 
     @property
-    def eras(self) -> tuple[Era, ...]:
+    def eras(self) -> tuple[Actuator, ...]:
         """Its ERAs, without wiring."""
         return self.problem.eras(self.found.positions)
 

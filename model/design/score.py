@@ -34,7 +34,8 @@ from model.finger.grid import Grid
 from model.finger.perception import STRONG_DB_SL, detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.attachments import Era, coupled_forces
+from model.structure.actuators import Actuator
+from model.structure.attachments import coupled_forces
 
 LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""
@@ -77,7 +78,7 @@ class Scorer:
         frequencies: FloatArray,
         sets: Sequence[FloatArray],
         *,
-        eras: Sequence[Era],
+        eras: Sequence[Actuator],
         contents: int = 1,
     ) -> None:
         self._rig = rig

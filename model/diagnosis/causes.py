@@ -23,7 +23,7 @@ from model.errors import InputError
 from model.identification.parameters import VALUE_UNITS
 from model.rig.rig import Rig
 from model.spectral.mesh import stretched
-from model.structure.attachments import Era
+from model.structure.actuators import Actuator
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -82,15 +82,14 @@ class Cause:
             ),
         )
 
-    def _is_of(self, era: Era) -> bool:
+    def _is_of(self, era: Actuator) -> bool:
         return self.era in ("", era.name)
 
-    def _changed(self, era: Era, factor: float, plate_mass: float) -> Era:
+    def _changed(self, era: Actuator, factor: float, plate_mass: float) -> Actuator:
         if self.what == "bolt_mass":
-            return replace(era, bolt_mass=era.bolt_mass + factor * plate_mass)
-        # One that is loose damps less, too.
-        damping = era.damping * min(factor, 1.0) if self.era else era.damping
-        return replace(era, stiffness=era.stiffness * factor, damping=damping)
+            field = era.fields[self.what]
+            return replace(era, **{field: getattr(era, field) + factor * plate_mass})
+        return era.loosened(factor) if self.era else era.varied(stiffness=factor)
 
 
 @dataclass(frozen=True, eq=False)

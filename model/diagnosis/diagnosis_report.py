@@ -15,6 +15,7 @@ from model.study.verify import MIN_KEPT_SHARE
 
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
+    "loose": "press it on or glue it anew, and measure again",
     "weak": "check its voltage and mounting, or measure its gain with `era calibrate`",
     "strong": "lower its voltage, or correct its stroke in the rig",
     "other ERA": "correct the plug, or the rig's channels",
@@ -52,7 +53,8 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
         rows.append("all of them: check mounting of sensors and sign convention of phases")
     rows += [f"SENSOR {each.name} {each.why}: left out" for each in verdict.bad_sensors]
-    if not verdict.plate_matches:
+    is_loose = any("loose" in channel.states for channel in verdict.channels)
+    if not verdict.plate_matches and not is_loose:
         rows += _plate_rows(verdict)
     elif verdict.match is not None and verdict.match.outliers.any():
         by_sensor = verdict.match.outliers.sum(axis=(0, 1))
@@ -269,6 +271,11 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
                 f"WRONG ERA: {wiring} drives ERA {channel.drives} instead of {channel.era} (MAC "
                 f"{channel.mac_found:.3f}, with its own ERA {channel.mac_own:.3f}; "
                 f"confidence {channel.confidence:.3f}): {remedy}"
+            )
+        case "loose":
+            return (
+                f"LOOSE: {wiring} acts on the plate with a part of its contact only, as an exciter "
+                f"whose glue is off: {remedy}"
             )
         case "inverted":
             return f"INVERTED: {wiring} has the opposite sign of the others: {remedy}"

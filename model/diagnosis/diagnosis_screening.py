@@ -17,6 +17,7 @@ _FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
 _NO_SHAPE = 0.6  # MAC
 _SENSOR_SCALE = (0.7, 1.4)
 _MUTE = 0.1  # of the others' scale
+_UPSIDE_DOWN = -0.5
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class BadSensor:
     @property
     def why(self) -> str:
         """What is wrong with it."""
+        if self.scale < _UPSIDE_DOWN:
+            return f"is upside down (reads {self.scale:.2f} of what the others say): turn it over"
         return f"reads {self.scale:.2f} of what the others say" if self.scale else "reads nothing"
 
 

@@ -1,5 +1,6 @@
 """Diagnosis of a rig's plate and channels by measured responses."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
 from model.calibration.sensed_plate import SensedPlate, sensed_plate
-from model.choice import best_by
+from model.choice import best_by, best_of
 from model.diagnosis.assignment import (
     ChannelPhase,
     ShapeMatch,
@@ -36,11 +37,18 @@ from model.diagnosis.plate_match import (
 )
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
+from model.structure.attachments import Era
 
 MISSED_DB = 1.0
 """By which half of a table's answers may miss their promises [dB]."""
 
-WEAK, STRONG = 0.8, 1.25  # gain of a channel: 2 dB either way, four times what a drive varies
+STRONG = 1.25
+"""Gain of a channel: 2 dB either way, four times what a drive varies."""
+
+_GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
+LOOSE = 0.7
+"""Share of its own stiffness below which an exciter that explains a plate is loose."""
+
 _LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
@@ -50,7 +58,15 @@ Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, Responses], None]
 """Of responses at usable sensors, by the plate there and what its shapes are most like."""
 
 ChannelState: TypeAlias = Literal[
-    "well", "dead", "weak", "strong", "other ERA", "inverted", "out of phase", "not driven"
+    "well",
+    "dead",
+    "loose",
+    "weak",
+    "strong",
+    "other ERA",
+    "inverted",
+    "out of phase",
+    "not driven",
 ]
 
 
@@ -223,6 +239,8 @@ def diagnose(
         )
         for number in range(len(rig.eras))
     )
+    if not matches:
+        channels = tuple(_loose(each, rig, match, explanations) for each in channels)
     return Verdict(
         channels,
         matches,
@@ -285,9 +303,13 @@ def _channel(
     )
     if driven != number:
         states.append("other ERA")
-    if gain < WEAK:
+    known = rig.uncertainty
+    # No response tells a force factor from a gain.
+    varies = 0.0 if isinstance(era, Era) else known.stiffness
+    strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
+    if gain < 1 / strong:
         states.append("weak")
-    elif gain > STRONG:
+    elif gain > strong:
         states.append("strong")
     if phase.sign < 0:
         states.append("inverted")
@@ -307,6 +329,26 @@ def _channel(
         float(mac[driven]),
         confidence,
     )
+
+
+def _loose(
+    channel: ChannelVerdict, rig: Rig, match: Match, explanations: Sequence[Explanation]
+) -> ChannelVerdict:
+    """The same, loose where its exciter is what is farthest off, or the likeliest explanation.
+
+    And acts with less than it would.
+    """
+    drives = channel.drives
+    if drives is None or isinstance(rig.era(drives), Era):
+        return channel
+    shares = [each.value / each.expected for each in explanations[:1] if each.cause.era == drives]
+    if match.plate.rows[best_of(np.abs(match.z))].era == drives:
+        acts = [row for row in match.plate.rows if row.era == drives and row.is_factor]
+        shares += [row.of(match.rig) / row.of(rig) for row in acts]
+    if min(shares, default=1.0) > LOOSE:
+        return channel
+    states = ("loose", *(each for each in channel.states if each not in ("well", "weak")))
+    return replace(channel, states=states)
 
 
 def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:

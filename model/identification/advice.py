@@ -17,6 +17,9 @@ UNKNOWN = 0.5
 Of that of a plate that was not measured, where the rig states less: answers need no more.
 """
 
+SUSPENSION_FELT = 120.0
+"""Hz; above it fields change by less than 5 % with a suspension that is 20 % off."""
+
 _STEP = 20.0  # Hz between the tones that are considered
 _NOISE = 0.01
 _SHARES = (0.13, 0.5, 0.87)  # of the sides, where further sensors are considered
@@ -53,6 +56,9 @@ def unknowns(setting: Setting, fitted: FittedModel, posterior: Posterior) -> lis
     for kind, rows in relevant(space).items():
         before, after = prior.std_of(rows), posterior.std_of(rows)
         unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * built.std_of(rows)))
+        if kind == "stiffness" and setting.measurement.frequencies[0] > SUSPENSION_FELT:
+            excites = ["force_factor" in era.fields for era in setting.rig.eras]
+            unknown = unknown[~np.array(excites)[unknown]]
         # Of losses and frequencies of single modes only those count that no tone has shown.
         if not len(unknown) or (kind in ("frequency", "loss") and len(unknown) < len(rows)):
             continue

@@ -2,8 +2,8 @@
 
 With L = 1 - T Z, changes dA of the free receptance and dZ of what is attached change the receptance
 T of the plate on its attachments by L dA L^T - T dZ T: a mode, a place or an attachment by a rank
-of one or two (`model.identification.forward`). A sensor of mass m that is on the plate while it measures
-sees l dT_sj + l² w² m T_sj dT_ss.
+of one or two (`model.identification.forward`). A sensor of mass m that is on the plate while it
+measures sees l dT_sj + l² w² m T_sj dT_ss.
 """
 
 from collections.abc import Callable
@@ -238,7 +238,7 @@ def _held(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:
 def _outer(plate: PlateAt, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
     """Responses of T = factor u v^T, (f, s, n, m), of columns (f, a, m) and factors (f, m)."""
     left = u[:, plate.model.observed] * factor[:, None]
-    return _responses(plate, left[:, :, None] * v[:, None, _pushed(plate)])
+    return _responses(plate, np.asarray(left[:, :, None] * v[:, None, _pushed(plate)]))
 
 
 def _pushed(plate: PlateAt) -> slice | IntArray:
@@ -249,7 +249,7 @@ def _pushed(plate: PlateAt) -> slice | IntArray:
     return np.concatenate([np.arange(n), plate.model.observed])
 
 
-def _responses(plate: PlateAt, change: ComplexArray) -> ComplexArray:
+def _responses(plate: PlateAt, change: AnyArray) -> ComplexArray:
     """Change of the responses (f, s, n, ...) by one of T (f, s, columns of `_pushed`, ...)."""
     further = (1,) * (change.ndim - 3)
     n, at = plate.force.shape[1], np.arange(change.shape[1])

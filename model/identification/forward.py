@@ -237,12 +237,12 @@ class PlateAt:
     values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
     by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
     factor, and of all that a mode loses; eta (f,): loss factor; modulus: relative to that solved;
-    further (f, r, r): stiffness between modes beside all else [rad²/s²], None for none; bending (f, r, r), added (r, r): stiffness and mass
-    between modes by form errors; sources: the ERAs; force (f, n): of each on a plate that is held,
-    per unit of its drive; stiffness (f, a): of what is attached; free_receptance A, receptance T, of the plate
-    with its attachments, and left factor L (f, a, a); moved (f, r, a): coordinates of the free
-    plate by a force at each; finger_slopes: by finger, derivatives of its dynamic stiffness by its
-    parts (f, 4).
+    further (f, r, r): stiffness between modes beside all else [rad²/s²], None for none; bending
+    (f, r, r), added (r, r): stiffness and mass between modes by form errors; sources: the ERAs;
+    force (f, n): of each on a plate that is held, per unit of its drive; stiffness (f, a): of what
+    is attached; free_receptance A, receptance T, of the plate with its attachments, and left factor
+    L (f, a, a); moved (f, r, a): coordinates of the free plate by a force at each; finger_slopes:
+    by finger, derivatives of its dynamic stiffness by its parts (f, 4).
     """
 
     def __init__(
@@ -342,7 +342,9 @@ class PlateAt:
     def lightness(self) -> ComplexArray | None:
         """Motion of the plate at each sensor relative to one without its mass, None where 1."""
         inertia, at = self.model.sensor_inertia, self.model.observed
-        return None if inertia is None else 1 / (1 - inertia * self.receptance[:, at, at])
+        if inertia is None:
+            return None
+        return np.asarray(1 / (1 - inertia * self.receptance[:, at, at]))
 
     @cached_property
     def responses(self) -> ComplexArray:

@@ -324,6 +324,8 @@ def space_of(
 def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:
     """Parameters of a rig of data sheets: its plate's modulus and losses, its ERAs and their gains.
 
+    A force factor damps as the suspension of its exciter does, and no response tells them apart.
+
     form_modes: also form errors, with so many modes that shift; None for none. All else is known.
     """
     plate, count, has_form = rig.plate, len(rig.eras), form_modes is not None
@@ -354,18 +356,19 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
     }
     # Places may leave the plate, whose shapes go on by their slopes.
     form = (*FORM, "place", "mode_shifts") if has_form else ()
-    excites = np.array(["magnet_mass" in era.fields for era in rig.eras])
-    magnet = ("magnet_mass",) if excites.any() else ()
+    excites = np.array(["force_factor" in era.fields for era in rig.eras])
+    of_exciters = EXCITER_KINDS if excites.any() else ()
     columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
-    for name in ("modulus", "stiffness", "gain", *magnet, *added, *form):
+    for name in ("modulus", "stiffness", "gain", *of_exciters, *added, *form):
         kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
-        std = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
+        own = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
+        std = np.maximum(own, rig.uncertainty.stiffness * (name in ("stiffness", *of_exciters)))
         lower = -value if name in added else -kind.bound
         upper = np.maximum(kind.bound * unit - value, value)
         columns[:, space.groups[name]] = np.array(
             np.broadcast_arrays(std, lower / std, upper / std)
         ).reshape(3, -1)
-    for name in magnet:
+    for name in of_exciters:
         columns[0, space.groups[name]] *= excites
     return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 

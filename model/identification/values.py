@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -10,7 +10,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.identification.parameters import Space
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import Gain, PointLoad, Source
+from model.structure.actuators import Actuator
+from model.structure.attachments import Gain, PointLoad
 from model.structure.plate import LOSS_FREQUENCY, Plate
 
 _LEAST_MASS = 1e-5  # kg; less is none
@@ -105,9 +106,9 @@ class Values:
             loss_law=float(own("loss_law").sum()),
         )
 
-    def sources(self, rig: Rig) -> list[Source]:
+    def sources(self, rig: Rig) -> tuple[Actuator, ...]:
         """The rig's ERAs with their values, where the rig has them and without gains."""
-        found = []
+        found: list[Actuator] = []
         for number, era in enumerate(rig.eras):
             new = {
                 "stiffness": self.stiffness[number],
@@ -116,9 +117,9 @@ class Values:
             }
             for kind in era.fields.keys() - new:
                 new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
-            fields = {era.fields[kind]: float(value) for kind, value in new.items()}
+            fields: dict[str, Any] = {era.fields[kind]: float(value) for kind, value in new.items()}
             found.append(replace(era, gains=(), **fields))
-        return found
+        return tuple(found)
 
     def lag(self, frequencies: FloatArray) -> ComplexArray:
         """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).

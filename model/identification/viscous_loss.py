@@ -1,11 +1,10 @@
 """What changes in a plate's responses where its losses are viscous, not hysteretic.
 
-A loss factor that is the same at every frequency, (1 + i eta) K, is not causal; a real plate's grows
-or falls between its resonances. The other extreme loses in each mode j of the plate on its supports
-as the loss factor does at its own resonance, but in proportion to frequency, eta omega / omega_j.
-Both agree at the resonances alone, and most tones are beside them: a fit of a wrong law finds a loss
-factor that is off by more than noise and form errors make it. What lies between them is a form error
-of its own, of which a fit finds the share.
+A loss factor that is the same at every frequency, (1 + i eta) K, is not causal. The other extreme
+loses in each mode j of the plate on its supports as the loss factor does at its own resonance, but
+in proportion to frequency, eta omega / omega_j. Both agree at the resonances alone, and most tones
+are beside them: a fit of the wrong law finds a loss factor that is off by more than noise and form
+errors make it. What lies between them is a form error of its own, of which a fit finds the share.
 """
 
 import numpy as np
@@ -26,7 +25,7 @@ def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
     own, viscous = _lossy(plate), _viscous(plate)
     change = 1j * plate.eta[:, None, None] * (model.omega[:, None, None] * viscous - own)
     columns = plate.force.shape[1]
-    other = PlateAt(model, x, change)
+    other = PlateAt(model, x, np.asarray(change))
     return np.asarray((other.receptance - plate.receptance)[:, model.observed, :columns])
 
 
@@ -37,7 +36,7 @@ def _lossy(plate: PlateAt) -> FloatArray:
 
 
 def _viscous(plate: PlateAt) -> FloatArray:
-    """Damping (r, r) [rad/s] by a loss factor of 1: that of each supported mode at its resonance."""
+    """Damping (r, r) [rad/s] by a loss factor of 1 of each supported mode at its resonance."""
     values, model, shapes = plate.values, plate.model, plate.located.shapes
     rig, h = model.rig, plate.functions.thickness
     springs = [each.in_time.stiffness for each in plate.sources]

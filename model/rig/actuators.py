@@ -54,7 +54,7 @@ KINDS: Mapping[type[Actuator], ActuatorKind] = {
         keys=_SUSPENSION
         | {"magnet_mass": "weight", "coil_mass": "coil_mass", "force_factor": "force_factor"}
         | _GAINS,
-        restated=(),
+        restated=("stiffness", "damping"),
         instead={"stiffness": ("resonance", "resonance_is"), "damping": ("q",)},
     ),
 }

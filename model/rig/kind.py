@@ -19,11 +19,13 @@ from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.rig.era_section import STIFF_MOUNT
+from model.rig.exciter_checks import exciter_notes, excursion_problems
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
 from model.structure.attachments import Source
+from model.structure.exciter import Exciter
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -41,16 +43,18 @@ def _check(document: Document) -> CheckedFile:
     except ConfigError as error:
         problems += error.problems
     wrong, warnings = check_amplifiers(document, rig)
-    support = None if rig is None else support_problem(rig.plate, rig.eras, loads=rig.masses)
-    if support is not None:
-        problems.append(document.problem(("eras",), support))
+    if rig is not None:
+        support = support_problem(rig.plate, rig.eras, loads=rig.masses)
+        problems += [] if support is None else [document.problem(("eras",), support)]
+        problems += excursion_problems(document, rig)
     known = {problem.key for problem in problems}
     problems += [problem for problem in wrong if problem.key not in known]
     if rig is None or problems:
         raise ConfigError(document.source, problems)
     note = rig.uncertainty.note
     line, lost, more = clock_costs(rig, _urls(document))
-    costs = [*lost, *gain_notes(rig), *_air_costs(rig), *_layer_costs(rig), *_point_costs(rig)]
+    costs = [*lost, *gain_notes(rig), *exciter_notes(document, rig), *_air_costs(rig)]
+    costs += [*_layer_costs(rig), *_point_costs(rig)]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
@@ -147,9 +151,12 @@ def gain_notes(rig: Rig) -> list[str]:
 
 def _notes(era: Source, low: float, high: float) -> list[str]:
     if not era.gains:
+        guessed = "motion is a guess, a stroke"
+        if isinstance(era, Exciter):
+            guessed = f"voltage is a guess, {era.voltage:.3g} V"
         return [
-            f"eras.{era.name}.gains: missing behind an output, so that its motion is a guess, a "
-            "stroke by full level at every frequency; measure the plate and calibrate the rig"
+            f"eras.{era.name}.gains: missing behind an output, so that its {guessed} by full level "
+            "at every frequency; measure the plate and calibrate the rig"
         ]
     played = [each for each in pairwise(era.gains) if each[0][0] < high and each[1][0] > low]
     turns = {

@@ -4,6 +4,8 @@ import math
 from typing import Any
 
 from model.config.sections import Quantity
+from model.rig.exciter_checks import exciters_of
+from model.rig.exciter_summary import summary_of, types_of
 from model.rig.rig import Rig
 from model.rig.sections import PlateSection
 from model.structure.laminate_section import (
@@ -54,6 +56,8 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
         ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
+        "exciters": [summary_of(one) for one in exciters_of(rig)],
+        "exciter_types": types_of(rig),
     }
 
 

@@ -124,7 +124,8 @@ def _numbers(rig: Rig) -> Iterator[tuple[float, float]]:
                     yield from ((size, 0.0), (math.cos(phase), _SAME), (math.sin(phase), _SAME))
             case _:
                 yield value, 0.0
-    for mass in rig.masses:
+    # A file's own masses come before its supports, and those that were found after both.
+    for mass in sorted(rig.masses, key=lambda each: (each.stiffness, round(each.x, 5), each.y)):
         yield from ((mass.x, _SAME_PLACE), (mass.y, _SAME_PLACE), (mass.mass, 0.0))
 
 

@@ -124,6 +124,9 @@ class Source(Support, Protocol):
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """The source with another stiffness and damping, by factors."""
 
+    def loosened(self, share: float) -> Self:
+        """The source where it is held by a share of its contact."""
+
     @property
     def fields(self) -> Mapping[str, str]:
         """Its fields that an identification may change, by the kind of parameter."""
@@ -171,6 +174,9 @@ class Era(MeasuredGains):
 
     LEARNED: ClassVar = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
     """Fields that measurements of a plate change."""
+
+    UNIT: ClassVar = "m"
+    """Of its drive."""
 
     name: str
     x: float
@@ -240,6 +246,10 @@ class Era(MeasuredGains):
         """An ERA that is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
 
+    def loosened(self, share: float) -> Self:
+        """An ERA with a share of its stiffness, which damps less, too."""
+        return self.varied(stiffness=share, damping=min(share, 1.0))
+
     @property
     def fields(self) -> Mapping[str, str]:
         """Its spring, damper and bolt."""
@@ -250,7 +260,8 @@ class Era(MeasuredGains):
         w, base = np.asarray(omega), self.base(omega)
         held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
         bolt = -(w**2) + 0j, np.zeros(w.shape, dtype=complex)
-        return {kind: (own, own * base) for kind, own in held.items()} | {"bolt_mass": bolt}
+        found = {kind: (np.asarray(own), np.asarray(own * base)) for kind, own in held.items()}
+        return found | {"bolt_mass": bolt}
 
 
 def damping_from_ratio(

@@ -45,6 +45,9 @@ class Exciter(MeasuredGains):
     )
     """Fields that measurements of a plate change."""
 
+    UNIT: ClassVar = "V"
+    """Of its drive."""
+
     name: str
     x: float
     y: float
@@ -150,15 +153,36 @@ class Exciter(MeasuredGains):
         w = np.asarray(omega)
         return np.asarray(self._share(w) ** 2 * 1j * w * self.damping)
 
-    def excursion_at(self, omega: FloatArray) -> FloatArray:
-        """Amplitude of the coil in the magnet at full level on a plate that is held [m]."""
-        w = np.asarray(omega)
-        own = -self._spring(w) if self.held else w**2 * self.magnet_mass - self._spring(w)
-        return np.abs(self._pull(w) / own)
+    @property
+    def quality(self) -> float:
+        """Q = sqrt(k M) / (c + Bl² / R) of the magnet on the coil that is held, driven."""
+        return math.sqrt(self.stiffness * self.magnet_mass) / self.in_time.damping
+
+    @property
+    def largest_force(self) -> float:
+        """Force Bl V / R [N] at full level well above the resonance of the magnet, without L."""
+        return self.in_time.by_drive * self.voltage
+
+    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
+        """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
+        share = self._share(np.asarray(omega))
+        return np.asarray(share.reshape(-1, *[1] * (moved.ndim - 1)) * moved)
 
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An exciter whose suspension is stiffer and damps more by factors."""
         return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    def loosened(self, share: float) -> Self:
+        """An exciter that acts with a share of its dynamic stiffness, by its glue, and less force.
+
+        The force falls by the root of the share, and by as much again in a gain.
+        """
+        return replace(
+            self.varied(stiffness=share, damping=share),
+            magnet_mass=share * self.magnet_mass,
+            coil_mass=share * self.coil_mass,
+            force_factor=math.sqrt(share) * self.force_factor,
+        )
 
     @property
     def fields(self) -> Mapping[str, str]:
@@ -174,12 +198,17 @@ class Exciter(MeasuredGains):
         w, share, force = np.asarray(omega), self._share(omega), self.force(omega)
         base, still = self.base(w), 1 - share
         electric = 2j * w * self.force_factor**2 / self._impedance(w)
-        changes = {"stiffness": self.stiffness, "damping": 1j * w, "force_factor": electric}
-        found = {kind: (share**2 * dS, share**2 * dS * base) for kind, dS in changes.items()}
-        by_factor, of_force = found["force_factor"]
-        return found | {
+
+        def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
+            found = share**2 * change
+            return np.asarray(found), np.asarray(found * base)
+
+        by_factor, of_force = by_spring(electric)
+        return {
+            "stiffness": by_spring(self.stiffness),
+            "damping": by_spring(np.asarray(1j * w)),
             "force_factor": (by_factor, of_force + force),
-            "magnet_mass": (self._spring(w) * share * still, force * still),
+            "magnet_mass": (np.asarray(self._spring(w) * share * still), np.asarray(force * still)),
             "bolt_mass": (-(w**2) + 0j, np.zeros(w.shape, dtype=complex)),
         }
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from model.answer.plan import query
 from model.arrays import Complex64Array
-from model.config.sections import Quantity, Section
+from model.config.sections import Section, quantities
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
@@ -126,7 +126,7 @@ def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
 
 
 _SECTIONS: tuple[type[Section], ...] = (
-    *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection),
+    *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection, FingertipSection),
     *(kind.section for kind in KINDS.values()),
 )
 _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
@@ -138,10 +138,9 @@ def _physics(table: LocalizationTable) -> dict[str, Any]:
     """All that a table must have of its rig, numbers with the units of the rig's file."""
     by_unit = {
         key: each.dimension.key(key)
-        for section in (*_SECTIONS, FingertipSection)
+        for section in _SECTIONS
         for key, field in section.model_fields.items()
-        for each in field.metadata
-        if isinstance(each, Quantity)
+        for each in quantities(field)
     } | _NAMES
     return {
         name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)

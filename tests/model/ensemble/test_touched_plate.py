@@ -18,6 +18,7 @@ from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
+from model.structure.exciter import Exciter
 from paper_plate import LENGTH, WIDTH
 from paper_table import smooth_rig
 
@@ -40,6 +41,20 @@ UNEQUAL = replace(
         for number, era in enumerate(RIG.eras)
     ),
 )
+MIXED = replace(
+    RIG,
+    eras=(
+        RIG.eras[0],
+        Exciter(
+            *("SE", RIG.eras[1].x, RIG.eras[1].y),
+            **{"stiffness": 4769.0, "damping": 0.83, "magnet_mass": 0.0335, "coil_mass": 1.29e-3},
+            **{"force_factor": 1.54, "resistance": 3.6, "voltage": 20.0, "inductance": 7e-5},
+            gains=((60.0, 0.9, 0.02), (430.0, 1.0, -0.4)),
+        ),
+        *RIG.eras[2:],
+    ),
+)
+"""With an exciter in place of an ERA, driven to as much at 60 Hz, its resonance."""
 POINTS = PLACES[:, None] + FINGERTIP_RADIUS * FIVE_POINTS.points
 
 
@@ -88,6 +103,7 @@ def changed(touched, points, weights, *, node=MODELLED):
 @cache
 def directly(
     *,
+    with_exciter=False,
     thickness=1.0,
     modulus=1.0,
     loss=1.0,
@@ -100,38 +116,40 @@ def directly(
 
     pressed: on pulp and contact mass of each finger; load: on all of it.
     """
+    rig = MIXED if with_exciter else RIG
     plate = replace(
-        RIG.plate.scaled(modulus=modulus),
-        thickness=thickness * RIG.plate.thickness,
-        loss_factor=loss * RIG.plate.loss_factor,
+        rig.plate.scaled(modulus=modulus),
+        thickness=thickness * rig.plate.thickness,
+        loss_factor=loss * rig.plate.loss_factor,
     )
     eras = [
-        replace(era, stiffness=k * era.stiffness, damping=damping * era.damping)
-        for era, k in zip(RIG.eras, stiffness, strict=True)
+        era.varied(stiffness=k, damping=damping) for era, k in zip(rig.eras, stiffness, strict=True)
     ]
     fingers = [
-        FingertipLoad(*place, RIG.fingertip.scaled(more).multiplied(factor))
+        FingertipLoad(*place, rig.fingertip.scaled(more).multiplied(factor))
         for place, more, factor in zip(PLACES, pressed, load, strict=True)
     ]
     return direct_acceleration(
-        assemble(plate, RIG.mesh),
+        assemble(plate, rig.mesh),
         eras,
         FREQUENCIES,
         POINTS.reshape(-1, 2),
-        loads=[*RIG.masses, *fingers],
+        loads=[*rig.masses, *fingers],
     )
 
 
 @pytest.mark.usefixtures("kernels_or_numpy")
-@pytest.mark.parametrize("loads", [(), (0.4, 1.0, 2.5)])
-def test_fields_are_those_of_the_direct_solve(loads):
+@pytest.mark.parametrize(
+    ("rig", "loads"), [(RIG, ()), (RIG, (0.4, 1.0, 2.5)), (MIXED, ())], ids=["like", "", "exciter"]
+)
+def test_fields_are_those_of_the_direct_solve(rig, loads):
     """At every finger's points, with an ERA's drive and a mass on the plate: to 1e-4.
 
     Whether all fingers press alike or not.
     """
-    _, contacts, _ = solved(Uncertainty(), loads)
+    _, contacts, _ = solved(Uncertainty(), loads, rig=rig)
     found = contacts.fields.transpose(0, 3, 1, 2).reshape(4, 4, 15)
-    exact = directly(pressed=loads or (1, 1, 1))
+    exact = directly(with_exciter=rig is MIXED, pressed=loads or (1, 1, 1))
     error = np.abs(found - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
     assert error.max() < 2e-4
 
@@ -183,14 +201,18 @@ def test_thickness_is_exact_at_its_nodes(modulus):
     assert np.abs(found[0] + found[4] - 2 * nominal).max() > 0.1 * size
 
 
+@pytest.mark.parametrize("rig", [RIG, MIXED], ids=["", "exciter"])
 @pytest.mark.parametrize("what", CHANGES)
-def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(what):
+def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(what, rig):
     """Of a plate 3 % thicker, by central differences: within 1 % of the largest change."""
-    touched, _, points = solved(Uncertainty(0, 0, 0.02, 1.0, math.e, 1.0))
+    touched, _, points = solved(Uncertainty(0, 0, 0.02, 1.0, math.e, 1.0), rig=rig)
     node = touched.on.first[5] + 4
     found = changed(touched, points, np.tile(WEIGHTS, (4, 1)), node=node)[what]
     thickness = 1 + 0.02 * float(thickness_nodes(5)[4])
-    more, less = (directly(thickness=thickness, **CHANGES[what](d)) for d in (1e-3, -1e-3))
+    more, less = (
+        directly(with_exciter=rig is MIXED, thickness=thickness, **CHANGES[what](d))
+        for d in (1e-3, -1e-3)
+    )
     exact = np.einsum("e,fep->fp", WEIGHTS, (more - less) / 2e-3)
     error = np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)
     assert error.max() < 0.01
@@ -238,15 +260,15 @@ def test_expected_power_is_the_mean_square_of_the_draws():
     np.testing.assert_allclose(found, powers @ FIVE_POINTS.weights, rtol=0.05)
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("rig", "count"), [(UNEQUAL, 1), (UNEQUAL, 3), (MIXED, 3)])
 @pytest.mark.usefixtures("kernels_or_numpy")
-def test_every_stage_is_that_of_numpy(count):
+def test_every_stage_is_that_of_numpy(rig, count):
     """Fields, forms and what drawn plates feel, in single precision: to 1e-4 of the largest.
 
     ERAs differ in stiffness, stroke and gain, so that none takes the place of another.
     """
     loads = (0.4, 1.0, 2.5)[:count]
-    touched, _, points = solved(Uncertainty(), loads, rig=UNEQUAL, count=count)
+    touched, _, points = solved(Uncertainty(), loads, rig=rig, count=count)
     by_numpy = TouchedPlate(touched.on, touched.centres, touched.stiffness)
     weights = np.tile(WEIGHTS, (4, 1))
     few, shares = points.reshape(count, 5, -1), np.tile(FIVE_POINTS.weights, (count, 1))

@@ -8,6 +8,7 @@ import model
 import rig_page
 from model.config.sections import Section
 from model.rig import sections
+from model.rig.actuators import KINDS
 from model.rig.file import load_rig
 from model.structure.materials import KNOWN_MATERIALS
 
@@ -18,6 +19,7 @@ PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")
 def test_tables_of_keys_are_those_of_the_sections() -> None:
     """Of every section; unit, default, limits and meaning of a key."""
     every = {each for _, each in inspect.getmembers(sections, inspect.isclass)}
+    every |= {kind.section for kind in KINDS.values()}
     assert {each for each in every if issubclass(each, Section)} - {Section} == {
         *rig_page.SECTIONS.values()
     }

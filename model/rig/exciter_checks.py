@@ -1,0 +1,85 @@
+"""What the exciters of a rig can follow: from which frequency on, and what its file may mean."""
+
+import math
+from dataclasses import dataclass
+from pkgutil import resolve_name
+
+import numpy as np
+
+from model.arrays import FloatArray
+from model.config.document import ConfigProblem, Document
+from model.rig.exciter_section import ExciterSection, misread_resonance
+from model.rig.rig import Rig
+from model.structure.exciter import Exciter
+
+_EXCURSIONS = "model.vibration.excursion:excursions_of"
+"""By name: it solves plates, which the packages above this one do."""
+
+_ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
+
+
+@dataclass(frozen=True, eq=False)
+class Excursions:
+    """Excursions [m] of each exciter at the rig's level, (n,).
+
+    at_lowest, largest: at its lowest frequency, and within all that it allows; passed (n,): whether
+    they are more than they may be; allowed: the lowest frequency [Hz] from which all stay within up
+    to the highest, infinite where they do not there.
+    """
+
+    at_lowest: FloatArray
+    largest: FloatArray
+    passed: FloatArray
+    allowed: float
+
+
+def exciters_of(rig: Rig) -> list[Exciter]:
+    """The exciters among its actuators."""
+    return [era for era in rig.eras if isinstance(era, Exciter)]
+
+
+def excursion_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
+    """A problem where magnets pass their excursion within the rig's frequencies."""
+    exciters, limits = exciters_of(rig), rig.limits
+    if not exciters:
+        return []
+    found: Excursions = resolve_name(_EXCURSIONS)(rig)
+    if not found.passed.any():
+        return []
+    shares = found.largest / [one.excursion for one in exciters]
+    worst = int(shares.argmax())
+    names = ", ".join(
+        one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far
+    )
+    lowest = f"{found.allowed:g} Hz is the lowest; or" if np.isfinite(found.allowed) else ""
+    return [
+        document.problem(
+            ("limits", "frequency"),
+            f"must start where the magnets of {names} stay within their excursion at limits.level "
+            f"{limits.level:g}, got {limits.frequency_min:g} Hz, from where that of "
+            f"{exciters[worst].name} moves by up to {1e3 * found.largest[worst]:.2g} mm of "
+            f"{1e3 * exciters[worst].excursion:.2g} mm; {lowest} take a level of at most "
+            f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g}",
+        )
+    ]
+
+
+def exciter_notes(document: Document, rig: Rig) -> list[str]:
+    """Warnings: frequencies near the resonance of a magnet, and resonances that may be misread."""
+    low = rig.limits.frequency_min
+    free = [one for one in exciters_of(rig) if not one.held]
+    near = [one for one in free if low < _ABOVE * one.magnet_frequency]
+    notes = []
+    if near:
+        highest = max(one.magnet_frequency for one in near)
+        notes.append(
+            f"limits.frequency: starts at {low:g} Hz, below {_ABOVE:g} times the resonance of the "
+            f"magnets of {', '.join(one.name for one in near)} at up to {highest:.1f} Hz, where "
+            "the field depends on suspension and weight as much as on the plate; start at "
+            f"{math.ceil(_ABOVE * highest)} Hz, or identify the rig"
+        )
+    for one in exciters_of(rig):
+        section = ExciterSection.model_validate(document.value(("eras", one.name)))
+        if said := misread_resonance(section):
+            notes.append(f"eras.{one.name}.resonance_is: {said}")
+    return notes

@@ -1,0 +1,227 @@
+"""Exciters in rig files: by type and by values, what is refused and warned of, written again."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import era_haptics
+from exciter_rig import exciter_rig, exciter_rig_text
+from model.commands.config_cli import config_app
+from model.commands.plate_cli import show
+from model.config.document import ConfigError, parse_document
+from model.rig.exciter_checks import exciter_notes, excursion_problems
+from model.rig.file import parse_rig
+from model.rig.rewritten import rewritten_text
+from model.structure.exciter import Exciter
+from model.structure.exciter_types import EXCITER_TYPES
+from model.table.build import build_table
+from model.table.following import table_following
+
+OWN = (
+    "coil_mass: 1.61 g, weight: 109.29 g, q: 3, force_factor: 3.63 T m, resistance: 4.3 ohm, "
+    "inductance: 0.1 mH, power: 1 W"
+)
+
+
+def first(keys: str) -> Exciter:
+    """The first exciter of a board with these keys."""
+    exciter = exciter_rig(keys).eras[0]
+    assert isinstance(exciter, Exciter)
+    return exciter
+
+
+def refused(keys: str) -> dict[str, str]:
+    """Messages by key, without the first exciter's name."""
+    with pytest.raises(ConfigError) as error:
+        exciter_rig(keys)
+    return {each.key.removeprefix("eras.SW."): each.message for each in error.value.problems}
+
+
+def test_resonance_of_the_coil_and_of_the_magnet_are_one_exciter() -> None:
+    """224 Hz free, 27.19 Hz mounted: k of 3189.2 N/m, c of 0.7553 N s/m, 1 W at 3.0008 V."""
+    free, mounted = (
+        first(f"{OWN}, resonance: {f} Hz, resonance_is: {which}")
+        for f, which in ((224, "free"), (224 * math.sqrt(1.61 / 109.29), "mounted"))
+    )
+    assert free.stiffness == pytest.approx(3189.20, rel=1e-5)
+    assert free.damping == pytest.approx(0.7553, rel=1e-4)
+    assert free.voltage == pytest.approx(3.0008, rel=1e-4)
+    assert mounted.stiffness == pytest.approx(free.stiffness)
+    assert first(f"{OWN}, stiffness: 3 kN/m, clip: 2.5 V").voltage == 2.5
+
+
+@pytest.mark.parametrize(
+    ("name", "magnet", "quality", "force"),
+    [("DAEX25FHE-4", 27, 5, 2.5), ("DAEX25CT-4", 60, 9, 1.15), ("DAEX13-4SM", 44, 4, 1.1)],
+)
+def test_types_are_those_of_their_sheets(
+    name: str, magnet: float, quality: float, force: float
+) -> None:
+    """Resonance glued, Q with the amplifier and force at 1 W, worked out of the sheets."""
+    one = first(f"type: {name}, power: 1 W")
+    assert one.magnet_frequency == pytest.approx(magnet, abs=0.5)
+    assert one.quality == pytest.approx(quality, abs=0.55)
+    assert one.largest_force == pytest.approx(force, abs=0.05)
+    assert first(f"type: {name}, weight: 50 g, magnet: held").held
+    for key, stated in EXCITER_TYPES[name].values.items():
+        assert stated.source or stated.assumed, key
+
+
+def test_what_is_wrong_is_found_at_its_key() -> None:
+    """Of the kind, the type, a resonance that does not say which, and what only ERAs have."""
+    assert "free, of the light coil" in refused(f"{OWN}, resonance: 224 Hz")["resonance_is"]
+    assert refused("type: DAEX25CT-4, resonance: 60").keys() >= {"resonance_is"}
+    assert refused(OWN)["resonance"] == "missing; add it, or a type that has it"
+    assert "did you mean DAEX25CT-4" in refused("type: DAEX25CT-5")["type"]
+    assert "known are at" in refused("type: DAEX25CT-4, stroke: 1 mm")["stroke"]
+    assert "DAEX25CT-4" not in str(refused("type: DAEX25CT-4, q: -1"))
+    text = exciter_rig_text("type: DAEX25CT-4")
+    for wrong, key in (
+        (text.replace("kind: exciter", "kind: exiter", 1), "kind"),
+        (text.replace("amplifier: card, channel: 0, ", "", 1), "amplifier"),
+        (text.replace("[0.054, 0.0552]", "[3, 0.0552]"), "at"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            parse_rig("board.yaml", wrong)
+        problem = error.value.problems[0]
+        assert (problem.line, problem.key) == (3, f"eras.SW.{key}")
+        said = "must be era or exciter, got 'exiter'; did you mean exciter?"
+        assert key != "kind" or problem.message == said
+
+
+def checked(keys: str, frequency: str) -> tuple[list[str], list[str]]:
+    """Problems of the excursion and warnings of a board."""
+    document = parse_document("board.yaml", exciter_rig_text(keys, frequency=frequency))
+    rig = parse_rig("board.yaml", document.text)
+    problems = excursion_problems(document, rig)
+    return [each.message for each in problems], exciter_notes(document, rig)
+
+
+def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misread() -> None:
+    """Below 1.3 x 44.2 = 57.5 Hz; 200 Hz of 14.3 g on a coil of 0.7 g is 44 Hz when glued."""
+    (near,) = checked("type: DAEX13-4SM, power: 10 mW", "[50, 300]")[1]
+    assert near.startswith("limits.frequency: starts at 50 Hz")
+    assert "start at 58 Hz" in near
+    assert checked("type: DAEX13-4SM, power: 10 mW", "[58, 300]") == ([], [])
+    *_, misread = checked("type: DAEX13-4SM, resonance_is: mounted", "[300, 400]")[1]
+    assert misread.startswith("eras.NW.resonance_is: 200 Hz is high")
+    assert "at 44 Hz" in misread
+    assert not [
+        each for each in checked(f"{OWN}, stiffness: 3190", "[100, 300]")[1] if "is high" in each
+    ]
+
+
+def test_check_refuses_frequencies_at_which_a_magnet_leaves_its_excursion() -> None:
+    """On a rigid heavy board a magnet moves as on one that is held, by F / (M omega² - S).
+
+    Within 1 % of the magnet's own equation, -omega² M x = (k + i omega c') x - F.
+    """
+    (said,) = checked("type: DAEX13-4SM, power: 1 W", "[40, 300]")[0]
+    assert "SW, SE, NE, NW stay" in said
+    exciter = first("type: DAEX13-4SM, power: 1 W")
+    heavy = exciter_rig_text("type: DAEX13-4SM, power: 1 W").replace("rho: 1190", "rho: 100000")
+    document = parse_document("board.yaml", heavy.replace("E: 4.5 GPa", "E: 9000 GPa"))
+    (problem,) = excursion_problems(document, parse_rig("board.yaml", document.text))
+    omega = 2 * np.pi * np.arange(65.0, 120.0, 0.1)
+    spring = exciter.stiffness + 1j * omega * (exciter.damping + 1.5**2 / 3.7)
+    moved = 1.118 / np.abs(spring - omega**2 * exciter.magnet_mass)
+    lowest, level = re.search(r"; (\S+) Hz is the lowest.*at most (\S+)", problem.message).groups()
+    allowed = omega[moved < 0.5e-3][0] / (2 * np.pi)
+    assert float(lowest) == pytest.approx(allowed, rel=0.01)
+    assert float(level) == pytest.approx(0.5e-3 / moved[0], rel=0.01)
+
+
+def test_a_fitted_exciter_is_written_and_reads_back() -> None:
+    """Stiffness and damping take the place of resonance and q, and are followed by a table."""
+    text = exciter_rig_text("type: DAEX25CT-4, resonance: 300, resonance_is: free, q: 4")
+    document = parse_document("board.yaml", text)
+    before = parse_rig("board.yaml", text)
+    fitted = replace(
+        before.eras[0].varied(stiffness=1.2, damping=0.8),
+        magnet_mass=0.03,
+        force_factor=1.6,
+        gains=((60.0, 0.9, 0.1), (200.0, 0.8, -0.2)),
+    )
+    after = replace(before, eras=(fitted, *before.eras[1:]))
+    written = rewritten_text(document, before, after, comment="Fitted")
+    back = parse_rig("board.yaml", written)
+    for key in ("stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "voltage"):
+        assert getattr(back.eras[0], key) == pytest.approx(getattr(fitted, key), rel=1e-5)
+    assert "resonance: 300" in written.split("SE:")[1]
+    assert "resonance" not in written.split("SE:")[0].split("SW:")[1]
+    table = build_table(before, frequencies=np.array([80.0, 150.0]))
+    followed = table_following(table, after)
+    expected = build_table(after, frequencies=np.array([80.0, 150.0]))
+    points = np.array([[0.1, 0.1], [0.25, 0.05]])
+    assert followed.unit_fields(points) == pytest.approx(expected.unit_fields(points), rel=2e-3)
+
+
+def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
+    """`era.Exciter` beside `era.Era`, `Rig.replaced` and `save_rig`."""
+    corners = {"a": (0, 0), "b": (0.3, 0), "c": (0.15, 0.23)}
+    made = era_haptics.rig(
+        era_haptics.Plate(length=0.3, width=0.23, thickness=0.005, material="acrylic"),
+        {
+            **{n: era_haptics.Era(at=at, stiffness=2e3) for n, at in corners.items()},
+            "x": era_haptics.Exciter(at=(0.1, 0.1), type="DAEX25CT-4", amplifier="card", channel=0),
+        },
+        amplifiers={"card": {"url": "sim://"}},
+    )
+    assert [era.name for era in made.eras] == ["x"]
+    assert made.supports == ("a", "b", "c")
+    changed = made.replaced(eras={"x": {"type": "DAEX13-4SM"}}, thickness=0.006)
+    assert changed.eras[0].magnet_mass == pytest.approx(14.3e-3)
+    era_haptics.save_rig(changed, tmp_path / "board.yaml")
+    assert era_haptics.load_rig(tmp_path / "board.yaml") == changed
+    with pytest.raises(ConfigError, match="kind"):
+        era_haptics.Exciter(at=(0, 0), kind="coil")
+
+
+@pytest.mark.parametrize(
+    ("name", "levels"),
+    [
+        ("DAEX25FHE-4", {150: 41, 200: 42, 300: 29}),
+        ("DAEX25CT-4", {150: 36, 200: 36, 300: 23}),
+        ("DAEX13-4SM", {150: 35, 200: 36, 300: 22}),
+    ],
+)
+def test_show_prints_exciters_and_what_they_reach(
+    name: str, levels: dict[int, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Least level over the acrylic board at 1 W as another program found it, to 1.3 dB."""
+    path = tmp_path / "board.yaml"
+    path.write_text(exciter_rig_text(f"type: {name}, power: 1 W", frequency="[40, 300]"))
+    show(str(path), as_json=True)
+    found = json.loads(capsys.readouterr().out)
+    by_frequency = dict(
+        zip(found["reach"]["frequencies_hz"], found["reach"]["least_level_db_sl"], strict=True)
+    )
+    assert {f: by_frequency[f] for f in levels} == pytest.approx(levels, abs=1.3)
+    assert found["reach"]["from_hz"] == 40
+    assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
+    show(str(path), as_json=False)
+    text = capsys.readouterr().out
+    assert "20 dB SL everywhere but 2 cm at the edges, under a finger: from 40 Hz" in text
+
+
+def test_config_check_reports_the_excursion_and_the_schema_knows_both_kinds(
+    tmp_path: Path,
+) -> None:
+    """By line and key; keys of exciters and of ERAs are in the schema."""
+    path = tmp_path / "board.yaml"
+    path.write_text(exciter_rig_text("type: DAEX25CT-4", frequency="[40, 300]"))
+    said = CliRunner().invoke(config_app, ["check", str(path)])
+    assert said.exit_code == 1
+    assert "limits.frequency: must start where the magnets of" in said.output
+    made = CliRunner().invoke(config_app, ["init", str(tmp_path / "new.yaml")])
+    assert made.exit_code == 0, made.output
+    (schema,) = tmp_path.glob("*.json")
+    stated = schema.read_text()
+    assert "force_factor" in stated
+    assert "damping_ratio" in stated

@@ -1,0 +1,107 @@
+"""Exciters by numbers worked out by hand, and on a plate by an independent solver."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.direct_plate import direct_acceleration
+from exciter_rig import exciter_rig
+from model.arrays import lattice
+from model.errors import InputError
+from model.fem.plate import assemble
+from model.reduction.free_plate import solve_free_plate
+from model.structure.attachments import Fingertip, FingertipLoad
+from model.structure.exciter import Exciter
+from model.vibration.convergence import reference_mesh
+
+# DAEX25FHE-4 of its sheet with Qms 3, R_g 0.1 ohm, 1 W.
+BY_HAND = Exciter(
+    "SW",
+    0.1,
+    0.1,
+    stiffness=3189.20,
+    damping=0.7553,
+    magnet_mass=0.10929,
+    coil_mass=1.61e-3,
+    force_factor=3.63,
+    resistance=4.3,
+    voltage=3.0008,
+    source_resistance=0.1,
+    inductance=1e-4,
+)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "force", "stiffness", "held"),
+    [
+        (20, -2.6413 + 0.8583j, -3594.3 + 593.1j, False),
+        (60, 3.0801 + 0.3263j, 3546.1 + 2213.0j, False),
+        (100, 2.6675 + 0.1192j, 2677.8 + 2741.1j, False),
+        (250, 2.5044 - 0.0340j, -706.5 + 6031.0j, False),
+        (100, 2.4751 - 0.0353j, 2580.5 + 2355.9j, True),
+    ],
+)
+def test_force_and_dynamic_stiffness_by_hand(
+    frequency: float, force: complex, stiffness: complex, held: bool
+) -> None:
+    """Of a magnet that is free, and of one that a frame holds, to the digits worked out."""
+    omega = 2 * np.pi * np.array([frequency])
+    exciter = replace(BY_HAND, held=held)
+    assert exciter.force(omega)[0] == pytest.approx(force, rel=1e-4)
+    assert exciter.dynamic_stiffness(omega)[0] == pytest.approx(stiffness, rel=1e-4)
+
+
+def test_resonance_quality_and_force_of_the_glued_magnet() -> None:
+    """f_m = f_s sqrt(m_s / M) of 224 Hz, 1.61 g and 109.29 g; Q and force at 1 W as worked out."""
+    assert BY_HAND.magnet_frequency == pytest.approx(224 * np.sqrt(1.61 / 109.29), rel=1e-4)
+    assert BY_HAND.quality == pytest.approx(5, abs=0.1)
+    assert BY_HAND.largest_force == pytest.approx(2.5, abs=0.05)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_errors_of_the_suspension_act_as_its_changes_say(held: bool) -> None:
+    """Force and stiffness of one that is stiffer and damps more, by differences of the hand's."""
+    omega, step = 2 * np.pi * np.array([30.0, 47.0, 120.0, 400.0]), 1e-5
+    exciter = replace(BY_HAND, held=held, gains=((100.0, 0.5, 0.3),))
+    for key, change in (("stiffness", exciter.by_stiffness), ("damping", exciter.by_damping)):
+        other = exciter.varied(**{key: 1 + step})
+        by_stiffness = (other.dynamic_stiffness(omega) - exciter.dynamic_stiffness(omega)) / step
+        by_force = (other.force(omega) - exciter.force(omega)) / step
+        assert change(omega) == pytest.approx(by_stiffness, rel=1e-3)
+        size = np.abs(exciter.force(omega)).max()
+        assert change(omega) * exciter.base(omega) == pytest.approx(by_force, abs=3e-4 * size)
+        drive = exciter.full_level * exciter.gain(omega / (2 * np.pi))
+        off = {"stiffness": 1.0, "damping": 1.0, key: 1.3}
+        stiffness, by_voltage = exciter.deviating(omega, **off)
+        assert stiffness == pytest.approx(exciter.varied(**off).dynamic_stiffness(omega))
+        assert by_voltage * drive == pytest.approx(exciter.varied(**off).force(omega))
+
+
+@pytest.mark.parametrize("magnet", ["free", "held"])
+def test_response_on_a_board_against_magnet_and_current_solved_beside_it(magnet: str) -> None:
+    """Finite elements with the magnets' and the coils' own equations: within 0.3 % of the field.
+
+    Of four exciters on acrylic on foam, under a finger, from 40 to 500 Hz.
+    """
+    keys = f"type: DAEX25FHE-4, magnet: {magnet}"
+    rig = exciter_rig(keys, frequency="[40, 500]", more="mesh: auto 0.1 %")
+    finger = FingertipLoad(0.11, 0.09, Fingertip())
+    frequencies = np.array([40.0, 70.0, 107.0, 160.0, 240.0, 330.0, 420.0, 500.0])
+    points = lattice(np.linspace(0, 0.3, 13), np.linspace(0, 0.23, 10))
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    loads = (*rig.masses, finger)
+    found = free.acceleration(rig.eras, frequencies, points, loads=loads)
+    mesh = reference_mesh(rig.plate, frequency_max=500.0)
+    expected = direct_acceleration(
+        assemble(rig.plate, mesh), rig.eras, frequencies, points, loads=loads
+    )
+    apart = np.linalg.norm(found - expected, axis=2) / np.linalg.norm(expected, axis=2)
+    assert apart.max() < 3e-3
+
+
+@pytest.mark.parametrize("key", ["stiffness", "magnet_mass", "force_factor", "resistance"])
+def test_values_that_no_exciter_has_are_refused(key: str) -> None:
+    """By name and key."""
+    with pytest.raises(InputError, match=f"exciter SW: {key}"):
+        replace(BY_HAND, **{key: 0.0})

@@ -15,7 +15,7 @@ from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_file import read_stepped
 from sim.sensors.sensor_file import WiredSensor
 
-RATE = 48_000
+RATE = 12_000
 TONES = (61.0, 151.5, 311.0)
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))

@@ -66,11 +66,7 @@ def identified_errors(rig: Rig, truth: dict[str, Any]) -> list[Error]:
     drives = _drives(rig, truth)
     for era, drive in zip(rig.eras, drives, strict=True):
         own = truth["eras"][era.name]
-<<<<<<< HEAD
-        bolt = getattr(era, era.fields["bolt_mass"]) + sum(
-=======
         bolt = era.in_time.mass + sum(
->>>>>>> source
             each.mass
             for each in rig.masses
             if math.hypot(each.x - era.x, each.y - era.y) < _AT_BOLT

@@ -58,13 +58,7 @@ class Truth:
             "eras": {
                 era.name: {
                     "at_m": [era.x, era.y],
-<<<<<<< HEAD
                     **{kind: getattr(era, field) for kind, field in era.fields.items()},
-=======
-                    "stiffness": era.stiffness,
-                    "damping": era.damping,
-                    "bolt_mass": era.in_time.mass,
->>>>>>> source
                     "resonance_hz": actuator.resonance,
                     "damping_ratio": actuator.ratio,
                     "gain": actuator.gain,
@@ -90,7 +84,6 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     loss = min(plate.loss_factor * std.damping ** rng.standard_normal(), 0.5)
     plate = replace(plate, loss_factor=float(loss))
     damping = std.damping ** rng.standard_normal()
-<<<<<<< HEAD
     eras = []
     for era in rig.eras:
         x, y = _near((era.x, era.y), plate, rng)
@@ -105,22 +98,6 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
         else:
             changes["magnet_mass"] = era.magnet_mass * relative(_MAGNET)
         eras.append(replace(era, gains=(), **changes))
-=======
-    eras = tuple(
-        replace(
-            era,
-            x=float(x),
-            y=float(y),
-            stiffness=era.stiffness * relative(std.stiffness),
-            damping=float(era.damping * damping * relative(std.stiffness)),
-            bolt_mass=era.bolt_mass + float(rng.uniform(0, _BOLT)),
-            gains=(),
-        )
-        for era in rig.eras
-        if isinstance(era, Era)
-        for x, y in (_near((era.x, era.y), plate, rng),)
-    )
->>>>>>> source
     actuators = tuple(
         Actuator(
             float(rng.uniform(*(_RESONANCES if isinstance(era, Era) else _AMPLIFIERS))),

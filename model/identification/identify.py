@@ -94,7 +94,9 @@ def identify(
         fitted = fit_in_stages(setting)
     values = Values.of(rig, fitted.space, fitted.best.x)
     posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
-    found = Identification(*(before, rig, values, posterior, chi2(fitted), shift, None, fitted, seed))
+    found = Identification(
+        *(before, rig, values, posterior, chi2(fitted), shift, None, fitted, seed)
+    )
     if found.is_explained:
         _check_gains(rig, measurement, values, fitted.space)
     unknown = unknowns(setting, fitted, posterior)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -140,13 +140,7 @@ def _physics(table: LocalizationTable) -> dict[str, Any]:
         key: each.dimension.key(key)
         for section in _SECTIONS
         for key, field in section.model_fields.items()
-<<<<<<< HEAD
-        for kind in (field, *get_args(field.annotation))  # of a key that may be left out
-        for each in getattr(kind, "metadata", getattr(kind, "__metadata__", ()))
-        if isinstance(each, Quantity)
-=======
         for each in quantities(field)
->>>>>>> source
     } | _NAMES
     return {
         name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)

@@ -128,13 +128,13 @@ def measure(
             raise InputError(f"{option} needs {needs}; leave it out")
     is_whole = True
     if source is not None:
-        from sim.desk.stepped_cli import measured_from
+        from sim.desk.measuring.stepped_import import measured_from
 
         rows, answer = measured_from(source, desk, output)
     else:
         opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)
         if is_moved:
-            from sim.desk.moved_cli import measure_by_moving
+            from sim.desk.measuring.moved_dialogue import measure_by_moving
 
             rows, answer, is_whole = measure_by_moving(
                 desk, opened, output, periods=periods, is_resumed=resume

@@ -20,8 +20,9 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels
+from sim.desk.measuring.measure import run_time
 from sim.desk.measuring.multisine import Estimate, Multisine, estimate, ramped
-from sim.desk.measuring.single_run import run_time, settled
+from sim.desk.measuring.single_run import settled
 from sim.desk.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import WiredSensor
 

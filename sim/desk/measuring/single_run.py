@@ -2,18 +2,12 @@
 
 import numpy as np
 
-from drivers.errors import LinkError
 from model.arrays import FloatArray
+from sim.desk.measuring.measure import TRIES, blocks_lost, run_time
 from sim.desk.measuring.multisine import PERIOD, Multisine
 from sim.desk.measuring.sound_card import SoundCard
 
-_SETTLING, _TAIL = 1.0, 0.05  # s
-_TRIES = 3
-
-
-def run_time(periods: int) -> float:
-    """Time [s] of a run of which so many periods are analysed."""
-    return _SETTLING + PERIOD * periods + _TAIL
+_SETTLING = 1.0  # s, of the time of a run
 
 
 def settled(
@@ -27,11 +21,8 @@ def settled(
     played = np.zeros((len(signal), outputs))
     played[:, output - 1] = signal[:, 0]
     start = round(_SETTLING * sines.rate)
-    for _ in range(_TRIES):
+    for _ in range(TRIES):
         recorded = card.run(played)[start : start + periods * sines.samples]
         if not card.gaps:
             return recorded.astype(float)
-    raise LinkError(
-        f"blocks of sound were lost in {_TRIES} attempts of a run; end other programs, give "
-        "the sound server real-time priority, or choose larger blocks"
-    )
+    raise blocks_lost()

@@ -64,7 +64,7 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
             f"them, got {samples.shape[1]}"
         )
     columns = [sensor.input - 1 for sensor in sensors]
-    found, turn, before = [], 0, 0.0
+    found, number, before = [], 0, 0.0
     for begin, end in _held(path, references.sum(axis=1), rate):
         kept = slice((begin + end) // 2, end)
         played = references[kept]
@@ -72,18 +72,18 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
         frequency = _frequency(played[:, loudest], rate)
         place = f"{path} at {begin / rate:.1f} s"
         if references.shape[1] == 1:
-            turn += frequency <= before * (1 + _CLOSE)
+            number += frequency <= before * (1 + _CLOSE)
         else:
-            turn = loudest
+            number = loudest
             _check_alone(place, played, loudest)
-        if turn >= len(eras):
+        if number >= len(eras):
             raise InputError(
                 f"{place}: one reference must have ascending tones for each of {len(eras)} ERAs in "
                 "turn, got more; record a reference for each ERA, or a file SENSOR-OUTPUT.wav"
             )
         before = frequency
         both = np.column_stack([played[:, loudest], samples[kept][:, columns]])
-        found.append(Tone(eras[turn], frequency, begin / rate, _ratios(both, frequency, rate)))
+        found.append(Tone(eras[number], frequency, begin / rate, _ratios(both, frequency, rate)))
     if {tone.era for tone in found} != set(eras):
         raise InputError(
             f"{path}: tones must be of all of {', '.join(eras)}, got "
@@ -164,7 +164,7 @@ def _check_alone(place: str, played: FloatArray, loudest: int) -> None:
     if others.max(initial=0) > _CROSSTALK * size[loudest]:
         raise InputError(
             f"{place}: one output must play at a time, got several references; play a stepped sine "
-            "on each output in turn"
+            "on one output after another"
         )
 
 

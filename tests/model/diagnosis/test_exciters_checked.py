@@ -1,0 +1,124 @@
+"""A board on exciters as sold: sound ones pass, and each mistake of a maker is named."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from exciter_rig import exciter_rig
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import Responses
+from model.diagnosis.diagnosis_report import verdict_rows
+from model.diagnosis.verdict import Verdict, diagnose
+from model.rig.rig import Rig
+from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.mesh import SpectralMesh
+from model.structure.exciter import Exciter
+
+TONES = np.arange(41.0, 300.0, 20.0)
+PLACES = np.array([(0.3 * x, 0.23 * y) for x in (0.1, 0.4, 0.88) for y in (0.15, 0.5, 0.85)])
+PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"
+
+
+@dataclass(frozen=True)
+class HalfGlued:
+    """An exciter behind what is left of its glue, a spring [N/m] that damps."""
+
+    own: Exciter
+    glue: float
+
+    @property
+    def x(self) -> float:
+        """Its place."""
+        return self.own.x
+
+    @property
+    def y(self) -> float:
+        """Its place."""
+        return self.own.y
+
+    @property
+    def foot(self) -> float:
+        """Its foot."""
+        return self.own.foot
+
+    def _share(self, omega: FloatArray) -> ComplexArray:
+        glue = self.glue * (1 + 0.2j)
+        return np.asarray(glue / (glue + self.own.dynamic_stiffness(omega)))
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """Of both, one behind the other."""
+        return np.asarray(self.own.dynamic_stiffness(omega) * self._share(omega))
+
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """What comes through the glue."""
+        return np.asarray(self.own.force(omega) * self._share(omega))
+
+
+def as_sold(rig: Rig, seed: int) -> Rig:
+    """A board of another rigidity (10 %) with exciters whose parts differ (20 %, 10 degrees)."""
+    rng = np.random.default_rng(seed)
+
+    def factor(deviation: float) -> float:
+        return float(np.exp(deviation * rng.standard_normal()))
+
+    eras = tuple(
+        replace(
+            era,
+            stiffness=factor(0.2) * era.in_time.stiffness,
+            magnet_mass=factor(0.2) * getattr(era, "magnet_mass"),  # noqa: B009
+            force_factor=factor(0.2) * getattr(era, "force_factor"),  # noqa: B009
+            gains=((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),),
+        )
+        for era in rig.eras
+    )
+    return replace(rig, plate=rig.plate.scaled(modulus=factor(0.1)), eras=eras)
+
+
+def checked(seed: int, *, loose: int | None = None, wired: FloatArray | None = None) -> Verdict:
+    """A board checked by nine sensors with 0.5 % of noise; wired (e, s): signs of what is read."""
+    rig = exciter_rig("type: DAEX25FHE-4, power: 1 W", frequency="[40, 300]", more=PARTS)
+    true = as_sold(rig, seed)
+    assert isinstance(rig.mesh, SpectralMesh)
+    sources = [
+        HalfGlued(era, 600.0) if number == loose and isinstance(era, Exciter) else era
+        for number, era in enumerate(true.eras)
+    ]
+    values = direct_spectral_acceleration(
+        true.plate, rig.mesh, sources, TONES, PLACES, loads=true.masses
+    )
+    values = values / np.array([era.full_level for era in rig.eras])[:, None]
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    noise = np.random.default_rng([seed, 1]).standard_normal((2, *values.shape))
+    values = values + 0.005 * size * (noise[0] + 1j * noise[1])
+    signs = np.ones(values.shape[1:]) if wired is None else wired
+    names = tuple(f"P{number}" for number in range(1, len(PLACES) + 1))
+    return diagnose(rig, Responses(names, PLACES, TONES, signs * values))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_sound_board_of_parts_as_sold_is_well(seed: int) -> None:
+    """Gains and force factors that are 20 % off together are no weak exciter, nor another plate."""
+    assert verdict_rows(checked(seed)) == ["ALL WELL: plate and channels match the rig"]
+
+
+def test_exciter_whose_glue_is_off_is_loose_and_nothing_else() -> None:
+    """By its dynamic stiffness: its gain alone may be that of a weak one."""
+    verdict = checked(5, loose=2)
+    assert [channel.states[0] for channel in verdict.channels] == ["well", "well", "loose", "well"]
+    rows = verdict_rows(verdict)
+    assert rows[0].startswith("LOOSE: channel 2 of amplifier card (ERA NE in the rig)")
+    assert not any(row.startswith("PLATE") for row in rows)
+
+
+def test_exciter_wired_backwards_and_sensor_upside_down_are_told_apart() -> None:
+    """One has the opposite sign at every sensor, the other under every exciter."""
+    signs = np.ones((4, len(PLACES)))
+    signs[1] *= -1
+    signs[:, 4] *= -1
+    verdict = checked(6, wired=signs)
+    assert [channel.states for channel in verdict.channels] == [
+        ("well",), ("inverted",), ("well",), ("well",)
+    ]  # fmt: skip
+    (sensor,) = verdict.bad_sensors
+    assert sensor.name == "P5" and "upside down" in sensor.why

@@ -93,7 +93,7 @@ def _board() -> Iterator[str]:
         yield _box(x + across * width - 7, y + down * height - 7, 14, 14, fill="#e8dcc0")
     for name, (at, down) in PLACES.items():
         yield f'<circle cx="{at}" cy="{down}" r="12" fill="#d98c3f" stroke="{GREY}"/>'
-        yield _text((at, down + 26), name, anchor="middle")
+        yield _text((at - 26, down + 5) if at > 800 else (at, down + 26), name, anchor="middle")
     yield _text((x, 258), "exciters below it, + to + of its output", color=RED)
 
 

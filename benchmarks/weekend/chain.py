@@ -1,6 +1,7 @@
 """Boards whose parts deviate, measured by one moved sensor, calibrated, touched: against the truth.
 
     python -m benchmarks.weekend.chain [--boards 10] [--touches 20] [--workers 2] [--report]
+    python -m benchmarks.weekend.chain --measured examples/weekend/measured.uff
 
 Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives and board drawn
 within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. A sensor of 2 g reads
@@ -15,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sense
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
+from model.calibration.responses_file import write_responses
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.finger.fingertip import fingertips_on
@@ -141,11 +144,17 @@ class Touch:
     exact: float
 
 
+def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Responses]:
+    """Build a board and measure it."""
+    built = BuiltBoard.drawn(rig, seed)
+    lines = np.arange(rig.limits.frequency_min + 1, rig.limits.frequency_max, 10.0)
+    return built, built.measured(lines, seed)
+
+
 def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
     """Build, measure, calibrate and touch a board; count: for each number of quiet fingers."""
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    built = BuiltBoard.drawn(rig, seed)
-    responses = built.measured(np.arange(low + 1, high, 10.0), seed)
+    built, responses = measured(rig, seed)
     known = calibrate(rig, responses, check_consistency(rig, responses)).rig
     frequencies = np.arange(low, high + 1, 10.0)
     table = build_table(known, frequencies=frequencies, drive_mode="phased")
@@ -169,12 +178,15 @@ def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
         yield Touch(quiet, promised, felt, best)
 
 
+def _rig() -> Rig:
+    return load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
+
+
 def outcome(board: int, touched: int) -> "Outcome":
     """Touches on a board by its number."""
     use_one_thread()
-    rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
     try:
-        return Outcome(board, tuple(touches(rig, board, touched)))
+        return Outcome(board, tuple(touches(_rig(), board, touched)))
     except InputError as refused:
         return Outcome(board, (), str(refused))
 
@@ -217,7 +229,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first board")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--measured", type=Path, help="only write what the sensor reads of --first")
     options = parser.parse_args()
+    if options.measured:
+        rig = _rig()
+        write_responses(options.measured, measured(rig, options.first)[1], rig)
+        return
     found = []
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
         numbers = range(options.first, options.first + options.boards)

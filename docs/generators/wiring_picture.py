@@ -89,22 +89,17 @@ def _board() -> Iterator[str]:
     x, y, width, height = BOARD
     yield _text((x + 84, 36), "board, seen from above, on foam", anchor="middle")
     yield f'<rect x="{x}" y="{y}" width="{width}" height="{height}" fill="none" stroke="{GREY}"/>'
-    for across in (x + 4, x + width - 18):
-        for down in (y + 4, y + height - 18):
-            yield _box(across, down, 14, 14, fill="#e8dcc0")
+    for across, down in ((0.22, 0.5), (0.78, 0.5), (0.5, 0.2), (0.5, 0.8)):
+        yield _box(x + across * width - 7, y + down * height - 7, 14, 14, fill="#e8dcc0")
     for name, (at, down) in PLACES.items():
         yield f'<circle cx="{at}" cy="{down}" r="12" fill="#d98c3f" stroke="{GREY}"/>'
-        yield _text(
-            (at + 17, down + 12) if at < 800 else (at - 17, down + 12),
-            name,
-            anchor="start" if at < 800 else "end",
-        )
+        yield _text((at - 26, down + 5) if at > 800 else (at, down + 26), name, anchor="middle")
     yield _text((x, 258), "exciters below it, + to + of its output", color=RED)
 
 
 def _sensor_and_loop() -> Iterator[str]:
-    yield _box(795, 134, 14, 14, fill="#c8e6c9")
-    yield _line([(360, 288), (440, 288), (440, 306), (670, 306), (670, 141), (795, 141)], GREEN)
+    yield _box(778, 121, 14, 14, fill="#c8e6c9")
+    yield _line([(360, 288), (440, 288), (440, 306), (670, 306), (670, 128), (778, 128)], GREEN)
     yield _text((676, 300), "accelerometer with its supply,", color=GREEN)
     yield _text((676, 316), "moved from place to place, arrow upwards", color=GREEN)
     yield _line([(400, 212), (400, 324), (360, 324)], BLUE)

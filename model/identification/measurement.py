@@ -134,8 +134,8 @@ class Measurement:
 class MeasuredPlate:
     """A measurement with how it came about.
 
-    level: of what played, 0..1 of full stroke, and duration [s], None for not known; sensors: the ones used, for programs;
-    notes: lines for people; details: keys and values for programs.
+    level: of what played, 0..1 of full stroke, and duration [s], None for not known; sensors: the
+    ones used, for programs; notes: lines for people; details: keys and values for programs.
     """
 
     measurement: Measurement

@@ -139,13 +139,14 @@ class Crossfades:
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
         """The answer with the tones of contents that are felt together, and what these promise."""
-        strokes, drives, owners = [*self.table.full_levels.values()], [], []
+        drives, owners = [], list[int]()
         rows, table = list[int](), self.table
         for number, stream in enumerate(goal.contents.streams):
             for one in voices[self.targets[stream.targets[0]][0].key]:
                 frequencies, bases = base_amplitudes(one.layer.excitation, table.eras)
-                rows += table.rows_of(frequencies).tolist()
-                drives += (bases / strokes).tolist()
+                at = table.rows_of(frequencies)
+                rows += at.tolist()
+                drives += (bases / table.highest_drives[at]).tolist()
                 owners += [number] * len(frequencies)
         every = np.array(rows), drives, np.array(owners), np.ones(len(rows))
         return with_tones(table, goal, *every)

@@ -378,6 +378,6 @@ def _felt(
     """Complex acceleration at a finger, by frequency [Hz]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = table.rows_of(frequencies)
-    weights = bases / [era.full_level for era in table.eras]
+    weights = bases / table.highest_drives[rows]
     felt = (weights * fields[rows]).sum(axis=1)
     return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))

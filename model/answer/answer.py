@@ -168,7 +168,8 @@ class Answer:
     asked: the fingers; contents: that are played, and who is kept quiet; tones: of these; held:
     vibrations given up, by finger, with the contrast that they would have had, and whether they
     would disturb a finger; applied: what was changed, in words; envelopes: onset and ending of each
-    layer, if shaped; eras, frequencies [Hz], thresholds [m/s²]: of the table.
+    layer, if shaped; eras, frequencies [Hz], highest_drives (f, eras), thresholds [m/s²]: of the
+    table.
     """
 
     asked: tuple[Finger, ...]
@@ -178,6 +179,7 @@ class Answer:
     applied: tuple[str, ...]
     eras: tuple[Source, ...]
     frequencies: FloatArray
+    highest_drives: FloatArray
     thresholds: Float32Array
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
 
@@ -239,7 +241,9 @@ class Answer:
         """What is played, a layer for each vibration."""
         layers, least = [], self.contents.least_ramp
         for number, stream in enumerate(self.contents.streams):
-            excitation, *sides = self.tones.excitations(number, self.eras, self.frequencies)
+            excitation, *sides = self.tones.excitations(
+                number, self.eras, self.frequencies, self.highest_drives
+            )
             if self.contents.drive_mode != UNRESTRICTED:  # all tones are one excitation
                 every = (excitation, *sides)
                 excitation = {name: tone for each in every for name, tone in each.items()}

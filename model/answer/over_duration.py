@@ -271,12 +271,12 @@ class RingingUnderFingers:
 
     def over_drive(self, drive: Drive) -> OverDuration:
         """What fingers feel of a drive, as `over`; solved once."""
-        hertz, strokes = self.table.frequencies, [era.full_level for era in self.table.eras]
+        hertz, drives = self.table.frequencies, self.table.highest_drives
         key = tuple([(row, weights.tobytes()) for row, weights in drive])
         if key not in self._solved:
             self._solved[key] = self.over(
                 [
-                    (float(hertz[row]), np.multiply(weights, strokes, dtype=complex))
+                    (float(hertz[row]), np.multiply(weights, drives[row], dtype=complex))
                     for row, weights in drive
                 ]
             )

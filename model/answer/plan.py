@@ -376,7 +376,7 @@ class _Answering:
         if not tones.is_apart or len(contents.avoided) < len(self.avoided):
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
         given = self.fingers, contents, tones, plan.held, applied
-        return Answer(*given, table.eras, table.frequencies, table.thresholds)
+        return Answer(*given, table.eras, table.frequencies, table.highest_drives, table.thresholds)
 
 
 def _avoided(

@@ -165,12 +165,16 @@ class Tones:
     is_apart: bool
 
     def excitations(
-        self, content: int, eras: Sequence[Source], frequencies: FloatArray
+        self,
+        content: int,
+        eras: Sequence[Source],
+        frequencies: FloatArray,
+        highest_drives: FloatArray,
     ) -> list[Excitation]:
         """What plays a content, a tone of each ERA for each of its tones, its carrier first.
 
-        frequencies: of the table [Hz]. The strongest ERA, the first of those nearly as strong, has
-        phase zero.
+        frequencies [Hz], highest_drives (f, eras): of the table. The strongest ERA, the first of
+        those nearly as strong, has phase zero.
         """
         found = list[Excitation]()
         every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
@@ -182,12 +186,12 @@ class Tones:
             enough = (1 - NEARLY) * max(map(abs, values))
             (strongest, *_) = [value for value in values if abs(value) >= enough]
             factor = strongest.conjugate() / abs(strongest)
-            for era, value in zip(eras, values, strict=True):
+            for era, highest, value in zip(eras, highest_drives[row].tolist(), values, strict=True):
                 if value != 0:
                     w = value * factor
                     if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
                         w = w.real
-                    amplitude = gain * min(abs(w), 1.0) * era.full_level
+                    amplitude = gain * min(abs(w), 1.0) * highest
                     tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
             found.append(tones)
         return found

@@ -140,6 +140,13 @@ class AttachedPlate(Mounts):
                     found[:, number] = self.fingertip.scaled(load).dynamic_stiffness(self.omega)
         return found.astype(np.complex64)
 
+    def driven_less(self, shares: FloatArray) -> "AttachedPlate":
+        """The same at shares (f,) of full level."""
+        if (shares == 1).all():
+            return self
+        by = shares[:, None].astype(np.float32)
+        return replace(self, forces=by * self.forces, strokes=by * self.strokes)
+
     @property
     def frequencies(self) -> FloatArray:
         """Its frequencies [Hz], (f,)."""
@@ -182,6 +189,24 @@ def attach(
         fingertip=fingertip,
         uncertainty=uncertainty,
     )
+
+
+def allowed_shares(plate: AttachedPlate, sources: Sequence[Source]) -> FloatArray:
+    """Share of full level (f,) at which all sources together stay within their excursion.
+
+    plate: at full level, without fingers, and as modelled. In those phases in which the motions of
+    one by all drives add.
+    """
+    found = np.ones(len(plate.omega))
+    limited = [number for number, each in enumerate(sources) if math.isfinite(each.excursion)]
+    if limited:
+        moved = PlateOnEras.of(plate).moved[:, MODELLED]
+        for number in limited:
+            relative = moved[:, number].astype(complex)
+            relative[:, number] -= plate.strokes[:, number]
+            by_each = np.abs(sources[number].excursion_by(plate.omega, relative))
+            found = np.minimum(found, sources[number].excursion / by_each.sum(axis=1))
+    return found
 
 
 def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:

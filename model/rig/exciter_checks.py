@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 import numpy as np
 
 from model.arrays import FloatArray
-from model.config.document import ConfigProblem, Document
+from model.config.document import Document
 from model.rig.exciter_section import ExciterSection, misread_resonance
 from model.rig.rig import Rig
 from model.structure.exciter import Exciter
@@ -38,8 +38,8 @@ def exciters_of(rig: Rig) -> list[Exciter]:
     return [era for era in rig.eras if isinstance(era, Exciter)]
 
 
-def excursion_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
-    """A problem where magnets pass their excursion within the rig's frequencies."""
+def excursion_notes(rig: Rig) -> list[str]:
+    """A warning where full level would move magnets beyond their excursion."""
     exciters, limits = exciters_of(rig), rig.limits
     if not exciters:
         return []
@@ -51,25 +51,24 @@ def excursion_problems(document: Document, rig: Rig) -> list[ConfigProblem]:
     names = ", ".join(
         one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far
     )
-    lowest = f"{found.allowed:g} Hz is the lowest; or" if np.isfinite(found.allowed) else ""
+    lowest = (
+        f"within from {found.allowed:g} Hz on" if np.isfinite(found.allowed) else "nowhere within"
+    )
     return [
-        document.problem(
-            ("limits", "frequency"),
-            f"must start where the magnets of {names} stay within their excursion at limits.level "
-            f"{limits.level:g}, got {limits.frequency_min:g} Hz, from where that of "
-            f"{exciters[worst].name} moves by up to {1e3 * found.largest[worst]:.2g} mm of "
-            f"{1e3 * exciters[worst].excursion:.2g} mm; {lowest} take a level of at most "
-            f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g}",
-        )
+        f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
+        f"move the magnets of {names} beyond their excursion, that of {exciters[worst].name} by "
+        f"{1e3 * found.largest[worst]:.2g} mm of {1e3 * exciters[worst].excursion:.2g} mm ({lowest}"
+        "); answers play less there, tones by hand do not: a level of at most "
+        f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"
     ]
 
 
 def exciter_notes(document: Document, rig: Rig) -> list[str]:
-    """Warnings: frequencies near the resonance of a magnet, and resonances that may be misread."""
+    """Warnings: magnets that move too far or resonate, and resonances that may be misread."""
     low = rig.limits.frequency_min
     free = [one for one in exciters_of(rig) if not one.held]
     near = [one for one in free if low < _ABOVE * one.magnet_frequency]
-    notes = []
+    notes = excursion_notes(rig)
     if near:
         highest = max(one.magnet_frequency for one in near)
         notes.append(

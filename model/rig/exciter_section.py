@@ -29,7 +29,7 @@ from model.config.units import (
 from model.rig.actuator_section import ActuatorSection
 from model.rig.key_types import gains_of, place_on
 from model.structure.exciter import Exciter
-from model.structure.exciter_types import EXCITER_TYPES, Stated
+from model.structure.exciter_types import EXCITER_TYPES, SheetValue
 from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
@@ -215,7 +215,7 @@ def misread_resonance(section: ExciterSection) -> str | None:
     )
 
 
-def _of_type(name: str | None) -> dict[str, Stated]:
+def _of_type(name: str | None) -> dict[str, SheetValue]:
     return {} if name is None else {**EXCITER_TYPES[name].values}
 
 

@@ -19,7 +19,7 @@ from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.rig.era_section import STIFF_MOUNT
-from model.rig.exciter_checks import exciter_notes, excursion_problems
+from model.rig.exciter_checks import exciter_notes
 from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
@@ -46,7 +46,6 @@ def _check(document: Document) -> CheckedFile:
     if rig is not None:
         support = support_problem(rig.plate, rig.eras, loads=rig.masses)
         problems += [] if support is None else [document.problem(("eras",), support)]
-        problems += excursion_problems(document, rig)
     known = {problem.key for problem in problems}
     problems += [problem for problem in wrong if problem.key not in known]
     if rig is None or problems:

@@ -98,6 +98,13 @@ class Source(Support, Protocol):
     def in_time(self) -> InTime:
         """Its equations in time."""
 
+    @property
+    def excursion(self) -> float:
+        """Largest motion between its ends [m], infinite where nothing limits it."""
+
+    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
+        """Motion between its ends [m] by that of the plate less its base (f, ...) at omega (f,)."""
+
     def gain(self, frequencies: FloatArray) -> ComplexArray:
         """Complex gain of its drive at frequencies [Hz], of their shape."""
 
@@ -203,6 +210,15 @@ class Era(MeasuredGains):
     def full_level(self) -> float:
         """Amplitude of its base at level 1, its stroke [m]."""
         return self.stroke
+
+    @property
+    def excursion(self) -> float:
+        """Infinite: the stroke limits its base alone."""
+        return math.inf
+
+    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
+        """How far its spring is stretched [m], by the plate's motion less the base's."""
+        return moved
 
     @property
     def support(self) -> "PointLoad":

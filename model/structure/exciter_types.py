@@ -14,7 +14,7 @@ _NET_WEIGHT = f"{_DESIGN}: net weight of 110.9 g less the coil's"
 
 
 @dataclass(frozen=True)
-class Stated:
+class SheetValue:
     """A value in SI units with its source; lowest and highest where it is assumed."""
 
     value: float
@@ -22,8 +22,8 @@ class Stated:
     assumed: tuple[float, float] | None = None
 
 
-def _assumed(value: float, lowest: float, highest: float) -> Stated:
-    return Stated(value, assumed=(lowest, highest))
+def _assumed(value: float, lowest: float, highest: float) -> SheetValue:
+    return SheetValue(value, assumed=(lowest, highest))
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ExciterType:
 
     name: str
     note: str
-    values: Mapping[str, Stated]
+    values: Mapping[str, SheetValue]
 
     @property
     def assumed(self) -> dict[str, tuple[float, float]]:
@@ -46,44 +46,44 @@ _KNOWN = (
         "13 mm; no sheet gives force factor and coil mass, and its resonance is unreliable",
         {
             "coil_mass": _assumed(0.7e-3, 0.5e-3, 1.0e-3),
-            "weight": Stated(14.3e-3, f"{_PART_PAGE}: 15 g in all, less the coil's"),
-            "resonance": Stated(200.0, f"{_PART_PAGE}, unreliable"),
+            "weight": SheetValue(14.3e-3, f"{_PART_PAGE}: 15 g in all, less the coil's"),
+            "resonance": SheetValue(200.0, f"{_PART_PAGE}, unreliable"),
             "q": _assumed(3.0, 2.0, 5.0),
             "force_factor": _assumed(1.5, 1.2, 1.8),
             "resistance": _assumed(3.6, 3.2, 4.0),
             "inductance": _assumed(0.06e-3, 0.03e-3, 0.1e-3),
             "excursion": _assumed(0.5e-3, 0.5e-3, 1.0e-3),
-            "power": Stated(3.0, _PART_PAGE),
+            "power": SheetValue(3.0, _PART_PAGE),
         },
     ),
     ExciterType(
         "DAEX25CT-4",
         "25 mm, a coin",
         {
-            "coil_mass": Stated(1.29e-3, _PINNED),
+            "coil_mass": SheetValue(1.29e-3, _PINNED),
             "weight": _assumed(33.5e-3, 28.7e-3, 43.7e-3),
-            "resonance": Stated(306.0, _PINNED),
+            "resonance": SheetValue(306.0, _PINNED),
             "q": _assumed(3.0, 2.0, 5.0),
-            "force_factor": Stated(1.54, _PINNED),
-            "resistance": Stated(3.6, _PINNED),
+            "force_factor": SheetValue(1.54, _PINNED),
+            "resistance": SheetValue(3.6, _PINNED),
             "inductance": _assumed(0.07e-3, 0.04e-3, 0.1e-3),
             "excursion": _assumed(0.5e-3, 0.5e-3, 1.0e-3),
-            "power": Stated(10.0, _PINNED),
+            "power": SheetValue(10.0, _PINNED),
         },
     ),
     ExciterType(
         "DAEX25FHE-4",
         "25 mm in a frame; superseded by EX25FHE2-4",
         {
-            "coil_mass": Stated(1.61e-3, _DESIGN),
-            "weight": Stated(109.29e-3, _NET_WEIGHT),
-            "resonance": Stated(224.0, _DESIGN),
+            "coil_mass": SheetValue(1.61e-3, _DESIGN),
+            "weight": SheetValue(109.29e-3, _NET_WEIGHT),
+            "resonance": SheetValue(224.0, _DESIGN),
             "q": _assumed(3.0, 2.0, 5.0),
-            "force_factor": Stated(3.63, _DESIGN),
-            "resistance": Stated(4.3, _DESIGN),
-            "inductance": Stated(0.1e-3, f"{_DESIGN}, at 1 kHz"),
+            "force_factor": SheetValue(3.63, _DESIGN),
+            "resistance": SheetValue(4.3, _DESIGN),
+            "inductance": SheetValue(0.1e-3, f"{_DESIGN}, at 1 kHz"),
             "excursion": _assumed(0.5e-3, 0.5e-3, 1.0e-3),
-            "power": Stated(24.0, _DESIGN),
+            "power": SheetValue(24.0, _DESIGN),
         },
     ),
     ExciterType(
@@ -92,13 +92,13 @@ _KNOWN = (
         {
             "coil_mass": _assumed(1.61e-3, 1.2e-3, 2.0e-3),
             "weight": _assumed(109.29e-3, 85e-3, 130e-3),
-            "resonance": Stated(115.0, _DESIGN),
+            "resonance": SheetValue(115.0, _DESIGN),
             "q": _assumed(3.0, 2.0, 5.0),
             "force_factor": _assumed(3.63, 3.0, 4.2),
-            "resistance": Stated(4.3, _DESIGN),
-            "inductance": Stated(0.1e-3, f"{_DESIGN}, at 1 kHz"),
+            "resistance": SheetValue(4.3, _DESIGN),
+            "inductance": SheetValue(0.1e-3, f"{_DESIGN}, at 1 kHz"),
             "excursion": _assumed(0.5e-3, 0.5e-3, 1.0e-3),
-            "power": Stated(24.0, _DESIGN),
+            "power": SheetValue(24.0, _DESIGN),
         },
     ),
 )

@@ -268,6 +268,7 @@ def _check_content(
     chosen = np.sort(rng.choice(len(table.frequencies), count, replace=False))
     points = np.concatenate([table.raster.points, table.cell_centres])
     exact = respond(rig.eras, table.frequencies[chosen], points, loads=rig.masses)
+    exact = table.allowed_shares[chosen, None, None] * exact
     on_raster, at_cells = np.split(exact, [table.raster.point_count], axis=2)
     found = table.unit_fields(table.raster.points)[chosen]
     tolerance = CONTENT_TOLERANCE + _modal_error(table)

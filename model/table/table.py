@@ -24,6 +24,7 @@ from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,
     PlateOnEras,
+    allowed_shares,
     at_harmonics,
     attach,
 )
@@ -164,6 +165,8 @@ class LocalizationTable:
     ) -> Complex64Array:
         """Acceleration [m/s²] at points (p, 2) [m] by each ERA alone at full stroke, (f, eras, p).
 
+        Of exciters at `highest_drives`.
+
         contacts, loads: see `amplitudes`.
         """
         shapes = self.raster.at(self.shapes, points)
@@ -191,8 +194,8 @@ class LocalizationTable:
     ) -> tuple[FloatArray, Complex64Array]:
         """Frequencies (k,) [Hz] of an excitation, and its field by unit fields (f, eras, ...)."""
         frequencies, bases = base_amplitudes(excitation, self.eras)
-        weights = (bases / [era.full_level for era in self.eras]).astype(np.complex64)
         rows = self.rows_of(frequencies)
+        weights = (bases / self.highest_drives[rows]).astype(np.complex64)
         return frequencies, (weights[:, None] @ fields[rows])[:, 0]
 
     def rows_of(self, frequencies: FloatArray) -> IntArray:
@@ -331,8 +334,18 @@ class LocalizationTable:
 
     @cached_property
     def attached(self) -> AttachedPlate:
-        """The plate with its ERAs and masses at the drive frequencies."""
-        return self._attached(self.frequencies)
+        """The plate with its ERAs and masses at the drive frequencies, by `highest_drives`."""
+        return self._attached(self.frequencies).driven_less(self.allowed_shares)
+
+    @cached_property
+    def allowed_shares(self) -> FloatArray:
+        """Share of full level that all actuators may play together in any phases, (f,)."""
+        return allowed_shares(self._attached(self.frequencies), self.eras)
+
+    @cached_property
+    def highest_drives(self) -> FloatArray:
+        """Amplitude that each actuator may play at each frequency, of weight 1, (f, eras)."""
+        return np.asarray(self.allowed_shares[:, None] * [*self.full_levels.values()])
 
     def _attached(self, frequencies: FloatArray) -> AttachedPlate:
         return attach(
@@ -360,7 +373,8 @@ class LocalizationTable:
         """The same at twice the drive frequencies, of those thicknesses that come first there."""
         twice = self._attached(2 * self.frequencies)
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.bases}
-        return PlateOnEras.of(at_harmonics(twice, self.eras), *sorted(counts))
+        driven = at_harmonics(twice, self.eras).driven_less(self.allowed_shares)
+        return PlateOnEras.of(driven, *sorted(counts))
 
     @cached_property
     def error_power(self) -> Float32Array:

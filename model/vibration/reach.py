@@ -1,7 +1,7 @@
 """From which frequency a rig reaches a level over its plate, and where it falls short.
 
 At each place, as the mean over a finger that rests there, all actuators are in phase at full level,
-or at the share of it that the rig's limits and the excursion of the magnets allow them together.
+or at the share of it that the rig's limits and the excursion of the magnets allow answers.
 """
 
 import math
@@ -76,8 +76,9 @@ def reach_of(rig: Rig) -> Reach:
             for side, edge in margins
         )
     )
-    between = relative_motions(rig, free, frequencies)
+    moved = np.abs(relative_motions(rig, free, frequencies)).sum(axis=1)
     allowed = np.array([one.excursion for one in exciters_of(rig)])
+    level = np.minimum((allowed / moved).min(axis=1), limits.level)[:, None]
     threshold = detection_threshold(frequencies, rig.threshold)[:, None]
     found = []
     for few in np.array_split(places, math.ceil(len(places) / _AT_ONCE)):
@@ -88,8 +89,6 @@ def reach_of(rig: Rig) -> Reach:
             rig.eras, frequencies, points.reshape(-1, 2), loads=rig.masses
         ).reshape(len(frequencies), len(rig.eras), *weights.shape)
         phases = fields[..., 0].conj() / np.abs(fields[..., 0])
-        moved = np.abs(np.einsum("fep,fem->fmp", phases, between))
-        level = np.minimum((allowed[:, None] / moved).min(axis=1), limits.level)
         together = np.abs((fields * phases[..., None]).sum(axis=1))
         felt = level * (together * weights).sum(axis=-1)
         found.append(felt / _held(rig, free, few, frequencies) / threshold)

@@ -166,6 +166,7 @@ def set_answer(
         (),
         (),
         np.array([110.0]),
+        np.ones((1, 0)),
         np.ones(1, np.float32),
     )
     factor = limits.factor_within(found.amplitudes, defaultdict[str, float](lambda: STROKE))

@@ -329,7 +329,7 @@ class PlateAt:
     def loaded(self) -> ComplexArray:
         """Receptance between sensors and ERAs, each sensor's mass on the plate (f, s, n) [m/N]."""
         found = self.receptance[:, self.model.observed, : self.force.shape[1]]
-        return found if self.lightness is None else self.lightness[:, :, None] * found
+        return np.asarray(found if self.lightness is None else self.lightness[:, :, None] * found)
 
     @cached_property
     def seen(self) -> ComplexArray:

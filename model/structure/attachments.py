@@ -275,7 +275,7 @@ class Era(MeasuredGains):
         """Changes of D and of the force, which spring and damper pass on from the base."""
         w, base = np.asarray(omega), self.base(omega)
         held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
-        bolt = -(w**2) + 0j, np.zeros(w.shape, dtype=complex)
+        bolt = np.asarray(-(w**2) + 0j), np.zeros(w.shape, dtype=complex)
         found = {kind: (np.asarray(own), np.asarray(own * base)) for kind, own in held.items()}
         return found | {"bolt_mass": bolt}
 

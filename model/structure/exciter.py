@@ -196,7 +196,7 @@ class Exciter(MeasuredGains):
         A heavier magnet moves less, dT = T (1 - T) dM / M.
         """
         w, share, force = np.asarray(omega), self._share(omega), self.force(omega)
-        base, still = self.base(w), 1 - share
+        base, still = self.base(w), np.asarray(1 - share)
         electric = 2j * w * self.force_factor**2 / self._impedance(w)
 
         def by_spring(change: ComplexArray | float) -> tuple[ComplexArray, ComplexArray]:
@@ -207,9 +207,9 @@ class Exciter(MeasuredGains):
         return {
             "stiffness": by_spring(self.stiffness),
             "damping": by_spring(np.asarray(1j * w)),
-            "force_factor": (by_factor, of_force + force),
+            "force_factor": (by_factor, np.asarray(of_force + force)),
             "magnet_mass": (np.asarray(self._spring(w) * share * still), np.asarray(force * still)),
-            "bolt_mass": (-(w**2) + 0j, np.zeros(w.shape, dtype=complex)),
+            "bolt_mass": (np.asarray(-(w**2) + 0j), np.zeros(w.shape, dtype=complex)),
         }
 
     def _impedance(self, w: FloatArray) -> ComplexArray:

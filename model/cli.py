@@ -11,10 +11,12 @@ from model.commands.table_cli import query, table_app
 from model.commands.table_files_cli import build, contrast_map, export, plot
 from model.commands.table_show_cli import show as show_table
 from model.commands.table_show_cli import verify
+from model.commands.template_cli import template
 from model.errors import InputError
 
 plate_app.command()(materials)
 plate_app.command()(show)
+plate_app.command()(template)
 
 table_app.command()(build)
 table_app.command("show")(show_table)

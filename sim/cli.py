@@ -10,7 +10,9 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
+from sim.desk.impedance_cli import MeasureCommand
 from sim.desk.measure_cli import measure
+from sim.desk.outputs_cli import outputs
 from sim.desk.soft_amp_cli import port_option, soft_amp
 from sim.witness_cli import witness
 
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(witness)
 app.command("soft-amp")(soft_amp)
-app.command()(measure)
+app.command(cls=MeasureCommand)(measure)
+app.command()(outputs)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""

@@ -329,7 +329,7 @@ def test_example_has_a_name_that_the_project_does_not_have(kind: Kind, install: 
     for file in (Path(__file__).parents[1] / "examples" / "plugins").glob("*/pyproject.toml"):
         points = tomllib.loads(file.read_text("utf-8"))["project"]["entry-points"]
         for name in points.get(f"era_haptics.{kind.group}", ()):
-            install(file.parent.name, kind, name, None)
+            install(f"{file.parent.name}_{name}", kind, name, None)
             with pytest.raises(kind.error) as caught:
                 kind.look_up(name)
             assert "(era-haptics," not in str(caught.value), (
@@ -374,6 +374,16 @@ def test_plugin_has_the_name_of_its_entry_point(kind: Kind, install: Install) ->
     install("good", kind, "finer", kind.works)
     with pytest.raises(kind.error, match=r"of package good .*'fine'"):
         kind.look_up("finer")
+
+
+def test_format_whose_ending_has_a_dot(install: Install, tmp_path: Path) -> None:
+    """Of `a.fine.json` the longest ending that is known counts, whatever its case."""
+    kind = next(kind for kind in KINDS if kind.group == "content_formats")
+    install("one", kind, "json", kind.works.replace("'fine'", "'json'"))
+    source = kind.works.replace("'fine'", "'fine.json'").replace("Format\n", "Format, Pattern\n", 1)
+    install("two", kind, "fine.json", source.replace("pass", "return Pattern(0.5)"))
+    (file := tmp_path / "a.FINE.json").write_text("")
+    assert read_content(file).duration == 0.5
 
 
 @made_of_urls

@@ -18,6 +18,7 @@ RATE, BLOCK = 48_000, 128
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
 _COMMAND = 900.0  # s
+_MOVED = 2.0  # s; the plate is computed anew
 
 Place = tuple[float, float]
 
@@ -51,7 +52,35 @@ class Desk:
 
     def touch_plate(self, fingers: Sequence[Place]) -> None:
         """Put fingers on the plate."""
-        self._plate.write(json.dumps({"fingers": list(fingers)}) + "\n")
+        self._change({"fingers": list(fingers)})
+
+    def measure_by_moving(self, *arguments: object) -> None:
+        """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError."""
+        with subprocess.Popen(
+            [str(ERA), "measure", *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+            bufsize=1,
+            cwd=self.folder,
+            env=self.environment,
+        ) as process:
+            assert process.stdin is not None
+            assert process.stderr is not None
+            said = ""
+            while letter := process.stderr.read(1):
+                said += letter
+                if said.endswith("then Enter: "):
+                    self._change({"sensor": said.rpartition("sensor at ")[2].split(",")[0]})
+                    time.sleep(_MOVED)
+                    process.stdin.write("\n")
+                    process.stdin.flush()
+        if process.returncode or "not kept" in said:
+            raise RuntimeError(f"era measure: status {process.returncode}: {said}")
+
+    def _change(self, what: Mapping[str, object]) -> None:
+        self._plate.write(json.dumps(what) + "\n")
         self._plate.flush()
 
     @property
@@ -62,8 +91,10 @@ class Desk:
 
 
 @contextlib.contextmanager
-def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
-    """A desk with a plate of its own; seed: of its deviations."""
+def desk(
+    folder: Path, *, seed: int, mesh: str = "8x6 Q3", sensors: str | None = None
+) -> Iterator[Desk]:
+    """A desk with a plate of its own; seed: of its deviations; sensors: another file's content."""
     name = f"desk{os.getpid()}-{next(_numbers)}"  # several plates may be on desks at once
     environment = os.environ | {
         "JACK_DEFAULT_SERVER": name,
@@ -73,7 +104,8 @@ def desk(folder: Path, *, seed: int, mesh: str = "8x6 Q3") -> Iterator[Desk]:
     link = folder / "amp"
     text = (EXAMPLES / "rig.yaml").read_text("utf-8")
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
-    (folder / "sensors.csv").write_text((EXAMPLES / "sensors.csv").read_text("utf-8"), "utf-8")
+    given = (EXAMPLES / "sensors.csv").read_text("utf-8") if sensors is None else sensors
+    (folder / "sensors.csv").write_text(given, "utf-8")
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     with contextlib.ExitStack() as stack:

@@ -52,7 +52,8 @@ def desk_plate(
         bool,
         typer.Option(
             "--until-eof",
-            help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch it.',
+            help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch it, '
+            '{"sensor": NAME} moves the only sensor.',
         ),
     ] = False,
 ) -> None:
@@ -72,7 +73,7 @@ def desk_plate(
     from sim.sensors.sensor_file import read_sensors
 
     rig = load_rig(rig_file)
-    sensors = read_sensors(sensors_file, rig.plate)
+    sensors = read_sensors(sensors_file, rig.plate, may_move=True)
     drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
     client = JackClient(name, is_only=True)
     try:
@@ -105,18 +106,23 @@ def _run(running: "JackPlate", plate: "DeskPlate", *, until_eof: bool) -> None:
             line = sys.stdin.readline()
             if not line:
                 return
-            places = _places(line)
-            plate.set_fingers(places)
-            print(json.dumps({"fingers": len(places)}), flush=True)
+            print(json.dumps(_changed(plate, line)), flush=True)
 
 
-def _places(line: str) -> list[tuple[float, float]]:
+def _changed(plate: "DeskPlate", line: str) -> dict[str, object]:
+    """Change what a line says; return what is there now."""
     try:
-        return [(float(x), float(y)) for x, y in json.loads(line)["fingers"]]
+        wanted = json.loads(line)
+        if "sensor" in wanted:
+            plate.move_sensor(str(wanted["sensor"]))
+            return {"sensor": wanted["sensor"]}
+        places = [(float(x), float(y)) for x, y in wanted["fingers"]]
     except (ValueError, TypeError, KeyError) as problem:
         raise InputError(
-            f'a line must be {{"fingers": [[X, Y], ...]}}, got {line[:60]!r}'
+            f'a line must be {{"fingers": [[X, Y], ...]}} or {{"sensor": NAME}}, got {line[:60]!r}'
         ) from problem
+    plate.set_fingers(places)
+    return {"fingers": len(places)}
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
+from model.errors import InputError
 from model.structure.attachments import FingertipLoad, fingertip_loads
-from sim.sensors.sensor_file import WiredSensor
+from sim.sensors.sensor_file import WiredSensor, are_places
 
 _LOOPED = 0.9  # of what a cable from an output to an input brings back
 
@@ -19,8 +20,9 @@ class DeskPlate:
     """A plate with accelerometers, a loop-back cable, and fingers on request.
 
     Outputs of the card: as many as the highest channel of an ERA, and one more for the loop-back.
-    Inputs: those of the sensors, and the next for the loop-back. rate [Hz]. `advance` and
-    `set_fingers` may be called by different threads.
+    Inputs: those of the sensors, and the next for the loop-back. rate [Hz]. One sensor that is
+    moved is at the first of its places, with its mass. `advance`, `set_fingers` and `move_sensor`
+    may be called by different threads.
     """
 
     def __init__(
@@ -37,8 +39,11 @@ class DeskPlate:
         self._columns = [rig.wiring[era.name].number for era in rig.eras]
         self.outputs = max(self._columns) + 2
         self._model = DeskModel(truth, np.array([[sensor.x, sensor.y] for sensor in sensors]))
+        self._sensors = tuple(sensors)
+        self._fingers: tuple[FingertipLoad, ...] = ()
+        self._place = 0 if are_places(sensors) else None
         self._channels = SensorChannels(
-            sensors,
+            sensors if self._place is None else sensors[:1],
             loopback=max(sensor.input for sensor in sensors) + 1,
             converters=converters,
             rate=rate,
@@ -46,7 +51,7 @@ class DeskPlate:
         )
         self.inputs = self._channels.count
         self._next: LiftedBlocks | None = None
-        self._plate = self._under(())
+        self._plate = self._now()
         self._kept = self._model.shared
 
     def set_fingers(self, places: Sequence[tuple[float, float]]) -> None:
@@ -54,10 +59,23 @@ class DeskPlate:
 
         The plate's motion is continuous; phalanges begin at rest.
         """
-        self._next = self._under(fingertip_loads(self._truth.rig.fingertip, places))
+        self._fingers = tuple(fingertip_loads(self._truth.rig.fingertip, places))
+        self._next = self._now()
 
-    def _under(self, fingers: Sequence[FingertipLoad]) -> LiftedBlocks:
-        return LiftedBlocks(sampled(self._model.under(fingers), rate=self._rate))
+    def move_sensor(self, name: str) -> None:
+        """Put a sensor that is moved to another of its places; raises InputError."""
+        names = [sensor.name for sensor in self._sensors]
+        if self._place is None or name not in names:
+            raise InputError(
+                f"a sensor is moved to one of the places of one sensor, got {name!r} of "
+                f"{', '.join(names)}"
+            )
+        self._place = names.index(name)
+        self._next = self._now()
+
+    def _now(self) -> LiftedBlocks:
+        moved = None if self._place is None else (self._place, self._sensors[self._place].mass)
+        return LiftedBlocks(sampled(self._model.under(self._fingers, moved=moved), rate=self._rate))
 
     def advance(self, played: FloatArray) -> FloatArray:
         """Samples (n, inputs) for samples (n, outputs); n a multiple of 16."""

@@ -1,12 +1,14 @@
 """A plate on its ERAs in continuous time: from samples at the actuators to accelerations.
 
-Coordinates are those of the free plate (`ReducedPlate`), the base y of each ERA, and the phalanx of
-each finger. Mounts and fingers couple the modes; their damping is not proportional:
+Coordinates q are those of the free plate (`ReducedPlate`) and the free end of each actuator that
+has one, as the magnet of an exciter; then there are the drive y of each actuator, the base of an
+ERA or the voltage of an exciter, and the phalanx of each finger. Actuators and fingers couple the
+modes; their damping is not proportional. With the actuators' `InTime`,
 
-    M q'' + C q' + K q = Phi_e^T (k y + c y'),   y'' + 2 zeta w y' + w² y = g w² stroke u
+    M q'' + C q' + K q = Phi_e^T (b y + b' y'),   y'' + 2 zeta w y' + w² y = g w² full level u
 
-The base is a state, so that accelerations follow from it: with the base as input they would grow
-with frequency.
+The drive is a state, so that accelerations follow from it: with it as input they would grow with
+frequency.
 """
 
 from collections.abc import Sequence
@@ -28,8 +30,8 @@ FREQUENCY_MAX = 1000.0
 class ModelInTime:
     """x' = A x + B u, accelerations C x [m/s²] at points.
 
-    A (n, n), B (n, eras), C (points, n); x has displacements and velocities of the reduced
-    coordinates, then of the bases, then of the phalanges.
+    A (n, n), B (n, eras), C (points, n); x has displacements and velocities of the coordinates of
+    plate and free ends, then of the drives, then of the phalanges.
     """
 
     A: FloatArray
@@ -56,34 +58,61 @@ class DeskModel:
         self._plate: ReducedPlate = reduce_plate(
             rig.plate, rig.mesh, attached, frequency_max=FREQUENCY_MAX
         )
-        self._at_attached = self._plate.at(attached)
-        self._at_points = self._plate.at(points)
+        far = [(n, era.in_time.far_mass) for n, era in enumerate(rig.eras)]
+        self._far_masses = np.array([mass for _, mass in far if mass is not None])
+        self._at_attached = self._extended(self._plate.at(attached))
+        self._at_points = self._extended(self._plate.at(points))
+        free = [n for n, mass in far if mass is not None]
+        # Forces of an actuator push its two ends apart.
+        self._at_attached[free, len(self._plate.omega) :] = -np.eye(len(free))
+
+    def _extended(self, shapes: FloatArray) -> FloatArray:
+        """Shapes of the plate (p, r) in all coordinates, in which free ends are at rest."""
+        return np.hstack([shapes, np.zeros((len(shapes), len(self._far_masses)))])
+
+    @property
+    def _size(self) -> int:
+        """Number of coordinates of plate and free ends."""
+        return len(self._plate.omega) + len(self._far_masses)
 
     @property
     def shared(self) -> int:
         """Number of the first states, which are the same under any fingers."""
-        return 2 * len(self._plate.omega) + 2 * len(self._truth.rig.eras)
+        return 2 * self._size + 2 * len(self._truth.rig.eras)
 
-    def under(self, fingers: Sequence[FingertipLoad] = ()) -> ModelInTime:
-        """The plate with fingers on it."""
-        rig, r = self._truth.rig, len(self._plate.omega)
+    def under(
+        self, fingers: Sequence[FingertipLoad] = (), *, moved: tuple[int, float] | None = None
+    ) -> ModelInTime:
+        """The plate with fingers on it.
+
+        moved: the only point with an accelerometer now, by its number, and its mass [kg].
+        """
+        rig, r = self._truth.rig, self._size
         count = len(rig.eras)
         at_eras, at_masses = self._at_attached[:count], self._at_attached[count:]
-        k, c, m = (
-            np.array([getattr(era, key) for era in rig.eras])
-            for key in ("stiffness", "damping", "bolt_mass")
+        k, c, m, inertance, by_drive, by_rate = (
+            np.array([getattr(era.in_time, key) for era in rig.eras])
+            for key in ("stiffness", "damping", "mass", "inertance", "by_drive", "by_rate")
         )
-        mass = np.eye(r) + (at_eras.T * m) @ at_eras
+        plain = self._extended(at_eras[:, : len(self._plate.omega)])  # of the plate's ends alone
+        mass = linalg.block_diag(np.eye(len(self._plate.omega)), np.diag(self._far_masses))
+        mass += (plain.T * m) @ plain + (at_eras.T * inertance) @ at_eras
         damping = (at_eras.T * c) @ at_eras
-        elastic = self._plate.omega**2
-        stiffness = np.diag(elastic) + (at_eras.T * k) @ at_eras
+        stiffness = np.diag(self._elastic) + (at_eras.T * k) @ at_eras
         for load, shape in zip(rig.masses, at_masses, strict=True):
             mass += load.mass * np.outer(shape, shape)
             damping += load.damping * np.outer(shape, shape)
             stiffness += load.stiffness * np.outer(shape, shape)
         damping += self._structural(mass, stiffness)
+        at_points = self._at_points
+        if moved is not None:
+            number, weight = moved
+            at_points = at_points[[number]]
+            mass += weight * at_points.T @ at_points
 
-        contacts = self._plate.at(footprints_of(fingers)) if fingers else np.empty((0, r))
+        contacts = np.empty((0, r))
+        if fingers:
+            contacts = self._extended(self._plate.at(footprints_of(fingers)))
         p = len(fingers)
         n = 2 * r + 2 * count + 2 * p
         A, B = np.zeros((n, n)), np.zeros((n, count))
@@ -99,7 +128,7 @@ class DeskModel:
 
         force = np.zeros((r, n))
         force[:, q], force[:, v] = -stiffness, -damping
-        force[:, y], force[:, w] = at_eras.T * k, at_eras.T * c
+        force[:, y], force[:, w] = at_eras.T * by_drive, at_eras.T * by_rate
         force[:, x], force[:, u] = contacts.T * pulp, contacts.T * loss
         motion = linalg.solve(mass, force, assume_a="pos")
         A[q, v], A[v] = np.eye(r), motion
@@ -121,7 +150,12 @@ class DeskModel:
             A[row, v] = tip.damping / tip.phalanx_mass * shape
             A[row, phalanx] = -(tip.stiffness + tip.joint_stiffness) / tip.phalanx_mass
             A[row, row] = -(tip.damping + tip.joint_damping) / tip.phalanx_mass
-        return ModelInTime(A, B, self._at_points @ motion)
+        return ModelInTime(A, B, at_points @ motion)
+
+    @property
+    def _elastic(self) -> FloatArray:
+        """Eigenvalues of the plate [rad²/s²], none of free ends."""
+        return np.append(self._plate.omega**2, np.zeros(len(self._far_masses)))
 
     def _structural(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
         """Viscous damping that loses at each resonance of the supported plate what eta does.
@@ -129,7 +163,7 @@ class DeskModel:
         eta K_plate between modes j and k of the supported plate, over sqrt(omega_j omega_k).
         """
         values, modes = linalg.eigh(stiffness, mass)
-        elastic = (modes.T * self._plate.omega**2) @ modes * self._truth.rig.plate.loss_factor
-        roots = values**0.25
+        elastic = (modes.T * self._elastic) @ modes * self._truth.rig.plate.loss_factor
+        roots = np.maximum(values, 1e-3) ** 0.25
         weighted = mass @ modes
         return np.asarray(weighted @ (elastic / np.outer(roots, roots)) @ weighted.T)

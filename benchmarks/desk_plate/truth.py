@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ MESH = "16x12 Q3"
 """Elements of high order: another solver than the polynomials of a table."""
 
 _RESONANCES = 550.0, 800.0  # Hz, of actuators; above the played range, but felt in its phases
+_AMPLIFIERS = 2.5e3, 3.5e3  # Hz, of filters before exciters; far above the band
+_MAGNET = 0.05
 _RATIOS = 0.2, 0.4  # of their damping
 _PLACE = 1e-3  # m
 _BOLT = 0.008  # kg
@@ -55,9 +58,7 @@ class Truth:
             "eras": {
                 era.name: {
                     "at_m": [era.x, era.y],
-                    "stiffness": era.stiffness,
-                    "damping": era.damping,
-                    "bolt_mass": era.in_time.mass,
+                    **{kind: getattr(era, field) for kind, field in era.fields.items()},
                     "resonance_hz": actuator.resonance,
                     "damping_ratio": actuator.ratio,
                     "gain": actuator.gain,
@@ -70,7 +71,8 @@ class Truth:
 def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     """Draw a plate of a rig: by the rig's uncertainty, with places, bolts and actuators of its own.
 
-    Places are off by 1 mm (standard deviation), bolts weigh up to 8 g more.
+    Places are off by 1 mm (standard deviation), bolts weigh up to 8 g more, magnets of exciters
+    differ by 5 %.
     """
     rng = np.random.default_rng(seed)
     std = rig.uncertainty
@@ -82,25 +84,31 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     loss = min(plate.loss_factor * std.damping ** rng.standard_normal(), 0.5)
     plate = replace(plate, loss_factor=float(loss))
     damping = std.damping ** rng.standard_normal()
-    eras = tuple(
-        replace(
-            era,
-            x=float(x),
-            y=float(y),
-            stiffness=era.stiffness * relative(std.stiffness),
-            damping=float(era.damping * damping * relative(std.stiffness)),
-            bolt_mass=era.bolt_mass + float(rng.uniform(0, _BOLT)),
-            gains=(),
-        )
-        for era in rig.eras
-        if isinstance(era, Era)
-        for x, y in (_near((era.x, era.y), plate, rng),)
-    )
+    eras = []
+    for era in rig.eras:
+        x, y = _near((era.x, era.y), plate, rng)
+        changes: dict[str, Any] = {
+            "x": x,
+            "y": y,
+            "stiffness": era.stiffness * relative(std.stiffness),
+            "damping": float(era.damping * damping * relative(std.stiffness)),
+        }
+        if isinstance(era, Era):
+            changes["bolt_mass"] = era.bolt_mass + float(rng.uniform(0, _BOLT))
+        else:
+            changes["magnet_mass"] = era.magnet_mass * relative(_MAGNET)
+        eras.append(replace(era, gains=(), **changes))
     actuators = tuple(
-        Actuator(float(rng.uniform(*_RESONANCES)), float(rng.uniform(*_RATIOS)), relative(std.gain))
-        for _ in eras
+        Actuator(
+            float(rng.uniform(*(_RESONANCES if isinstance(era, Era) else _AMPLIFIERS))),
+            float(rng.uniform(*_RATIOS)),
+            relative(std.gain),
+        )
+        for era in eras
     )
-    return Truth(replace(rig, plate=plate, eras=eras, mesh=parse_mesh(mesh, plate)), actuators)
+    return Truth(
+        replace(rig, plate=plate, eras=tuple(eras), mesh=parse_mesh(mesh, plate)), actuators
+    )
 
 
 def _near(place: Sequence[float], plate: Plate, rng: np.random.Generator) -> tuple[float, float]:

@@ -180,7 +180,7 @@ class ContactStatus(Message):
         None, description="whether it is to feel the pattern; null before the first decision"
     )
     level_db_sl: float | None = Field(
-        None, description="predicted sensation level; null if unknown"
+        None, description="predicted sensation level of a target; null if unknown"
     )
     promised_contrast_db: float | None = Field(None, description=PROMISED)
     contrast_db: float | None = Field(

@@ -20,7 +20,7 @@ from controller.content.rendition import (
     requested_level,
 )
 from model.answer.answer import Answer
-from model.answer.fingers import Finger, Stimulus
+from model.answer.fingers import Finger, Stimulus, check_level
 from model.answer.plan import answer
 from model.arrays import FloatArray
 from model.choice import best_of
@@ -172,6 +172,7 @@ def play_content(
     quiet: Sequence[Position] = (),
 ) -> PlayedContent:
     """Play a pattern at a finger in time; arguments and errors as of `check_content`."""
+    check_level(level_db_sl)
     rendition = rendered(pattern, level_db_sl, table.frequencies)
     if quiet:
         rendition = rendition.smoothed()

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from controller.check.content_check import RANGE_DB, TOLERANCE_DB, CheckedContent
 from controller.content.pattern import Pattern, along
-from controller.content.rendition import sharpness_hz
+from controller.content.sharpness import hertz_of
 
 _REQUESTED, _FELT = "#888888", "#0b5cad"
 
@@ -27,10 +27,10 @@ def content_figure(pattern: Pattern, checked: CheckedContent) -> Figure:
         f"{100 * checked.kept_share:.0f} % kept, felt {1000 * checked.delay:.0f} ms later",
         fontsize=10,
     )
-    tones.plot(times, sharpness_hz(along(pattern.sharpness, times)), color=_REQUESTED, lw=1)
+    tones.plot(times, hertz_of(along(pattern.sharpness, times)), color=_REQUESTED, lw=1)
     sharpness = np.array([each.sharpness for each in pattern.transients])
     starts = [each.time for each in pattern.transients]
-    tones.plot(starts, sharpness_hz(sharpness), "x", color=_REQUESTED)
+    tones.plot(starts, hertz_of(sharpness), "x", color=_REQUESTED)
     for part in checked.parts:
         if part.frequency is not None:
             until = part.start + (part.stimulus.duration or 0.0)

@@ -6,6 +6,8 @@ Also how commands measure it.
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,6 +57,14 @@ def identify(
     quick: Annotated[
         bool, typer.Option("--quick", help="Play every tone on one ERA only: a third of the time.")
     ] = False,
+    measured_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--measured",
+            metavar="MEASURED.uff|.csv",
+            help="Responses that era measure has written instead, as of a sensor that is moved.",
+        ),
+    ] = None,
     device: Annotated[
         str | None,
         typer.Option(
@@ -105,8 +115,8 @@ def identify(
 
     Write its rig with what is left uncertain. Every ERA plays small tones of its own at the same
     time, the amplifiers' sensors listen. With --device a sound card plays multisines and records
-    accelerometers, as era measure does, with its loop-back cable. Exit status 1, and no rig is
-    written, where the model does not explain what they heard.
+    accelerometers, as era measure does, with its loop-back cable; with --measured nothing is
+    played. Exit status 1, and no rig is written, where the model does not explain what was heard.
     """
     import time
 
@@ -118,6 +128,9 @@ def identify(
     from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
+    if measured_file is not None:
+        played = {"--url": url, "--level": level, "--quick": quick or None, "--device": device}
+        _refuse(played, rule="plays; leave it out beside --measured")
     if device is None:
         only = {"--sensors": sensors_file, "--frequencies": frequencies, "--periods": periods}
         _refuse(only, rule="needs --device")
@@ -140,8 +153,11 @@ def identify(
         check_measurable(rig.plate)
         source = Path(document.source)
         check_rig_output(output, rig_file, source)
-        require_untouched(is_known=untouched, has_terminal=not as_json)
-        if settings is not None:
+        if measured_file is None:
+            require_untouched(is_known=untouched, has_terminal=not as_json)
+        if measured_file is not None:
+            measured = _measured_before(measured_file, rig)
+        elif settings is not None:
             with progress_bar("runs") as progress:
                 measured = measure_by_device(rig, settings, progress=progress)
         else:
@@ -184,6 +200,31 @@ def _refuse(given: Mapping[str, object], *, rule: str) -> None:
     for name, value in given.items():
         if value is not None:
             raise InputError(f"{name} {rule}")
+
+
+def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
+    """Responses of a file, where they are what they claim to be; raises InputError."""
+    import numpy as np
+
+    from model.calibration.responses import responses_of
+    from model.calibration.responses_file import read_measured
+    from model.diagnosis.consistency import check_consistency
+    from model.identification.measurement import MeasuredPlate
+
+    responses = responses_of(read_measured(path), rig)
+    screened = check_consistency(rig, responses)
+    dead = [*compress(responses.sensors, screened.dead_sensors)]
+    live = responses.without(screened.dead_sensors)
+    live = replace(live, values=np.where(screened.dead_eras[:, None], np.nan, live.values))
+    places = zip(live.sensors, live.points.tolist(), live.sensor_masses.tolist(), strict=True)
+    return MeasuredPlate(
+        live.as_measurement(),
+        None,
+        None,
+        tuple({"sensor": n, "x_m": x, "y_m": y, "mass_g": 1e3 * m} for n, (x, y), m in places),
+        tuple(f"{name} has no signal, left out" for name in dead),
+        {"values_beyond_limits": live.skipped},
+    )
 
 
 @contextmanager
@@ -269,11 +310,12 @@ def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
 
     measurement = measured.measurement
     low, high = measurement.frequencies[0], measurement.frequencies[-1]
+    level = "" if measured.level is None else f" at a level of {measured.level:.3g}"
+    duration = "" if measured.duration is None else f" in {measured.duration:.1f} s"
     return (
         f"{counted(len(rig.eras), 'ERA')}, {counted(len(measurement.sensors), 'sensor')}, "
-        f"{counted(len(measurement.frequencies), 'tone')} from {low:g} to {high:g} Hz at a level "
-        f"of {measured.level:.3g}, {counted(measurement.count, 'response')} in "
-        f"{measured.duration:.1f} s"
+        f"{counted(len(measurement.frequencies), 'tone')} from {low:g} to {high:g} Hz{level}, "
+        f"{counted(measurement.count, 'response')}{duration}"
     )
 
 

@@ -30,7 +30,10 @@ COMMANDS = ("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.
 
 SECTIONS = {
     "Try": ("demo", "sim", "figure"),
-    "Plate": ("config", "plate", "table", "layout", "calibrate", "rig", "design", "measure"),
+    "Plate": (
+        *("config", "plate", "table", "layout", "calibrate", "rig", "design", "outputs"),
+        "measure",
+    ),
     "Run": (
         *("daemon", "status", "arm", "disarm", "stop", "clear", "touch", "watch", "gateway"),
         *("forget", "reload", "report"),

@@ -3,25 +3,14 @@
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from controller.content.pattern import Pattern
+from controller.content.pattern import MAX_DURATION, Pattern
 from model.config.document import ConfigError, ConfigProblem
 
 MAX_SIZE = 4 << 20
 """Largest file [bytes]."""
 
-MAX_DURATION = 60.0
-"""Longest content [s]."""
-
 MAX_POINTS = 20_000
 """Most points of a file: breakpoints, keyframes, events, or what one of them is made of."""
-
-MIN_HZ, MAX_HZ = 65.0, 300.0
-"""Frequencies of sharpness 0 and 1 [Hz], as the MPEG reference encoder reads AHAP."""
-
-
-def sharpness_of(frequency: float) -> float:
-    """Return the sharpness of a frequency [Hz], 0 and 1 outside their range."""
-    return min(max((frequency - MIN_HZ) / (MAX_HZ - MIN_HZ), 0.0), 1.0)
 
 
 def refusal(source: str, message: str, *, line: int | None = None, key: str = "") -> ConfigError:

@@ -10,7 +10,7 @@ from controller.content.ahap import Ahap
 from controller.content.format import MAX_SIZE, ContentFormat, refusal, too_much
 from controller.content.haptic import Haptic
 from controller.content.hjif import Hjif
-from controller.content.pattern import Pattern
+from controller.content.pattern import Pattern, misfit
 from controller.content.wav import Wav
 from model.config.document import read_bytes
 from model.errors import InputError
@@ -58,7 +58,9 @@ def read_content(path: Path, channel: int | None = None) -> Pattern:
 
     channel: which one, counted from 1, of a format that has several; None for the first.
     """
-    source, ending = str(path), path.suffix[1:].lower()
+    source, name = str(path), path.name.lower()
+    known = [each for each in content_formats() if name.endswith(f".{each}")]
+    ending = max(known, key=len, default=path.suffix[1:].lower())
     if ending in _REFUSED:
         raise refusal(source, _REFUSED[ending])
     reader = content_format(ending, within=source)()
@@ -72,7 +74,8 @@ def read_content(path: Path, channel: int | None = None) -> Pattern:
     pattern = reader.read(given, source, channel or 1)
     if not isinstance(pattern, Pattern):
         raise WrongResultError(reader, pattern, Pattern)
-    if problem := too_much(pattern.duration, len(pattern.intensity) + len(pattern.transients)):
+    count = len(pattern.intensity) + len(pattern.transients)
+    if problem := too_much(pattern.duration, count) or misfit(pattern):
         raise refusal(source, problem)
     return pattern
 
@@ -89,5 +92,6 @@ def named_content(name: str) -> Path:
             return each
     known = named_contents()
     raise InputError(
-        f"unknown content {name[:40]!r}; {did_you_mean(name, known)}known are {', '.join(known)}"
+        f"unknown content {name[:40]!a}; {did_you_mean(name, known)}known are {', '.join(known)}; "
+        "the name of a file needs its ending"
     )

@@ -86,8 +86,12 @@ class Haptic(ContentFormat):
         envelopes = file.signals.continuous.envelopes
         frequencies = envelopes.frequency or []
         path = ("signals", "continuous", "envelopes")
-        _check_order(validation, (*path, "amplitude"), [each.time for each in envelopes.amplitude])
-        _check_order(validation, (*path, "frequency"), [each.time for each in frequencies])
+        ends = dict[float, KeyPath]()
+        for name, points in (("frequency", frequencies), ("amplitude", envelopes.amplitude)):
+            _check_order(validation, (*path, name), [each.time for each in points])
+            ends |= {each.time: (*path, name, len(points) - 1) for each in points[-1:]}
+        if problem := too_much(max(ends), 0):
+            validation.add(ends[max(ends)], problem)
         for index, each in enumerate(envelopes.amplitude):
             if each.emphasis is not None and each.emphasis.amplitude < each.amplitude:
                 validation.add(
@@ -115,7 +119,7 @@ def _check_order(
     path: KeyPath,
     times: list[float],
 ) -> None:
-    """Check that no time is before the one ahead of it, and that there is not too much."""
+    """Check that no time is before the one ahead of it."""
     before = 0.0
     for index, time in enumerate(times):
         if time < before:
@@ -123,5 +127,3 @@ def _check_order(
             validation.add((*path, index, "time"), message)
             return
         before = time
-    if problem := too_much(before, len(times)):
-        validation.add((*path, len(times) - 1), problem)

@@ -12,10 +12,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from controller.content.format import MAX_HZ, MIN_HZ, ContentFormat, refusal, sharpness_of, too_much
+from controller.content.format import ContentFormat, refusal, too_much
 from controller.content.json_file import ContentSection, Entries, read_json
 from controller.content.mixing import Segment, between, mixed
 from controller.content.pattern import Pattern, Transient
+from controller.content.sharpness import MAX_HZ, MIN_HZ, sharpness_of
 from controller.content.wav import course_of
 from model.arrays import FloatArray
 from model.config.document import KeyPath
@@ -186,15 +187,14 @@ class _HjifReading:
 
     def _play(self, band: _Band, effect: _Effect, times: list[float]) -> None:
         if band.band_type == "Transient":
-            for time, each in zip(times, effect.keyframes, strict=True):
-                hertz = each.frequency_modulation
-                self._transients.append(
-                    Transient(
-                        time,
-                        min(abs(each.amplitude_modulation or 0.0) * self._gain, 1.0),
-                        self._sharpness(_TRANSIENT_HZ if hertz is None else hertz),
-                    )
+            hertz = [each.frequency_modulation for each in effect.keyframes]
+            given = np.array([_TRANSIENT_HZ if each is None else each for each in hertz])
+            self._transients += [
+                Transient(time, min(abs(each.amplitude_modulation or 0.0) * self._gain, 1.0), sharp)
+                for time, each, sharp in zip(
+                    times, effect.keyframes, self._sharpness(given), strict=True
                 )
+            ]
         elif band.band_type == "VectorialWave":
             self._add_wave(band, effect, times)
         else:
@@ -206,7 +206,7 @@ class _HjifReading:
         amplitude = abs(_course(times, effect, "amplitude_modulation", knots, 1.0)) * factor
         hertz = _course(times, effect, "frequency_modulation", knots, 0.0)
         hertz = hertz.clip(band.lower_frequency_limit, band.upper_frequency_limit)
-        sharpness = [[self._sharpness(each) for each in row] for row in hertz.tolist()]
+        sharpness = self._sharpness(hertz)
         self._segments += zip(
             knots[:-1].tolist(), knots[1:].tolist(), *amplitude.tolist(), *sharpness, strict=True
         )
@@ -233,9 +233,9 @@ class _HjifReading:
         self._segments += zip(shifted[:-1], shifted[1:], *levels, *sharps, strict=True)
         self._remarks += tuple(f"curve: {each}" for each in remarks)
 
-    def _sharpness(self, hertz: float) -> float:
-        self._moved += not MIN_HZ <= hertz <= MAX_HZ
-        return sharpness_of(hertz)
+    def _sharpness(self, hertz: FloatArray) -> Any:
+        self._moved += int(((hertz < MIN_HZ) | (hertz > MAX_HZ)).sum())
+        return sharpness_of(hertz).tolist()
 
     def pattern(self, source: str, remarks: tuple[str, ...]) -> Pattern:
         """Return what the bands ask for together."""

@@ -15,8 +15,9 @@ from model.config.document import Document, KeyPath, decoded, key_name
 from model.config.sections import Section
 from model.counting import counted
 
+_MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
-_MAX_OPENED = 5 * MAX_POINTS  # brackets: an event of AHAP has five
+_MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
 _MAX_NAMED = 5  # unknown keys in remarks
 
 _SPACE = re.compile(r"[ \t\n\r]*")
@@ -66,6 +67,8 @@ class JsonDocument(Document):
 
 def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> JsonDocument:
     """Read an object; raises ConfigError for what is not JSON, nested too deep or repeated."""
+    if len(content) > _MAX_SIZE:
+        raise refusal(source, f"is larger than {_MAX_SIZE >> 20} MiB; shorten the content")
     text = decoded(source, content).removeprefix("\ufeff")
     if has_trailing_commas:
         text = _TRAILING_COMMA.sub(lambda found: found[1] or " ", text)
@@ -78,7 +81,9 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         message = f"is given twice, first on line {first}; remove one"
         raise refusal(source, message, line=line, key=key_name(path)) from None
     except json.JSONDecodeError as error:
-        message = f"is not valid JSON: {error.msg} in column {error.colno}"
+        is_cut = not text.rstrip().endswith("}")
+        remedy = "its end is missing: export it again" if is_cut else "correct it there"
+        message = f"is not valid JSON: {error.msg} in column {error.colno}; {remedy}"
         raise refusal(source, message, line=error.lineno) from error
     if not isinstance(data, dict):
         raise refusal(source, "must be an object in braces, got another value", line=1)
@@ -128,7 +133,7 @@ def _repeated(text: str, at: int, path: KeyPath) -> Iterator[tuple[int, KeyPath,
 
 
 def _check_size(source: str, text: str) -> None:
-    """Refuse what is nested too deep, or has too many objects and lists, before it is parsed."""
+    """Refuse what is nested too deep, or has too many values, before it is parsed."""
     bare = _STRINGS.sub("", text)
     codes = np.frombuffer(bare.encode("utf-32-le", "surrogatepass"), np.uint32)
     opened = (codes == ord("{")) | (codes == ord("["))
@@ -136,8 +141,8 @@ def _check_size(source: str, text: str) -> None:
     if len(levels) and levels.max() > _MAX_LEVELS:
         line = _line(bare, int(np.argmax(levels > _MAX_LEVELS)))
         raise refusal(source, f"is nested more than {_MAX_LEVELS} levels deep", line=line)
-    if np.count_nonzero(opened) > _MAX_OPENED:
-        raise refusal(source, f"has more than {_MAX_OPENED} objects and lists; shorten it")
+    if np.count_nonzero(opened | (codes == ord(","))) > _MAX_VALUES:
+        raise refusal(source, f"has more than {_MAX_VALUES} values; shorten it")
 
 
 def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:

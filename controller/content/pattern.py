@@ -11,6 +11,9 @@ import numpy as np
 
 from model.arrays import FloatArray
 
+MAX_DURATION = 60.0
+"""Longest content [s]."""
+
 Curve: TypeAlias = tuple[tuple[float, float], ...]
 """Times [s], none before the one ahead of it, and values 0 to 1: straight lines, steps where two
 times are equal."""
@@ -39,6 +42,28 @@ class Pattern:
     sharpness: Curve = ()
     transients: tuple[Transient, ...] = ()
     remarks: tuple[str, ...] = ()
+
+
+def misfit(pattern: Pattern) -> str:
+    """Return what is wrong with a pattern that a format has made, or ""."""
+    if not pattern.duration >= 0:  # also for NaN
+        return f"must last 0 s or longer, got {pattern.duration:g} s"
+    taps = pattern.transients
+    for name, curve in (
+        ("intensity", pattern.intensity),
+        ("sharpness", pattern.sharpness),
+        ("intensity of transients", [(each.time, each.intensity) for each in taps]),
+        ("sharpness of transients", [(each.time, each.sharpness) for each in taps]),
+    ):
+        before = 0.0
+        for index, (time, value) in enumerate(curve):
+            if not before <= time <= MAX_DURATION:
+                bounds = f"{before:g} to {MAX_DURATION:g} s"
+                return f"time of {name}[{index}] must be {bounds}, got {time:g} s"
+            if not 0 <= value <= 1:
+                return f"{name}[{index}] must be 0 to 1, got {value:g} at {time:g} s"
+            before = time
+    return ""
 
 
 def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:

@@ -5,8 +5,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from controller.content.format import MAX_DURATION
-from controller.content.pattern import Pattern, Transient, along
+from controller.content.pattern import MAX_DURATION, Pattern, Transient, along
 from model.errors import InputError
 
 MAX_GIVEN = 500

@@ -10,8 +10,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from controller.content.format import MAX_HZ, MIN_HZ
 from controller.content.pattern import Pattern, Transient, along
+from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray
@@ -112,7 +112,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     pattern = _as_tap(pattern)
     taps = _apart(pattern)
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
-    hertz = sharpness_hz(np.array([each.sharpness for each in taps]))
+    hertz = hertz_of(np.array([each.sharpness for each in taps]))
     clicks = tuple(
         Tap(tap.time, level, _band(frequency, frequencies))
         for tap, level, frequency in zip(taps, levels.tolist(), hertz.tolist(), strict=True)
@@ -135,7 +135,7 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     if highest := float(shares.max()):
         course = Course(tuple(times.tolist()), tuple((shares / highest).tolist()))
         of_taps = tuple((each.time, each.sharpness) for each in pattern.transients)
-        hertz = sharpness_hz(along(pattern.sharpness or of_taps, times))
+        hertz = hertz_of(along(pattern.sharpness or of_taps, times))
         band = _band(_carrier(hertz, shares**2), frequencies)
         modulation = _modulation(times, shares)
         remarks += _lost(hertz, shares, band, clicks)
@@ -165,11 +165,6 @@ def _with_taps(
     during = np.arange(len(number)) + (last - np.cumsum(last - first))[number]
     np.maximum.at(level, during, levels[number])
     return level
-
-
-def sharpness_hz(sharpness: FloatArray) -> FloatArray:
-    """Frequencies [Hz] of sharpness, 0 to 1."""
-    return MIN_HZ + sharpness * (MAX_HZ - MIN_HZ)
 
 
 def _band(hertz: float, frequencies: FloatArray) -> Band:

@@ -6,26 +6,20 @@ the sharpness is that of the stronger. What lies outside the frequencies that a 
 for is left out, and said in dB.
 """
 
-import io
 import math
-import warnings
 from typing import Any
 
 import numpy as np
 
-from controller.content.format import (
-    MAX_HZ,
-    MIN_HZ,
-    ContentFormat,
-    refusal,
-    sharpness_of,
-    too_much,
-)
+from controller.content.format import ContentFormat, refusal, too_much
 from controller.content.mixing import thinned
 from controller.content.pattern import Curve, Pattern
+from controller.content.sharpness import MAX_HZ, MIN_HZ, sharpness_of
 from model.arrays import FloatArray
+from model.errors import InputError
+from model.files.wav_file import samples_of
 
-_RATE = 200  # points a second
+_RATE = 200  # points a second, or a little more
 _PER_POINT = 10  # samples of the analytic signal
 _SPLIT = (110.0, 178.0)  # Hz; half an octave on both sides of the split fades over
 _OUTER_LOW, _OUTER_HIGH = (45.0, MIN_HZ), (MAX_HZ, 430.0)  # Hz; faded out beyond
@@ -62,31 +56,15 @@ class Wav(ContentFormat):
 
 def _samples(content: bytes, source: str) -> tuple[int, FloatArray]:
     """Return the rate [Hz], and samples (n, channels) of which 1 is full scale."""
-    from scipy.io import wavfile  # slow to import
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", r"Chunk \(non-data\)", wavfile.WavFileWarning)
-        try:
-            rate, given = wavfile.read(io.BytesIO(content))
-        except Exception as error:  # of a damaged file anything
-            message = f"is no WAV file of PCM or float: {error}; save it as one"
-            raise refusal(source, message) from error
+    try:
+        rate, samples = samples_of(content)
+    except InputError as error:
+        raise refusal(source, str(error)) from error
     if not _MIN_RATE <= rate <= _MAX_RATE:
         raise refusal(source, f"sample rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate}")
-    if problem := too_much(len(given) / rate, 0):
+    if problem := too_much(len(samples) / rate, 0):
         raise refusal(source, problem)
-    if not given.size:
-        raise refusal(source, "has no samples")
-    return rate, _scaled(given).reshape(len(given), -1)
-
-
-def _scaled(given: Any) -> FloatArray:
-    if given.dtype == np.uint8:
-        return np.asarray((given.astype(float) - 128) / 128)
-    full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
-    with np.errstate(all="ignore"):  # of float what is too large or no number is refused later
-        return np.asarray(given.astype(float) / full)
+    return rate, samples
 
 
 def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:
@@ -94,20 +72,28 @@ def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, .
     import scipy.fft
 
     duration = len(signal) / rate
-    seconds = math.ceil(duration) + 1  # whole ones: a bin is the same frequency at every rate
-    spectrum = scipy.fft.rfft(signal, rate * seconds)[1:] / rate / seconds
-    frequencies = np.arange(1, len(spectrum) + 1) / seconds
+    # A second longer at least: its end does not come round to its beginning.
+    length = scipy.fft.next_fast_len(len(signal) + rate, real=True)
+    cycle = length / rate  # s
+    spectrum = scipy.fft.rfft(signal, length)[1:] / length
+    frequencies = np.arange(1, math.ceil(_OUTER_HIGH[1] * cycle)) / cycle
     outer = _rise(frequencies, *_OUTER_LOW) * _rise(1 / frequencies, *_inverse(_OUTER_HIGH))
     upper = _rise(frequencies, *_SPLIT)
     lower = _rise(1 / frequencies, *_inverse(_SPLIT))
-    count = math.ceil(duration * _RATE)
+    points = scipy.fft.next_fast_len(math.ceil(cycle * _RATE))
+    step = cycle / points
+    count = math.ceil(duration / step)
     levels, centres = zip(
-        *(_band(spectrum * outer * band, seconds, count) for band in (lower, upper)), strict=True
+        *(
+            _band(spectrum[: len(outer)] * outer * band, points, step, count)
+            for band in (lower, upper)
+        ),
+        strict=True,
     )
     intensity = np.hypot(*levels)
     intensity[intensity < _FLOOR * intensity.max()] = 0
-    sharpness = np.array([sharpness_of(f) for f in np.where(levels[1] > levels[0], *centres[::-1])])
-    times = (np.arange(count) + 0.5) / _RATE
+    sharpness = sharpness_of(np.where(levels[1] > levels[0], *centres[::-1]))
+    times = (np.arange(count) + 0.5) * step
     times[-1] = min(times[-1], duration)
     is_felt = intensity > 0
     given = np.concatenate([[0], times, [duration]])
@@ -121,9 +107,10 @@ def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, .
 
 def _remarks(spectrum: Any, outer: FloatArray, intensity: FloatArray) -> tuple[str, ...]:
     power = abs(spectrum) ** 2
-    lost = 1 - float((power * outer**2).sum() / max(power.sum(), 1e-300))
+    total = float(power.sum())
+    lost = 1 - float((power[: len(outer)] * outer**2).sum()) / total if total else 0.0
     remarks = []
-    if lost > _MIN_LOST and power.sum() > 0:
+    if lost > _MIN_LOST:
         remarks.append(
             f"{lost:.0%} of its energy ({10 * math.log10(lost):.1f} dB) lies outside "
             f"{MIN_HZ:g} to {MAX_HZ:g} Hz and is left out"
@@ -133,16 +120,17 @@ def _remarks(spectrum: Any, outer: FloatArray, intensity: FloatArray) -> tuple[s
     return tuple(remarks)
 
 
-def _band(spectrum: Any, seconds: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the amplitude and the centre frequency [Hz] of a band at each point."""
-    rate = _RATE * _PER_POINT
-    bins = np.zeros(rate * seconds, complex)
-    kept = min(len(spectrum), len(bins) // 2)
-    bins[1 : kept + 1] = 2 * spectrum[:kept]
+def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the amplitude and the centre frequency [Hz] of a band at the first points.
+
+    points: of the whole cycle, a step [s] apart.
+    """
+    bins = np.zeros(points * _PER_POINT, complex)
+    bins[1 : len(spectrum) + 1] = 2 * spectrum
     analytic = np.fft.ifft(bins, norm="forward")
     power = (abs(analytic) ** 2).reshape(-1, _PER_POINT).mean(axis=1)
     turned = (np.roll(analytic, -1) * analytic.conj()).reshape(-1, _PER_POINT).sum(axis=1)
-    return np.sqrt(power[:count]), np.angle(turned[:count]) * rate / (2 * math.pi)
+    return np.sqrt(power[:count]), np.angle(turned[:count]) * _PER_POINT / (2 * math.pi * step)
 
 
 def _rise(frequencies: FloatArray, low: float, high: float) -> FloatArray:

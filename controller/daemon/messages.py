@@ -27,7 +27,7 @@ from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
 from controller.effects.layout import SurfaceLayout
 from controller.operation.states import Loss
-from controller.play.content import BEING_CHOSEN, Prediction, leaks_db_sl
+from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
 from controller.play.observer import PlayReport, SilenceReport
 from controller.play.routing import Drive
@@ -199,23 +199,13 @@ def contact_status(
                     "held_back": felt.held_back,
                 }
     if isinstance(report, PlayReport) and any(each.key == contact.key for each in report.quiet):
-        # Of several quiet contacts only the level of the loudest is known.
-        is_known, one = len(report.quiet) == len(report.contents) == 1, report.felt
         highest = max(report.quiet_levels.get(contact.key, ()), default=None)
         status |= {
             "role": "quiet",
-            "level_db_sl": _quiet_level(one) if is_known and one is not None else None,
             "foreign_level_db_sl": _finite(highest),
             "is_foreign_felt": is_felt(highest),
         }
     return ContactStatus.model_validate(status)
-
-
-def _quiet_level(felt: Prediction) -> float | None:
-    """Level at the loudest point of a quiet finger on the plate as modelled [dB SL]."""
-    if felt.nominal_db_sl is None or felt.contrast_db is None:
-        return None
-    return _finite(felt.nominal_db_sl - felt.contrast_db)
 
 
 def hello_result(

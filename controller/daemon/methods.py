@@ -324,10 +324,10 @@ class ApiService:
         name, effect, level_max = self._played(params)
         level = params.level_db_sl
         if level is not None and not MIN_DB_SL <= level <= level_max:
+            whose = "" if params.effect is None else f" of effect {name!a}"
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"level of effect {name!a} must be from {MIN_DB_SL:g} to {level_max:g} "
-                f"dB SL, got {level:g}",
+                f"level{whose} must be from {MIN_DB_SL:g} to {level_max:g} dB SL, got {level:g}",
                 where="level_db_sl",
                 remedy="choose one of these, or another level in the surface layout",
             )

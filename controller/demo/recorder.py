@@ -17,7 +17,7 @@ from controller.demo.touch_row import (
     steady_contrast_db,
 )
 from controller.play.content import Prediction
-from controller.play.layers import LayerContent
+from controller.play.layer_content import LayerContent
 from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.play.selection import MOVE_TOLERANCE
 from controller.sources.contacts import Change, Contact, ContactKey

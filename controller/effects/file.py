@@ -61,7 +61,7 @@ class File(Effect):
             raise InputError(
                 f"file must be in the folder of the layout, got {self.file}; copy it there"
             )
-        self._pattern = read_content(path, self.channel)
+        self._pattern = read_content(path, self.channel) if path.suffix else _named(self.file)
 
     def for_table(self, frequencies: FloatArray) -> Self:
         """Return it for the frequencies of a table [Hz], with what takes long to make done."""

@@ -15,15 +15,16 @@ from typing import Any
 
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content
-from controller.play.intent import CLICK, FADED_AFTER, Pulse
-from controller.play.pieces import HELD, PLAIN_STEP, piece_of
+from controller.play.course_layers import MIN_LEFT, CourseLayers
+from controller.play.intent import CLICK, FADED_AFTER
+from controller.play.layer_content import LayerContent
+from controller.play.pieces import HELD, PLAIN_STEP
 from controller.play.routing import (
     BESIDE_CLICK,
     FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
-    full_drive,
     tones_by_era,
 )
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
@@ -33,7 +34,6 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
-from model.answer.course import Course
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 
@@ -56,7 +56,6 @@ FALL_AFTER = 0.27 * CROSSFADE
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
 _MARGIN = 0.2  # s; after the contact is lifted, for late frames
-_MIN_LEFT = 0.001  # s; of a pulse that is about to end
 _SURELY_SETTLED = 0.005  # s; by which a set starts later than its last reply, and clocks differ
 _MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch would wait for it
 _VALID_FOR = QUANTITIES["valid_for"]
@@ -65,41 +64,6 @@ Check = Callable[[Mapping[str, Sequence[Layer]]], CommandRefused | None]
 """Why the ledgers would not admit layers, by amplifier, now; None if they would."""
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LayerContent:
-    """A content in its layer.
-
-    layer: with the ramp, onset and ending of its sets; drive: by ERA, as confirmed; settled_at
-    [s]: when its onset has ended. is_shaped: whether it may have an ending, which is sent at
-    ending_due [s], once the onset has ended: until then it fades. Of one with a course the next
-    piece is sent then; course_until [s]: when what has been sent of it ends. confirmed_until [s]:
-    when its first target would have been lifted, as known when it was sent; between renewal_due and
-    renewable_until it is renewed if all targets have been confirmed since. ends_at: when it has
-    ended by itself unless it was renewed. is_falling: whether another content takes its place along
-    a cross-fade: it falls at ending_due, and is not renewed.
-    """
-
-    content: Content
-    layer: answer.Layer
-    drive: Drive = field(default_factory=dict)
-    settled_at: float = math.inf
-    is_shaped: bool = False
-    ending_due: float = math.inf
-    confirmed_until: float = math.inf
-    renewal_due: float = math.inf
-    renewable_until: float = math.inf
-    ends_at: float = math.inf
-    is_falling: bool = False
-    course_until: float = -math.inf
-
-    @property
-    def settled_after(self) -> float:
-        """How long [s] after the commit its ramp or onset has ended."""
-        onset = self.layer.onset
-        last = next(iter(onset.values())).duration if onset else 0.0
-        return max(self.layer.ramp, last)
 
 
 @dataclass(frozen=True)
@@ -160,8 +124,9 @@ class Layers:
         has_endings = capabilities.envelope_support.ending_knots > 0
         self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
         # A limit of slew lengthens ramps.
-        self._course_knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
-        if not self._course_knots:
+        knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
+        self._courses = CourseLayers(self.builder, knots)
+        if not knots:
             why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
             _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
         self.contents: Mapping[int, LayerContent] = {}
@@ -241,8 +206,9 @@ class Layers:
         for number, one in self.contents.items():
             if one.ending_due <= now and (led := one.content.course) is not None:
                 if now < self._confirmed_until(one.content):
-                    layers[number], endings[number] = self._piece(
-                        number, one.content, *led, now, among=len(due), until=one.course_until
+                    drive, among = self._drive_of(number), len(due)
+                    layers[number], endings[number] = self._courses.piece(
+                        number, one.content, *led, now, among=among, playing=drive, before=one
                     )
             elif one.ending_due <= now and one.is_falling:
                 layers[number] = self.builder.build_fall(
@@ -312,9 +278,11 @@ class Layers:
         for number in going_on:
             one, lasts = self.contents[number], _shortest(played, number)
             since = max(now, one.course_until)  # a piece waits for the one before
-            if (led := one.content.course) is not None:
+            if one.content.course is not None:
                 starts = max(played.starts_at, one.course_until)
-                self._confirm_piece(number, sets, led[1], starts, now)
+                piece, is_first = sets.endings.get(number, one.layer), number in sets.started
+                one = self._courses.confirmed(one, piece, starts, now, is_first=is_first)
+                self._replace({**self.contents, number: one})
             elif number in sets.started:
                 drive = tones_by_era(played.layers, self._rig, number)
                 settled_at = now + one.settled_after
@@ -332,26 +300,6 @@ class Layers:
                 renewable_until=now + lasts - _MARGIN / 2,
                 ends_at=since + lasts,
             )
-
-    def _confirm_piece(
-        self, number: int, sets: Sets, pulse: Pulse, since: float, now: float
-    ) -> None:
-        """Note that a layer plays a piece of the course of a pulse from a time [s] on.
-
-        The next one follows the first at once, and is sent when half of any other has been played.
-        """
-        one = self.contents[number]
-        played = sets.endings.get(number, one.layer)
-        until = since + replace(one, layer=played).settled_after
-        due = now + _MIN_LEFT if number in sets.started else (since + until) / 2
-        due = due if played.onset else until
-        is_over = until > pulse.end - _MIN_LEFT
-        self._change(
-            number,
-            drive=full_drive(one.content.layer.excitation, self._rig),
-            course_until=until,
-            ending_due=math.inf if is_over else due,
-        )
 
     def forget(self) -> None:
         """Discard what plays, which is unknown; fingers keep their layers."""
@@ -463,7 +411,9 @@ class Layers:
             content = numbers[number]
             if (led := content.course) is not None:
                 among = len(starting)
-                layers[number], played = self._piece(number, content, *led, now, among=among)
+                layers[number], played = self._courses.piece(
+                    number, content, *led, now, among=among, playing=self._drive_of(number)
+                )
                 playing[number] = LayerContent(content, played)
                 settled.append(playing[number].settled_after)
                 continue
@@ -491,43 +441,6 @@ class Layers:
             layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
             settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
-
-    def _piece(
-        self,
-        number: int,
-        content: Content,
-        course: Course,
-        pulse: Pulse,
-        now: float,
-        *,
-        among: int,
-        until: float | None = None,
-    ) -> tuple[PlateLayer, answer.Layer]:
-        """Return the set of the piece of a course that is played next, and its layer.
-
-        From where the pulse is at a time [s] on, or until [s] the piece before ends, if that has
-        not ended yet.
-        """
-        is_after, knots = until is not None and now < until, self._course_knots
-        starts = until if until is not None and is_after else now
-        if until is None:
-            knots = min(knots, self.builder.support.onset_knots)
-        piece = piece_of(
-            course,
-            pulse,
-            0.0 if pulse.started_at is None else starts - pulse.started_at,
-            knots=max(knots // among, 1) if knots else 0,
-            is_first=until is None,
-        )
-        has_ended = until is not None and now >= self.contents[number].ends_at
-        return self.builder.build_piece(
-            number,
-            content.layer,
-            piece,
-            playing={} if has_ended else self._drive_of(number),
-            valid_for=piece.duration + HELD,
-            is_after=is_after and piece.has_knots,
-        )
 
     def _fade_of(self, number: int, content: Content) -> float:
         """How long [s] a content is led to from what its finger feels; 0 where it begins."""
@@ -642,7 +555,7 @@ def _all_left(content: Content, now: float) -> list[float]:
         elif pulse.started_at is None:
             left.append(pulse.duration)
         else:
-            left.append(max(pulse.end - now, _MIN_LEFT))
+            left.append(max(pulse.end - now, MIN_LEFT))
     return left
 
 

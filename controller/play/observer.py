@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from controller.play.content import Prediction, not_served
-from controller.play.layers import LayerContent
+from controller.play.layer_content import LayerContent
 from controller.play.planner import Plan
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey

@@ -5,6 +5,7 @@ What many commands have stands once, above them.
 
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import typer
 from typer.core import TyperGroup
@@ -44,10 +45,18 @@ def _commands(
         if isinstance(command, TyperGroup):
             yield from _commands(command, inner)
             continue
-        usage = " ".join([inner.command_path, *command.collect_usage_pieces(inner)])
-        found = [parameter.get_help_record(inner) for parameter in command.params]
-        records = [(" ".join(one[0].split()), " ".join(one[1].split())) for one in found if one]
-        yield inner.command_path, usage, " ".join((command.help or "").split()), records
+        yield _described(command, inner)
+        for flag, variant in getattr(command, "variants", {}).items():
+            yield _described(
+                variant, typer.Context(variant, info_name=f"{name} {flag}", parent=context)
+            )
+
+
+def _described(command: Any, context: typer.Context) -> tuple[str, str, str, _Records]:
+    usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
+    found = [parameter.get_help_record(context) for parameter in command.params]
+    records = [(" ".join(one[0].split()), " ".join(one[1].split())) for one in found if one]
+    return context.command_path, usage, " ".join((command.help or "").split()), records
 
 
 def _entry(

@@ -29,6 +29,7 @@ from protocol_bytes import BYTES
 from protocol_tables import TABLES
 from python_page import with_entries
 from script_types import messages, with_version
+from wiring_picture import wiring
 
 ROOT = Path(__file__).parents[2]
 END = "<!-- end -->"
@@ -81,6 +82,7 @@ WRITTEN: Mapping[str, Sequence[Writer]] = {
         f"docs/reference/{page}.md": _of_protocol(page)
         for page in ("protocol", "serial", "modbus", "can")
     },
+    "docs/pictures/weekend_wiring.svg": [whole(wiring)],
     "docs/reference/api.md": [part("docs/generators/api_page.py", api_reference)],
     "docs/reference/commands.md": [part("docs/generators/command_page.py", command_reference)],
     "docs/reference/metrics.md": [

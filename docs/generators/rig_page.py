@@ -18,6 +18,7 @@ SECTIONS: Mapping[str, type[Section]] = {
     "eras": EraSection,
     "exciters": ExciterSection,
     "masses": sections.MassSection,
+    "supports": sections.SupportSection,
     "amplifiers": sections.AmplifierSection,
     "limits": sections.LimitsSection,
     "uncertainty": sections.UncertaintySection,

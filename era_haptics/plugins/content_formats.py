@@ -5,15 +5,21 @@
 
 from controller.content.format import ContentFormat
 from controller.content.formats import read_content
+from controller.content.json_file import ContentSection, Entries, read_json
 from controller.content.pattern import Pattern, Transient
 from controller.content.points import pattern_of_points
+from model.config.sections import Validation
 from model.errors import InputError
 
 __all__ = [
     "ContentFormat",
+    "ContentSection",
+    "Entries",
     "InputError",
     "Pattern",
     "Transient",
+    "Validation",
     "pattern_of_points",
     "read_content",
+    "read_json",
 ]

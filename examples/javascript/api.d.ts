@@ -417,7 +417,7 @@ export interface ContactStatus {
   y_m: number;
   /** whether it is to feel the pattern; null before the first decision */
   role?: "target" | "quiet" | null;
-  /** predicted sensation level; null if unknown */
+  /** predicted sensation level of a target; null if unknown */
   level_db_sl?: number | null;
   /** felt contrast, target over loudest quiet finger, that nine of ten plates within the rig's uncertainty give; null for a single finger */
   promised_contrast_db?: number | null;

@@ -1,9 +1,7 @@
 """Courses: how strongly a stimulus is felt over its duration, as an envelope of its amplitude."""
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -68,10 +66,3 @@ class Course:
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""
         return np.asarray(np.interp(times, self.times, self.shares, left=0.0, right=0.0))
-
-    def left(self, since: float) -> Self:
-        """What is left of it from a time [s] within it on."""
-        later = bisect_right(self.times, since)
-        first = float(self.at(np.array([since]))[0])
-        times = (0.0, *[each - since for each in self.times[later:]])
-        return type(self)(times, (first, *self.shares[later:]))

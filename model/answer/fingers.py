@@ -81,12 +81,7 @@ class Stimulus:
             raise InputError(
                 f"band_hz must be from a lowest to a highest frequency, got {low:g} to {high:g}"
             )
-        if not MIN_LEVEL_DB_SL <= self.level_db_sl <= MAX_LEVEL_DB_SL:
-            raise InputError(
-                f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
-                f"{self.level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold, and at "
-                f"{MAX_LEVEL_DB_SL:g} the exposure is 12 to 60 m/s² (ISO 5349-1)"
-            )
+        check_level(self.level_db_sl)
         if not (self.name is None or isinstance(self.name, str)):
             raise InputError(f"name of a stimulus must be text, got {shown(self.name)}")
         if not isinstance(self.is_limit, bool):
@@ -266,6 +261,16 @@ def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
                     f"finger ({x:g}, {y:g}) m must be at least {1000 * FINGERTIP_RADIUS:g} mm "
                     f"from the one at ({other.at[0]:g}, {other.at[1]:g}) m"
                 )
+
+
+def check_level(level_db_sl: float) -> None:
+    """Raise InputError for a level [dB SL] that no stimulus may have."""
+    if not MIN_LEVEL_DB_SL <= level_db_sl <= MAX_LEVEL_DB_SL:
+        raise InputError(
+            f"level must be between {MIN_LEVEL_DB_SL:g} and {MAX_LEVEL_DB_SL:g} dB SL, got "
+            f"{level_db_sl:g}; 20 is strong, 12 is felt, 0 is the threshold, and at "
+            f"{MAX_LEVEL_DB_SL:g} the exposure is 12 to 60 m/s² (ISO 5349-1)"
+        )
 
 
 def _check_pair(given: object, *, what: str, such_as: str) -> None:

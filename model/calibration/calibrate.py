@@ -115,7 +115,7 @@ def calibrate(
         live = responses.without(dead)
         values = live.values.copy()
         values[:, dead_eras] = np.nan
-        plate = sensed_plate(rig, live.points, live.frequencies, has_form=True)
+        plate = sensed_plate(rig, live.points, live.frequencies, masses=live.masses, has_form=True)
         part, z = CalibrationProblem.of(plate, values), np.zeros(plate.model.space.size)
         z[plate.numbers] = screened.start
         start = start_at(part, z)

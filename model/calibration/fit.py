@@ -255,6 +255,10 @@ def _result(
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by_gain / gains
         of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
+    # A force factor is told together with the gain, and their product is what moves the plate.
+    space, numbers = problem.plate.model.space, np.flatnonzero(searched)
+    for era, factor in enumerate(space.indices("force_factor")):
+        relative[numbers == factor, :, era] += space.std[factor]
     magnitude, phase = (
         np.sqrt(of_noise + (np.tensordot(root.T, part, axes=1) ** 2).sum(axis=0))
         for part in (relative.real, relative.imag)

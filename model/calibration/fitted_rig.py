@@ -65,7 +65,8 @@ def predicted_by(
     rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    model = sensed_plate(rig, points, problem.plate.model.frequencies).responses()
+    known = problem.plate
+    model = sensed_plate(rig, points, known.model.frequencies, masses=known.masses).responses()
     weight = fit.used / fit.noise[:, :, None]
     gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
     return model, gains

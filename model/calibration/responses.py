@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from model.identification.forward import Sensor
+from model.identification.measurement import Measurement
 from model.rig.rig import Rig
+from model.structure.actuators import Actuator
+from model.structure.exciter import Exciter
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3
@@ -25,8 +29,12 @@ LEAST_SENSORS = 3
 class MeasuredValue:
     """Acceleration at one sensor per base displacement of one ERA [1/s²] at a frequency [Hz].
 
+    Per volt at an exciter [m/s²/V], is_per_volt.
+
     Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
-    known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors.
+    known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors;
+    sensor_mass [kg]: as `Responses.masses`; setting: with what it was measured, in words, "" for
+    not known.
     """
 
     era: str
@@ -36,6 +44,9 @@ class MeasuredValue:
     frequency: float
     value: complex
     place: str
+    sensor_mass: float = 0.0
+    setting: str = ""
+    is_per_volt: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +55,8 @@ class Responses:
 
     sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
     has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
-    known, and no polarity; skipped: number of values beyond the rig's limits of frequency.
+    known, and no polarity; skipped: number of values beyond the rig's limits of frequency. masses
+    (s,) [kg]: of a sensor that is moved, as `Sensor.mass`; None for none.
     """
 
     sensors: tuple[str, ...]
@@ -53,6 +65,7 @@ class Responses:
     values: ComplexArray
     has_phases: bool = True
     skipped: int = 0
+    masses: FloatArray | None = None
 
     @property
     def count(self) -> int:
@@ -64,6 +77,18 @@ class Responses:
         """Mask of the ERAs that were driven (e,)."""
         return np.asarray(np.isfinite(self.values).any(axis=(0, 2)))
 
+    @property
+    def sensor_masses(self) -> FloatArray:
+        """Mass of the sensor at each place while it measures there, (s,) [kg]."""
+        return np.zeros(len(self.sensors)) if self.masses is None else self.masses
+
+    def as_measurement(self) -> Measurement:
+        """The same for an identification, of drives that lag as actuators behind a card do."""
+        places = zip(self.sensors, self.points.tolist(), self.sensor_masses.tolist(), strict=True)
+        sensors = [Sensor(name, x=x, y=y, mass=mass) for name, (x, y), mass in places]
+        values = self.values.swapaxes(1, 2)
+        return replace(Measurement.of(sensors, self.frequencies, values), drives_lag=True)
+
     def without(self, sensors: NDArray[np.bool_]) -> "Responses":
         """Remove some of the sensors (s,)."""
         kept = ~sensors
@@ -72,6 +97,7 @@ class Responses:
             sensors=tuple(compress(self.sensors, kept)),
             points=self.points[kept],
             values=self.values[:, :, kept],
+            masses=None if self.masses is None else self.masses[kept],
         )
 
 
@@ -94,6 +120,7 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     if skipped:
         _logger.warning("%d of %d values beyond %s are left out", skipped, len(measured), limits)
     sensors: dict[str, tuple[float, float]] = {}
+    masses: dict[str, float] = {}
     first: dict[str, str] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
     found: dict[tuple[float, int, str], complex] = {}
@@ -107,9 +134,15 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
                 f"{each.place}: sensor {each.sensor} must have one position, got {_shown(known)} "
                 f"({place}) and {_shown(each.point)} m; name sensors differently"
             )
+        if masses.setdefault(each.sensor, each.sensor_mass) != each.sensor_mass:
+            raise InputError(
+                f"{each.place}: sensor {each.sensor} must have one mass, got "
+                f"{1e3 * masses[each.sensor]:g} ({place}) and {1e3 * each.sensor_mass:g} g"
+            )
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
         number = eras[each.era, each.era_point]
+        _check_unit(each, rig.eras[number])
         if (each.frequency, number, each.sensor) in found:
             raise InputError(
                 f"{each.place}: response of sensor {each.sensor} to ERA {rig.eras[number].name} "
@@ -123,7 +156,14 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
         values[np.searchsorted(frequencies, frequency), number, column[sensor]] = value
     # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    return Responses(tuple(sensors), points, frequencies, values, skipped=skipped)
+    return Responses(
+        tuple(sensors),
+        points,
+        frequencies,
+        values,
+        skipped=skipped,
+        masses=np.array([*masses.values()]) if any(masses.values()) else None,
+    )
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:
@@ -134,6 +174,17 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
             f"{measured.place}: sensor {measured.sensor} must be on the rig's plate, from "
             f"(0, 0) to ({plate.length:g}, {plate.width:g}) m, got {_shown(measured.point)} m; "
             "check the plate and the unit"
+        )
+
+
+def _check_unit(measured: MeasuredValue, actuator: Actuator) -> None:
+    if measured.is_per_volt != isinstance(actuator, Exciter):
+        right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
+        if measured.is_per_volt:
+            right, wrong = wrong, right
+        raise InputError(
+            f"{measured.place}: response to {actuator.name} must be acceleration per {right}, got "
+            f"per {wrong}; check the rig, or its unit"
         )
 
 

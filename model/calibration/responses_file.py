@@ -3,9 +3,16 @@
 A CSV file has exactly the columns below and one value a line, in any order. A UFF file has a
 function of type 4 for every sensor and ERA, acceleration over displacement, with the nodes'
 positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
+
+Responses to exciters are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions
+whose reference is of no type of its own (1), in V.
+
+The mass of a sensor that is moved and the setting of a measurement are in columns of their own, or
+in the second line of free text of a function: `sensor_mass_g=2 setting=level 0.1`.
 """
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,7 +20,7 @@ import numpy as np
 
 from model.calibration.responses import MeasuredValue, Responses
 from model.errors import InputError
-from model.files.csv_file import read_lines, write_columns
+from model.files.csv_file import Column, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
@@ -21,14 +28,24 @@ from model.files.uff import (
     FREQUENCY_RESPONSE,
     Function,
     Universal,
+    read_bytes,
     read_universal,
+    text_of,
     write_universal,
 )
 from model.rig.rig import Rig
+from model.structure.exciter import Exciter
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
+_PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
 ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
+MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
+_NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
+MAX_SENSOR_MASS = 500.0
+"""g; of a sensor that is moved. One that weighs more is no accelerometer."""
+
 _UP = 3  # +z
+_GENERAL = 1  # a data type without one of its own
 # SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
 _ACCELERATION_UNITS = {
     **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
@@ -60,10 +77,31 @@ def read_measured(path: Path) -> list[MeasuredValue]:
     raise InputError(f"{path}: name of measured responses must end in .csv, .uff or .unv")
 
 
-def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
-    """Write responses as CSV with all digits; raises OSError."""
+def write_responses(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+    """Write responses as CSV or UFF by the name's ending; setting: as `MeasuredValue`.
+
+    Raises OSError.
+    """
+    write = write_responses_csv if path.suffix.lower() == ".csv" else write_responses_uff
+    write(path, responses, rig, setting=setting)
+
+
+def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+    """Write responses as CSV with all digits.
+
+    Raises OSError; InputError for ERAs beside exciters, whose units differ.
+    """
+    kinds = {isinstance(era, Exciter) for era in rig.eras}
+    if len(kinds) > 1:
+        raise InputError(f"{path}: ERAs and exciters need a .uff file, whose functions have units")
+    real, imaginary = _PER_VOLT if True in kinds else COLUMNS[-2:]
     f, e, s = np.nonzero(np.isfinite(responses.values))
     values = responses.values[f, e, s]
+    further: dict[str, Column] = {}
+    if responses.masses is not None:
+        further[MASS] = 1e3 * responses.masses[s]
+    if setting:
+        further[SETTING] = [setting] * len(s)
     write_columns(
         path,
         {
@@ -74,18 +112,22 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig) -> None:
             "x_m": responses.points[s, 0],
             "y_m": responses.points[s, 1],
             "frequency_hz": responses.frequencies[f],
-            "real_1_s2": values.real,
-            "imag_1_s2": values.imag,
+            real: values.real,
+            imaginary: values.imag,
+            **further,
         },
     )
 
 
-def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
+def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
     """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
+    masses = responses.sensor_masses
+    notes = [f"{MASS}={1e3 * mass:.10g} {SETTING}={setting}" for mass in masses]
     positions = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
     for e, era in enumerate(rig.eras):
+        reference = (_GENERAL, "V") if isinstance(era, Exciter) else (DISPLACEMENT, "m")
         for s, sensor in enumerate(responses.sensors):
             measured = np.isfinite(responses.values[:, e, s])
             if measured.any():
@@ -99,8 +141,9 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
                         (_UP, _UP),
                         responses.frequencies[measured],
                         responses.values[measured, e, s],
-                        (FREQUENCY, ACCELERATION, DISPLACEMENT),
-                        ("m/s^2", "m"),
+                        (FREQUENCY, ACCELERATION, reference[0]),
+                        ("m/s^2", reference[1]),
+                        note=notes[s] if setting or masses[s] else "",
                     )
                 )
     nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, positions, strict=True)}
@@ -109,11 +152,14 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig) -> None:
 
 def _read_csv(path: Path) -> list[MeasuredValue]:
     found = []
-    for line in read_lines(path, COLUMNS, optional=ERA_COLUMNS):
+    header = text_of(path, read_bytes(path)).lstrip().partition("\n")[0]
+    is_per_volt = _PER_VOLT[0] in header
+    columns = (*COLUMNS[:-2], *(_PER_VOLT if is_per_volt else COLUMNS[-2:]))
+    for line in read_lines(path, columns, optional=(*ERA_COLUMNS, MASS, SETTING)):
         at_era = [line.number(name) for name in ERA_COLUMNS if name in line.cells]
         if len(at_era) == 1:
             raise InputError(f"{path}:1: {' and '.join(ERA_COLUMNS)} must be given together")
-        x, y, frequency, real, imaginary = map(line.number, COLUMNS[2:])
+        x, y, frequency, real, imaginary = map(line.number, columns[2:])
         era, sensor = line.cells["era"], line.cells["sensor"]
         if not (era and sensor):
             raise InputError(f"{line.place}: era and sensor must have names")
@@ -121,7 +167,21 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
             raise InputError(f"{line.place}: frequency_hz must be 0 or more, got {frequency:g}")
         era_point = (at_era[0], at_era[1]) if at_era else None
         value = complex(real, imaginary)
-        found.append(MeasuredValue(era, sensor, (x, y), era_point, frequency, value, line.place))
+        mass, setting = line.number(MASS, 0.0), line.cells.get(SETTING, "")
+        found.append(
+            MeasuredValue(
+                era,
+                sensor,
+                (x, y),
+                era_point,
+                frequency,
+                value,
+                line.place,
+                _mass(line.place, mass),
+                setting,
+                is_per_volt,
+            )
+        )
     return found
 
 
@@ -143,14 +203,17 @@ def _uff_values(
     function: Function, content: Universal, named: dict[str, set[int]]
 ) -> list[MeasuredValue]:
     place = function.place
-    if function.data_types[1] != ACCELERATION or function.data_types[2] != DISPLACEMENT:
+    is_per_volt = function.data_types[2] == _GENERAL and function.units[1].lower() == "v"
+    is_known = is_per_volt or function.data_types[2] == DISPLACEMENT
+    if function.data_types[1] != ACCELERATION or not is_known:
         raise InputError(
             f"{place}: data types must be acceleration ({ACCELERATION}) over displacement "
-            f"({DISPLACEMENT}) of an ERA's base, got {function.data_types[1]} over "
-            f"{function.data_types[2]}"
+            f"({DISPLACEMENT}) of an ERA's base, or over volts ({_GENERAL}, in V) of an exciter, "
+            f"got {function.data_types[1]} over {function.data_types[2]}"
         )
     scale = _unit(place, function.units[0], _ACCELERATION_UNITS)
-    scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
+    if not is_per_volt:
+        scale /= _unit(place, function.units[1], _DISPLACEMENT_UNITS)
     hertz = _unit(place, function.abscissa_unit, _FREQUENCY_UNITS)
     if not np.iscomplexobj(function.data):
         raise InputError(f"{place}: response must be complex, got real; export it with phases")
@@ -169,6 +232,7 @@ def _uff_values(
         name = f"{name or 'node'}:{function.response}"
     scale *= math.prod(-1 if direction < 0 else 1 for direction in function.directions)
     x, y, _ = content.nodes[function.response]
+    mass, setting = _noted(function)
     era_point = None if reference is None else (float(reference[0]), float(reference[1]))
     return [
         MeasuredValue(
@@ -179,6 +243,9 @@ def _uff_values(
             hertz * frequency,
             scale * value,
             place,
+            mass,
+            setting,
+            is_per_volt,
         )
         for frequency, value in zip(function.x.tolist(), function.data.tolist(), strict=True)
     ]
@@ -191,3 +258,22 @@ def _unit(place: str, label: str, known: Mapping[str, float]) -> float:
         spelled = ", ".join(filter(None, known))
         raise InputError(f"{place}: unit must be one of {spelled}, got {label!r}; export it so")
     return known[plain]
+
+
+def _noted(function: Function) -> tuple[float, str]:
+    """Mass of the sensor [kg] and setting by the free text of a function; raises InputError."""
+    found = _NOTE.search(function.note)
+    if found is None:
+        return 0.0, ""
+    try:
+        mass = float(found["mass"])
+    except ValueError:
+        mass = math.nan
+    return _mass(function.place, mass), (found["setting"] or "").strip()
+
+
+def _mass(place: str, grams: float) -> float:
+    """A sensor's mass [kg] from grams; raises InputError."""
+    if not 0 <= grams <= MAX_SENSOR_MASS:  # nor for NaN
+        raise InputError(f"{place}: {MASS} must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}")
+    return grams / 1e3

@@ -87,6 +87,11 @@ class SensedPlate:
         )
         return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
 
+    @property
+    def masses(self) -> FloatArray:
+        """Mass of the sensor at each point while it measures there, (s,) [kg]."""
+        return np.array([sensor.mass for sensor in self.model.sensors])
+
     @cached_property
     def numbers(self) -> IntArray:
         """Where each fitted value is in the space, (n,)."""
@@ -174,15 +179,25 @@ class SensedPlate:
 
 
 def sensed_plate(
-    rig: Rig, points: FloatArray, frequencies: FloatArray, *, has_form: bool = False
+    rig: Rig,
+    points: FloatArray,
+    frequencies: FloatArray,
+    *,
+    masses: FloatArray | None = None,
+    has_form: bool = False,
 ) -> SensedPlate:
     """Solve a rig's free plate once, for sensors at points (s, 2) [m] and frequencies (f,) [Hz].
 
-    has_form: whether it may have form errors. Raises InputError for frequencies too high for its
+    masses (s,) [kg]: of a sensor that is moved, as `Sensor.mass`, None for none; has_form: whether
+    the plate may have form errors. Raises InputError for frequencies too high for its
     mesh.
     """
     rig.mesh.check_frequencies(rig.plate, frequencies)
-    sensors = [Sensor(f"sensor {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
+    loads = np.zeros(len(points)) if masses is None else masses
+    sensors = [
+        Sensor(f"sensor {n}", x=x, y=y, mass=mass)
+        for n, ((x, y), mass) in enumerate(zip(points.tolist(), loads.tolist(), strict=True))
+    ]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = reduced_modes(rig, free) if has_form else None
     space = space_by_sheets(rig, (), None)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 NO_FIT = 1
 """Exit status where a fit does not explain the measurement."""
 
-_HEADING = re.compile(rb"# .* by `era (calibrate|rig identify)`:\s*$|\Z")
+_HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify)`:\s*$|\Z")
 """First line of a rig that was fitted, or of an empty file."""
 
 

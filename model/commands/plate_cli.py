@@ -263,6 +263,8 @@ def materials(as_json: JsonOption = False) -> None:
             "E_pa": one.material.E,
             "rho_kg_m3": one.material.rho,
             "nu": one.material.nu,
+            "moduli_pa": one.material.moduli,
+            "by_frequency": [list(row) for row in one.by_frequency],
             "source": one.source,
             "variation": one.variation,
             "loss_factor": one.loss_factor,
@@ -270,15 +272,24 @@ def materials(as_json: JsonOption = False) -> None:
         for name, one in known.items()
     ]
     rows = [
-        f"{each['name']}: E {each['E_pa'] / 1e9:g} GPa, rho {each['rho_kg_m3']:g} kg/m³, "
-        f"nu {each['nu']:g}\n    source  {each['source']}\n    variation  {each['variation']}\n"
+        f"{each['name']}: {_in_gpa(each['moduli_pa'])}, rho {each['rho_kg_m3']:g} kg/m³, "
+        f"{'nu' if 'E' in each['moduli_pa'] else 'nu12'} {each['nu']:g}\n"
+        f"    source  {each['source']}\n    variation  {each['variation']}\n"
         f"    loss factor of the bare material, about  {each['loss_factor']}"
         for each in entries
     ]
-    other = "Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}"
+    other = (
+        "Any other is given by numbers: material: {E: 70 GPa, rho: 2700, nu: 0.33}, with a grain "
+        "{E1, E2, G12, G13, G23, nu12, rho}"
+    )
     print_report([*rows, other], {"materials": entries, "problems": problems}, as_json=as_json)
     for problem in () if as_json else problems:
         print(f"era: warning: {problem}", file=sys.stderr)
+
+
+def _in_gpa(moduli: dict[str, float]) -> str:
+    """Moduli of a material, as `E 70 GPa`."""
+    return f"{', '.join(f'{key} {each / 1e9:.4g}' for key, each in moduli.items())} GPa"
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
@@ -305,6 +316,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
         f"    {1e3 * summary['thickness_m']:.4g} mm of {summary['material']}: "
         f"E {summary['E_pa'] / 1e9:.4g} GPa, rho {summary['rho_kg_m3']:.5g} kg/m³, "
         f"nu {summary['nu']:.3g}, loss factor {summary['loss_factor']:g}",
+        *_grain_rows(summary["orthotropic"]),
         f"    flexural rigidity  {summary['flexural_rigidity_n_m']:.4g} N m",
         f"    mass  {bare} ({summary['surface_density_kg_m2']:.4g} kg/m²)",
         *(
@@ -317,15 +329,53 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
             for key, wavelength in summary["bending_wavelength_m"].items()
         ),
-        *(
-            f"    carries {1e3 * mass['mass_kg']:g} g at ({mass['at_m'][0]:g}, "
-            f"{mass['at_m'][1]:g}) m"
-            for mass in summary["point_masses"]
-        ),
+        *_mass_rows(summary["point_masses"]),
+        *_support_rows(summary["supports"]),
         *_exciter_rows(summary["exciters"], summary.get("reach")),
         *_type_rows(summary["exciter_types"]),
     ]
     print_report(rows, summary, as_json=as_json)
+
+
+_MAX_NAMED = 6  # of masses and supports, which a frame has many of
+
+
+def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
+    """Yield the moduli of a board along the plate's length (1) and its width (2)."""
+    if grain is None:
+        return
+    moduli = {key[:-3]: each for key, each in grain.items() if key.endswith("_pa")}
+    yield f"    along its length and width  {_in_gpa(moduli)}, nu12 {grain['nu12']:.3g}"
+    yield (
+        f"    flexural rigidity along, across  {grain['flexural_rigidity_along_n_m']:.4g}, "
+        f"{grain['flexural_rigidity_across_n_m']:.4g} N m"
+    )
+
+
+def _mass_rows(masses: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield what the plate carries."""
+    if len(masses) > _MAX_NAMED:
+        together = 1e3 * sum(each["mass_kg"] for each in masses)
+        yield f"    carries {together:g} g at {len(masses)} points"
+        return
+    for each in masses:
+        yield f"    carries {1e3 * each['mass_kg']:g} g at {_at(each)}"
+
+
+def _support_rows(supports: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield what holds the plate without driving it."""
+    if len(supports) > _MAX_NAMED:
+        together = sum(each["stiffness_n_m"] for each in supports) / 1e3
+        yield f"    held by {together:.4g} kN/m at {len(supports)} points"
+        return
+    for each in supports:
+        loss = f", loss factor {each['loss_factor']:g}" if each["loss_factor"] else ""
+        yield f"    held by {each['stiffness_n_m'] / 1e3:g} kN/m{loss} at {_at(each)}"
+
+
+def _at(each: dict[str, Any]) -> str:
+    x, y = each["at_m"]
+    return f"({x:g}, {y:g}) m"
 
 
 def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
@@ -333,7 +383,12 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
     if laminate is None:
         yield "plate"
         return
-    yield f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}"
+    is_single = len(laminate["layers"]) == 1
+    yield (
+        "plate whose modulus depends on the frequency"
+        if is_single
+        else f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}"
+    )
     for layer in laminate["layers"]:
         yield (
             f"    {1e3 * layer['thickness_m']:g} mm of {layer['material']}: "
@@ -341,9 +396,12 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
         )
     bonded = laminate["rigidity_perfectly_bonded_n_m"]
     in_waves = laminate.get("rigidity_by_frequency_n_m", {})
-    rows = {
+    bounds = {
         "perfectly bonded": bonded,
         "freely sliding": laminate["rigidity_freely_sliding_n_m"],
+    }
+    rows = {
+        **({} if is_single else bounds),
         **{f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()},
     }
     for name, rigidity in rows.items():

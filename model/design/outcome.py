@@ -1,6 +1,7 @@
 """Files, pictures and summary of a design."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from model.design.layout_keys import layout_keys
 from model.design.run import Design, RankedLayout
 from model.figures import save_figure
 from model.figures.drawing import COLORS, draw_eras, label_plate
+from model.figures.template import Template, write_template
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Columns, write_columns
 from model.structure.support import rigid_body_frequencies, static_loads
@@ -22,7 +24,7 @@ MAX_SHOWN = 10
 
 
 def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> list[Path]:
-    """Write rig.yaml, layouts.csv, contrast.png and count.png; data: of the rig's file.
+    """Write rig.yaml, layouts.csv, contrast.png, count.png and template.svg; data: of the file.
 
     Raises OSError if the folder cannot be written.
     """
@@ -33,7 +35,9 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     pictures = {"contrast.png": contrast_figure, "count.png": count_figure}
     for name, figure in pictures.items():
         save_figure(figure(design), folder / name)
-    return [rig, table, *(folder / name for name in pictures)]
+    template = folder / "template.svg"
+    write_template(template, Template(replace(design.problem.rig, eras=design.best.eras), {}))
+    return [rig, table, *(folder / name for name in pictures), template]
 
 
 def _columns(layouts: Sequence[RankedLayout]) -> Columns:

@@ -95,7 +95,13 @@ def match_with_form(
 
     def matched(loads: Sequence[PointLoad | FingertipLoad], noise: float) -> Match:
         rig = replace(plate.rig, masses=(*plate.rig.masses, *loads))  # type: ignore[arg-type]
-        sensed = sensed_plate(rig, observation.points, observation.frequencies, has_form=True)
+        sensed = sensed_plate(
+            rig,
+            observation.points,
+            observation.frequencies,
+            masses=observation.masses,
+            has_form=True,
+        )
         return match_plate(sensed, values, drives=drives, model_error=noise)
 
     noise = float(np.clip(matched((), _FIRST_NOISE).error, *_NOISE))

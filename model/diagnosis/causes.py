@@ -143,7 +143,7 @@ def explain(
             return plate.of(other)
         # A sensor that would be off the plate counts as at its edge.
         on_plate = np.clip(points, 0, [other.plate.length, other.plate.width])
-        return sensed_plate(other, on_plate, frequencies)
+        return sensed_plate(other, on_plate, frequencies, masses=plate.masses)
 
     def matched(cause: Cause, factor: float) -> Match | None:
         found = solved(cause, factor)

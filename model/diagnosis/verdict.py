@@ -170,11 +170,11 @@ def diagnose(
             f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
             f"{len(observation.frequencies)}"
         )
-    plate = sensed_plate(rig, observation.points, observation.frequencies)
+    plate = _plate_of(rig, observation)
     dead = dead_channels(plate, observation)
     observation, removed = usable_sensors(observation, dead)
     if removed:
-        plate = sensed_plate(rig, observation.points, observation.frequencies)
+        plate = _plate_of(rig, observation)
     shapes = match_shapes(plate, observation.values)
     if check is not None:
         check(plate, shapes, observation)
@@ -253,6 +253,11 @@ def diagnose(
         observation.frequencies,
         beyond if matches else None,
     )
+
+
+def _plate_of(rig: Rig, observation: Responses) -> SensedPlate:
+    """The rig's plate at the sensors of a measurement."""
+    return sensed_plate(rig, observation.points, observation.frequencies, masses=observation.masses)
 
 
 def best_wiring(

@@ -13,20 +13,20 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem.mesh import DOF_PER_NODE, Mesh
 from model.structure.attachments import PointLoad, footprints_of
-from model.structure.plate import Plate
+from model.structure.plate import SHEAR_CORRECTION, Plate
 
 RIGID_BODY_MODES = 3  # of a free plate: up and down, and two tilts
 
 _ENERGY = (
-    ("ww", "shear", "vv", "ss"),
-    ("ww", "shear", "ss", "vv"),
-    ("wx", "-shear", "vv", "sv"),
-    ("wy", "-shear", "sv", "vv"),
-    ("xx", "shear", "vv", "rr"),
-    ("xx", "bending", "vv", "ss"),
+    ("ww", "shear_x", "vv", "ss"),
+    ("ww", "shear_y", "ss", "vv"),
+    ("wx", "-shear_x", "vv", "sv"),
+    ("wy", "-shear_y", "sv", "vv"),
+    ("xx", "shear_x", "vv", "rr"),
+    ("xx", "bending_x", "vv", "ss"),
     ("xx", "twist", "ss", "vv"),
-    ("yy", "shear", "rr", "vv"),
-    ("yy", "bending", "ss", "vv"),
+    ("yy", "shear_y", "rr", "vv"),
+    ("yy", "bending_y", "ss", "vv"),
     ("yy", "twist", "vv", "ss"),
     ("xy", "coupled", "vs", "sv"),
     ("xy", "twist", "sv", "vs"),
@@ -39,9 +39,16 @@ Slopes s, functions v, rotations r in shear (paper Eq. 17).
 
 def rigidities(plate: Plate) -> dict[str, float]:
     """Bending, coupled and twist [N m], and shear [N/m] of a plate's section (paper Eq. 5 to 7)."""
-    D, nu = plate.flexural_rigidity, plate.material.nu
-    twist = (1 - nu) / 2 * D
-    return {"bending": D, "coupled": nu * D, "twist": twist, "shear": plate.shear_rigidity}
+    of, shares, h = plate.material, plate.material.shares, plate.thickness
+    D, S = of.E * h**3 / (12 * of.plane_stress), SHEAR_CORRECTION * of.E * h
+    return {
+        "bending_x": D,
+        "bending_y": shares.e2 * D,
+        "coupled": of.nu * shares.e2 * D,
+        "twist": shares.g12 * of.E * h**3 / 12,
+        "shear_x": shares.g13 * S,
+        "shear_y": shares.g23 * S,
+    }
 
 
 @dataclass(frozen=True)
@@ -192,10 +199,12 @@ def element_slopes(plate: Plate, mesh: Mesh, shapes: FloatArray) -> FloatArray:
     By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, for
     the reasons of `model.spectral.shape_stiffness`.
     """
-    nu, section = plate.material.nu, rigidities(plate)
-    by_nu = {key: -value / (1 + nu) for key, value in section.items()}
-    by_nu["bending"] = 2 * nu / (1 - nu**2) * section["bending"]
-    by_nu["coupled"] = nu * by_nu["bending"] + section["bending"]
+    of, section = plate.material, rigidities(plate)
+    apart = of.orthotropy is not None  # its shear moduli do not follow from nu
+    by_nu = {key: 0.0 if apart else -value / (1 + of.nu) for key, value in section.items()}
+    for side in ("bending_x", "bending_y"):
+        by_nu[side] = 2 * of.nu * of.shares.e2 / of.plane_stress * section[side]
+    by_nu["coupled"] = of.nu * by_nu["bending_y"] + section["bending_y"]
     slopes = (
         _stiffness(mesh, section, "x"),
         _stiffness(mesh, section, "y"),

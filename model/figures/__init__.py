@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -12,6 +13,8 @@ from model.files.replacing import check_picture_name
 __all__ = ["map_figure", "save_figure"]
 
 _DPI = 150
+_UNDATED = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Metadata with which the same figure is the same bytes."""
 
 
 def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | None = None) -> None:
@@ -24,5 +27,6 @@ def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | Non
     FigureCanvasAgg(figure)
     if inches is not None:
         figure.set_size_inches(inches)
-    with whole_or_nothing(path) as stream:
-        figure.savefig(stream, dpi=_DPI, format=path.suffix[1:].lower())
+    ending = path.suffix.lower()
+    with whole_or_nothing(path) as stream, rc_context({"svg.hashsalt": "era"}):
+        figure.savefig(stream, dpi=_DPI, format=ending[1:], metadata=_UNDATED.get(ending))

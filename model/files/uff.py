@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.files.array_file import whole_or_nothing
 from registry.regular_file import regular_file
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
@@ -29,6 +30,7 @@ _MAX_BYTES = 512 << 20
 _READ = (15, 58, 164, 2411)
 _HEADER_LINES = 12  # of dataset 58, its number first
 _ID_LINES = 5  # of these, free text
+_NOTE = 2  # of these, see `Function`
 _FORM = 7  # of these, that of the data: kind, count, abscissa
 _SI = 1  # units code of dataset 164
 _NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetres, inches
@@ -51,7 +53,7 @@ class Function:
     place: file and line, for errors; response, reference: nodes, each with a name ("" without one)
     and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; data_types: codes of
     abscissa, ordinate and denominator; units: labels of ordinate and denominator; abscissa_unit:
-    that of a file.
+    that of a file; note: its second line of free text, up to 80 characters.
     """
 
     place: str
@@ -65,6 +67,7 @@ class Function:
     data_types: tuple[int, int, int]
     units: tuple[str, str]
     abscissa_unit: str = ""
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,7 @@ class Universal:
 
 
 def write_universal(path: Path, content: Universal) -> None:
-    """Write nodes, units and functions in ASCII, double precision (12 digits).
+    """Write nodes, units and functions in ASCII, double precision (12 digits), atomically.
 
     An evenly spaced abscissa has six digits for its step. Raises OSError, and InputError for
     numbers that are not finite, for which pyuff would write zeros.
@@ -100,9 +103,9 @@ def write_universal(path: Path, content: Universal) -> None:
         "y": y,
         "z": z,
     }
-    path.write_bytes(b"")  # raises OSError, which pyuff would hide
     sets = [units | factors, nodes, *(_as_58(function) for function in content.functions)]
-    pyuff.UFF(str(path)).write_sets(sets, "overwrite")
+    with whole_or_nothing(path) as stream:  # raises OSError, which pyuff would hide
+        pyuff.UFF(stream.name).write_sets(sets, "overwrite")
 
 
 def read_universal(path: Path) -> Universal:
@@ -248,6 +251,7 @@ def _as_58(function: Function) -> dict[str, Any]:
         "rsp_ent_name": function.names[0][:10] or "NONE",
         "ref_ent_name": function.names[1][:10] or "NONE",
         "id1": " / ".join(name for name in function.names if name) or "NONE",
+        "id2": function.note or "NONE",
         "abscissa_spacing": int(even),
         "abscissa_spec_data_type": function.data_types[0],
         "ordinate_spec_data_type": function.data_types[1],
@@ -295,6 +299,7 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
         tuple(found[f"{axis}_spec_data_type"] for axis in ("abscissa", "ordinate", "orddenom")),
         (_name(found["ordinate_axis_units_lab"]), _name(found["orddenom_axis_units_lab"])),
         _name(found["abscissa_axis_units_lab"]),
+        _name(block.rows[_NOTE].decode("utf-8", "replace")),
     )
 
 

@@ -123,6 +123,10 @@ def fit_rows(found: Identification) -> list[str]:
     held, known = found.held_out, found.rig.uncertainty
     verdict = "explains" if found.chi2 <= MAX_CHI2 else "does not explain"
     rows = [f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
+    material = found.rig.plate.material
+    if material.orthotropy != found.before.plate.material.orthotropy:
+        moduli = ", ".join(f"{key} {each / 1e9:.4g}" for key, each in material.moduli.items())
+        rows.append(f"the board's grain was found, too: {moduli} GPa")
     if not found.is_known_well:
         rows.append(
             f"not known well enough: modes are {found.mode_shift:.1f} standard deviations from "

@@ -8,11 +8,12 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.identification.advice import unknowns
+from model.identification.grain import fit_board
 from model.identification.held_out import SHARE, HeldOutPaths, hold_out
 from model.identification.measurement import Measurement
 from model.identification.parameters import Space
 from model.identification.posterior import Posterior
-from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages
+from model.identification.stages import FittedModel, Setting, chi2
 from model.identification.values import Values, rig_with
 from model.progress import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -81,11 +82,14 @@ def identify(
     would show it.
     """
     _check(rig, measurement)
-    setting = Setting(rig, solved_for(rig, float(measurement.frequencies[-1])), measurement)
-    fitted = fit_in_stages(setting)
+    before, free = rig, solved_for(rig, float(measurement.frequencies[-1]))
+    setting, fitted = fit_board(Setting(rig, free, measurement))
+    rig = setting.rig
     values = Values.of(rig, fitted.space, fitted.best.x)
     posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
-    found = Identification(*(rig, rig, values, posterior, chi2(fitted), shift, None, fitted, seed))
+    found = Identification(
+        *(before, rig, values, posterior, chi2(fitted), shift, None, fitted, seed)
+    )
     if found.is_explained:
         _check_gains(rig, measurement, values, fitted.space)
     unknown = unknowns(setting, fitted, posterior)

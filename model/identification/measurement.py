@@ -134,13 +134,13 @@ class Measurement:
 class MeasuredPlate:
     """A measurement with how it came about.
 
-    level: of what played, 0..1 of full stroke; duration [s]; sensors: the ones used, for programs;
-    notes: lines for people; details: keys and values for programs.
+    level: of what played, 0..1 of full stroke, and duration [s], None for not known; sensors: the
+    ones used, for programs; notes: lines for people; details: keys and values for programs.
     """
 
     measurement: Measurement
-    level: float
-    duration: float
+    level: float | None
+    duration: float | None
     sensors: tuple[Mapping[str, object], ...]
     notes: tuple[str, ...]
     details: Mapping[str, object]

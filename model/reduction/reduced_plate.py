@@ -16,8 +16,8 @@ magnet is free: its spring and damper end at a mass.
 Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
 which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
 the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
-geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers
-and air lose added to eta omega². That is
+geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers,
+air and the springs of supports with a loss factor lose added to eta omega². That is
 positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
 of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
 in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
@@ -59,6 +59,7 @@ RESIDUAL_VECTORS = 3  # for each attachment
 
 # Residual vectors below this share of their squared norm are linear combinations of the others.
 _DEPENDENT = 1e-9
+_LEAST_SHIFTED = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +158,11 @@ def reduce_free_plate(free: FreePlate, attachments: FloatArray) -> ReducedPlate:
     independent = squared_norms > _DEPENDENT * squared_norms.max(initial=0.0)
     orthonormal = scale[:, None] * vectors[:, independent] / np.sqrt(squared_norms[independent])
     shifted_eigenvalues, rotation = linalg.eigh(orthonormal.T @ shifted @ orthonormal)
-    omega = np.sqrt(shifted_eigenvalues / free.modes.largest_truncated - free.shift)
-    residual_transform = orthonormal @ rotation
+    # At least 1, the lowest truncated mode's; the local compliance between many near points, which
+    # is an approximation, leaves a few below zero that yield next to nothing.
+    physical = shifted_eigenvalues > _LEAST_SHIFTED
+    omega = np.sqrt(shifted_eigenvalues[physical] / free.modes.largest_truncated - free.shift)
+    residual_transform = orthonormal @ rotation[:, physical]
 
     def shapes(points: FloatArray) -> FloatArray:
         places = np.atleast_2d(np.asarray(points, dtype=float))
@@ -216,7 +220,10 @@ def modal_matrices(
     omega, own = np.sqrt(eigenvalues), psi[: len(reduced.omega)]
     lossy = (own.T * elasticity.eigenvalues * elasticity.relative_loss) @ own
     share = np.sqrt(loss_factors(reduced.plate, omega))
-    lost = lossy * np.outer(share, share) + (own.T * elasticity.losses) @ own
+    at_fixed = phi[:fixed] @ own
+    lossy_springs = [0.0] * len(eras) + [load.loss_factor * load.stiffness for load in loads]
+    in_springs = (at_fixed.T * lossy_springs) @ at_fixed
+    lost = lossy * np.outer(share, share) + (own.T * elasticity.losses) @ own + in_springs
     viscous = lost / np.sqrt(np.outer(omega, omega))
     mass_weighted_modes = M @ psi
     C += mass_weighted_modes @ viscous @ mass_weighted_modes.T

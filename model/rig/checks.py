@@ -3,19 +3,23 @@
 import math
 from typing import Any
 
-from model.config.document import key_name
+from model.config.document import KeyPath, key_name
 from model.config.sections import Validation, section_by_kind
 from model.errors import InputError
 from model.rig.actuator_section import ActuatorSection
 from model.rig.actuators import KINDS, kind_of
+from model.rig.era_section import stiff_mount_problems
 from model.rig.meshes import mesh_of
 from model.rig.parts import laminate_of, plate_of
 from model.rig.rig import SAME_POINT
 from model.rig.sections import (
+    ISOTROPIC,
+    ORTHOTROPIC,
     LimitsSection,
     MassSection,
     PlateSection,
     RigSection,
+    SupportSection,
 )
 from model.spectral.mesh import SpectralMesh
 from model.structure.plate import Plate
@@ -36,6 +40,42 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     _check_wiring(validation, names)
     for name in validation.mapping(("masses",)):
         _check_on_plate(validation, ("masses", name), MassSection, plate, what="mass")
+        _check_point_or_edges(validation, ("masses", name), "mass", "mass_per_length")
+    for name in validation.mapping(("supports",)):
+        _check_support(validation, name, plate)
+
+
+def _check_support(validation: Validation[RigSection], name: str, plate: Plate | None) -> None:
+    """Check what keys of a support require of each other."""
+    path = ("supports", name)
+    _check_on_plate(validation, path, SupportSection, plate, what="support")
+    given = _given(validation, path)
+    stiffness = None if "kind" in given and "along" not in given else "stiffness"
+    _check_point_or_edges(validation, path, stiffness, "stiffness_per_length")
+    if {"along", "kind"} <= given:
+        validation.add((*path, "kind"), "is of a foot; remove it, and give stiffness_per_length")
+    stiffness = validation.field((*path, "stiffness"), SupportSection)
+    for key, problem in stiff_mount_problems(_given(validation, path), stiffness):
+        validation.add((*path, key), problem)
+
+
+def _check_point_or_edges(
+    validation: Validation[RigSection], path: tuple[str, ...], of_point: str | None, of_edges: str
+) -> None:
+    """Check that what is attached is at a point, or along the edges, each with its own key."""
+    given = _given(validation, path)
+    if not validation.mapping(path):
+        return
+    if "along" not in given and "at" not in given:
+        validation.add((*path, "at"), "missing; add it, or along: edges")
+        return
+    edges = "along" in given
+    needed, others = (of_edges, {"at", of_point, "foot"}) if edges else (of_point, {of_edges})
+    if needed is not None and needed not in given:
+        validation.add((*path, needed), "missing; add it")
+    for key in sorted(each for each in others if each in given):
+        word = "is not of what is along: edges" if edges else "is of what is along: edges"
+        validation.add((*path, key), f"{word}; remove it")
 
 
 def _check_era(validation: Validation[RigSection], name: str) -> None:
@@ -64,12 +104,18 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
     if "layers" in given:
         for key in sorted({"thickness", "material"} & given):
             validation.add(("plate", key), "must not be given with layers; remove one of the two")
+        if "grain" in given:
+            validation.add(("plate", "grain"), "is for a plate without layers; remove it")
     else:
         for key in ("thickness", "material"):
             if key not in given:
                 validation.add(("plate", key), "missing; add it, or layers for a laminate")
         if "bond" in given:
             validation.add(("plate", "bond"), "is for layers only; remove it")
+    paths = [("plate", "material"), *_layer_materials(validation)]
+    good = [_check_material(validation, path) for path in paths]
+    if not all(good):
+        return None
     section = validation.part(("plate",), PlateSection)
     if section is None or (section.layers is None and not {"thickness", "material"} <= given):
         return None
@@ -77,7 +123,8 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
         laminate = laminate_of(section)
         plate = plate_of(section, frequency_max=frequency_max)
     except InputError as error:
-        validation.add(("plate", "bond" if "bond" in given else "layers"), str(error))
+        key = "material" if "layers" not in given else "bond" if "bond" in given else "layers"
+        validation.add(("plate", key), str(error))
         return None
     thickness = plate.thickness if laminate is None else laminate.thickness
     if thickness > min(plate.length, plate.width):
@@ -87,6 +134,31 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
             f"{thickness:g} mm",
         )
     return plate
+
+
+def _layer_materials(validation: Validation[RigSection]) -> list[KeyPath]:
+    """Where the materials of layers stand."""
+    layers = validation.mapping(("plate",)).get("layers")
+    count = len(layers) if isinstance(layers, list) else 0
+    return [("plate", "layers", number, "material") for number in range(count)]
+
+
+def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
+    """Check that a material by numbers has those of one of both kinds, and only these."""
+    given = _given(validation, path)
+    if not given:
+        return True
+    if "by_frequency" in given and given & ORTHOTROPIC:
+        validation.add((*path, "by_frequency"), "is of an isotropic material only; remove it")
+    kind, other = ISOTROPIC, ORTHOTROPIC
+    if len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0):
+        kind, other = other, kind
+    for key in sorted(kind - given):
+        others = "E1, E2, G12, G13, G23, nu12" if kind is ISOTROPIC else "E and nu"
+        validation.add((*path, key), f"missing; add it, or {others} instead")
+    for key in sorted(other & given):
+        validation.add((*path, key), f"must not be given with {min(kind & given)}; remove it")
+    return not (kind - given or other & given)
 
 
 def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_max: float) -> None:
@@ -137,7 +209,7 @@ def _check_places(
 def _check_on_plate(
     validation: Validation[RigSection],
     path: tuple[str, ...],
-    section: type[ActuatorSection | MassSection],
+    section: type[ActuatorSection | MassSection | SupportSection],
     plate: Plate | None,
     *,
     what: str,
@@ -187,6 +259,6 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             )
 
 
-def _given(validation: Validation[RigSection], path: tuple[str, ...]) -> set[str]:
+def _given(validation: Validation[RigSection], path: KeyPath) -> set[str]:
     """Keys of a section that are not empty."""
     return {key for key, value in validation.mapping(path).items() if value is not None}

@@ -71,7 +71,11 @@ def era_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tuple[
     for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
         if other in given and key not in given:
             yield key, f"missing; add it, or remove {other} too for an ERA that only supports"
-    stiffness = read("stiffness")
+    yield from stiff_mount_problems(given, read("stiffness"))
+
+
+def stiff_mount_problems(given: Set[str], stiffness: float | None) -> Iterator[tuple[str, str]]:
+    """The problem of a stiff mount [N/m] without a size, by key; none of others."""
     if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in given:
         yield (
             "foot",

@@ -15,8 +15,9 @@ from model.rig.parts import (
     fingertip_of,
     laminate_of,
     limits_of,
-    mass_of,
+    masses_of,
     plate_of,
+    supports_of,
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
@@ -74,7 +75,8 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         amplifiers={name: amplifier.url for name, amplifier in section.amplifiers.items()},
         limits=limits_of(section.limits),
         masses=(
-            *(mass_of(mass, plate) for mass in section.masses.values()),
+            *(each for mass in section.masses.values() for each in masses_of(mass, plate)),
+            *(each for foot in section.supports.values() for each in supports_of(foot, plate)),
             *(era.support for era in supports.values()),
         ),
         supports=tuple(supports),

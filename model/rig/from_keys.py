@@ -27,7 +27,10 @@ from model.rig.sections import PlateSection, RigSection
 _SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
 """Keys that are changed as a whole."""
 
-_OF_THEORY = {"length", "width", "thickness", "material", "layers", "bond", "air_gap"}
+_PLACED = {"eras", "masses", "supports"}
+"""Those of what has a place on the plate."""
+
+_OF_THEORY = {"length", "width", "thickness", "material", "grain", "layers", "bond", "air_gap"}
 """Keys of a plate that decide the modes to which its `modes` are relative."""
 
 _REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")
@@ -47,6 +50,7 @@ def rig(
     *,
     amplifiers: Mapping[str, Mapping[str, Any]] | None = None,
     masses: Mapping[str, Mapping[str, Any]] | None = None,
+    supports: Mapping[str, Mapping[str, Any]] | None = None,
     mesh: str | None = None,
     limits: Mapping[str, Any] | None = None,
     uncertainty: Any = None,
@@ -71,6 +75,7 @@ def rig(
         "eras": eras,
         "amplifiers": amplifiers,
         "masses": masses,
+        "supports": supports,
         "mesh": mesh,
         "limits": limits,
         "uncertainty": uncertainty,
@@ -114,12 +119,14 @@ def replaced(rig: Rig, changes: Mapping[str, Any]) -> Rig:
         (read(("plate", key), PlateSection) or own) / own
         for key, own in (("length", rig.plate.length), ("width", rig.plate.width))
     ]
-    for kind in {"eras", "masses"} & data.keys() if factors != [1, 1] else ():
+    for kind in _PLACED & data.keys() if factors != [1, 1] else ():
         data[kind] = {
             name: {
                 **each,
                 "at": [f * quantity(x, LENGTH) for f, x in zip(factors, each["at"], strict=True)],
             }
+            if "at" in each
+            else each
             for name, each in data[kind].items()
         }
     eras = _merged(data["eras"], changes.get("eras", {}))

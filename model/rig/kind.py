@@ -26,6 +26,7 @@ from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
 from model.structure.attachments import Source
 from model.structure.exciter import Exciter
+from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
 
@@ -53,7 +54,7 @@ def _check(document: Document) -> CheckedFile:
     note = rig.uncertainty.note
     line, lost, more = clock_costs(rig, _urls(document))
     costs = [*lost, *gain_notes(rig), *exciter_notes(document, rig), *_air_costs(rig)]
-    costs += [*_layer_costs(rig), *_point_costs(rig)]
+    costs += [*_layer_costs(rig), *_point_costs(rig), *_edge_costs(rig)]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
@@ -120,7 +121,7 @@ def _summary(rig: Rig) -> str:
     thickness = plate.thickness if laminate is None else laminate.thickness
     sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
     made_of = plate.material.name
-    if laminate is not None:
+    if laminate is not None and len(laminate.layers) > 1:
         made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
     parts = [
         f"{sizes} mm of {made_of}",
@@ -131,11 +132,29 @@ def _summary(rig: Rig) -> str:
     if gap is not None:
         edges = "sealed" if gap.closed else "open"
         parts.insert(1, f"{1e3 * gap.depth:g} mm of air behind it, {edges} at the edges")
-    if rig.supports:
-        parts.append(f"supported without being driven by {', '.join(rig.supports)}")
+    if feet := [*_attached(rig, "supports"), *rig.supports]:
+        parts.append(f"supported without being driven by {', '.join(feet)}")
     if carried := sum(mass.mass for mass in rig.masses):
         parts.append(f"carries {1e3 * carried:g} g")
     return f"good: {', '.join(parts)}"
+
+
+def _attached(rig: Rig, kind: str) -> dict[str, Any]:
+    """Masses or supports of the rig's file."""
+    keys: Any = {} if rig.document is None else rig.document.data.get(kind)
+    return dict(keys or {})
+
+
+def _edge_costs(rig: Rig) -> list[str]:
+    """What few points of an edge cost where it has many waves."""
+    high = rig.limits.frequency_max
+    needed = least_points(rig.plate, high)
+    return [
+        f"{kind}.{name}.points: {count} on each edge are few at {high:g} Hz; give {needed}"
+        for kind in ("masses", "supports")
+        for name, keys in _attached(rig, kind).items()
+        if "along" in keys and (count := keys.get("points", DEFAULT_POINTS)) < needed
+    ]
 
 
 _MAX_ANGLE = math.radians(20.5)  # between two rows

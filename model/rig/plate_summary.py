@@ -42,6 +42,7 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "E_pa": plate.material.E,
         "rho_kg_m3": plate.material.rho,
         "nu": plate.material.nu,
+        "orthotropic": _grain(plate),
         "loss_factor": plate.loss_factor,
         "further": {each.key(name): getattr(plate, name) for name, each in FURTHER.items()},
         "mass_kg": plate.mass,
@@ -55,9 +56,33 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "point_masses": [
             {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
         ],
+        "supports": [
+            {
+                "at_m": [each.x, each.y],
+                "stiffness_n_m": each.stiffness,
+                "damping_n_s_m": each.damping,
+                "loss_factor": each.loss_factor,
+            }
+            for each in rig.masses
+            if each.stiffness
+        ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
         "exciters": [summary_of(one) for one in exciters_of(rig)],
         "exciter_types": types_of(rig),
+    }
+
+
+def _grain(plate: Plate) -> dict[str, float] | None:
+    """Numbers of a board along and across the plate's length; None of an isotropic plate."""
+    material = plate.material
+    if material.orthotropy is None:
+        return None
+    along, across = plate.rigidity_towards(1.0), plate.rigidity_towards(0.0)
+    return {
+        **{f"{key}_pa": each for key, each in material.moduli.items()},
+        "nu12": material.nu,
+        "flexural_rigidity_along_n_m": float(along),
+        "flexural_rigidity_across_n_m": float(across),
     }
 
 

@@ -16,6 +16,7 @@ from model.rig.actuators import KINDS
 from model.rig.file import rig_of
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.structure.materials import known_material
 from model.structure.plate import Material
 
 _Written: TypeAlias = "float | tuple[Any, ...] | Material | Uncertainty"
@@ -43,8 +44,8 @@ def rewritten_text(
     rows: list[list[str]] = []
 
     def change(data: CommentedMap) -> None:
-        own = _values(before)
-        for path, value in _values(after).items():
+        own = _values(before, document)
+        for path, value in _values(after, document).items():
             if value != own[path] or path in _restated(after):
                 _put(data, path, value, rows)
         for era in after.eras:
@@ -61,7 +62,7 @@ def rewritten_text(
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
     back = rig_of(parse_document(document.source, text), mesh=mesh)
-    read, expected = ([*_numbers(each)] for each in (back, after))
+    read, expected = ([*_numbers(each, document)] for each in (back, after))
     if len(read) != len(expected) or not all(
         math.isclose(one, other, rel_tol=_SAME, abs_tol=none)
         for (one, _), (other, none) in zip(read, expected, strict=True)
@@ -73,16 +74,19 @@ def rewritten_text(
     return text
 
 
-def _values(rig: Rig) -> dict[KeyPath, _Written]:
+def _values(rig: Rig, document: Document) -> dict[KeyPath, _Written]:
     """Values of a rig that a fit may change, by where its file has them."""
     plate, layers = rig.plate, rig.laminate.layers if rig.laminate else ()
     found: dict[KeyPath, _Written] = {("uncertainty",): rig.uncertainty}
     # New keys come first in their block.
-    for number, layer in enumerate(layers):
-        found["plate", "layers", number, "material"] = layer.material
-        found["plate", "layers", number, "thickness"] = layer.thickness
-    if not layers:
-        found["plate", "material"], found["plate", "thickness"] = plate.material, plate.thickness
+    stated: Any = document.data["plate"]
+    if "layers" in stated:
+        for number, layer in enumerate(layers):
+            found["plate", "layers", number, "material"] = layer.material
+            found["plate", "layers", number, "thickness"] = layer.thickness
+    else:
+        whole = layers[0] if layers else plate  # a single layer of what depends on frequency
+        found["plate", "material"], found["plate", "thickness"] = whole.material, whole.thickness
     found["plate", "loss_factor"] = plate.loss_factor
     found["plate", "loss_exponent"] = plate.loss_exponent
     found["plate", "modes"] = plate.mode_deviations
@@ -107,12 +111,12 @@ def _drop_replaced(entry: CommentedMap, instead: Mapping[str, tuple[str, ...]]) 
             entry.pop(other, None)
 
 
-def _numbers(rig: Rig) -> Iterator[tuple[float, float]]:
+def _numbers(rig: Rig, document: Document) -> Iterator[tuple[float, float]]:
     """Values of a rig that are written, each with what counts as none of its quantity."""
-    for path, value in _values(rig).items():
+    for path, value in _values(rig, document).items():
         match value:
             case Material():
-                yield value.E, 0.0
+                yield from ((each, 0.0) for each in value.moduli.values())
             case Uncertainty():
                 yield from ((each, 0.0) for each in asdict(value).values())
             case tuple() if path[-1] == "at":
@@ -171,14 +175,18 @@ def _rows_text(rows: Sequence[str], *, indent: str) -> str:
 
 
 def _set_material(entry: CommentedMap, material: Material) -> None:
-    """Set the modulus of a plate's or layer's material, writing out a named material."""
-    text = f"{material.E / 1e9:.7g} GPa"
-    if isinstance(entry["material"], CommentedMap):
-        entry["material"]["E"] = text
+    """Set the moduli of a plate's or layer's material, writing out a named material."""
+    along_grain = material.turned() if entry.get("grain") == "width" else material
+    moduli = {key: f"{each / 1e9:.7g} GPa" for key, each in along_grain.moduli.items()}
+    given = entry["material"]
+    if isinstance(given, CommentedMap):
+        given.update(moduli)
         return
-    entry["material"] = _flow(
-        {"name": material.name, "E": text, "rho": material.rho, "nu": material.nu}
-    )
+    ratio = "nu" if material.orthotropy is None else "nu12"
+    numbers = {"name": material.name, **moduli, "rho": material.rho, ratio: along_grain.nu}
+    if rows := known_material(given).by_frequency:
+        numbers["by_frequency"] = [list(map(_rounded, row)) for row in rows]
+    entry["material"] = _flow(numbers)
 
 
 def _free_name(masses: CommentedMap) -> str:

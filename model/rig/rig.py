@@ -43,13 +43,13 @@ class Rig:
     """A plate on its ERAs, with wiring and limits.
 
     eras: those that are driven. wiring: channel by the name of the ERA; amplifiers: URL by name;
-    masses: on the plate, ERAs without an amplifier among them, whose names are supports; laminate:
-    of which the plate is made, also where its layers are solved as a homogeneous one; uncertainty:
-    of its parameters; fingertip: load of each finger on the plate, None for weightless ones;
-    threshold: name of the set of detection thresholds that levels are above
-    (`model.finger.perception`); promised_thresholds: of the sets by which promises hold, beside
-    that one; outputs: the amplifiers whose full level is an output, to which bases move by their
-    gains, not a motion;
+    masses: on the plate, and what supports it without being driven, last of them ERAs without an
+    amplifier, whose names are supports; laminate: of which the plate is made, also where its layers
+    are solved as a homogeneous one; uncertainty: of its parameters; fingertip: load of each finger
+    on the plate, None for weightless ones; threshold: name of the set of detection thresholds that
+    levels are above (`model.finger.perception`); promised_thresholds: of the sets by which promises
+    hold, beside that one; outputs: the amplifiers whose full level is an output, to which bases
+    move by their gains, not a motion;
     clock_errors: what each amplifier is taken to state of its clock [s], infinite for one that
     cannot be steered; document: its keys.
     """

@@ -20,6 +20,8 @@ from model.config.units import (
     DAMPING,
     DENSITY,
     LENGTH,
+    LINE_MASS,
+    LINE_STIFFNESS,
     MASS,
     MODULUS,
     RATE,
@@ -47,29 +49,32 @@ from model.rig.key_types import (
     check_url,
 )
 from model.rig.uncertainty import BOUNDS, Uncertainty
-from model.structure.materials import material, material_names
+from model.structure.feet_and_frames import DEFAULT_POINTS
+from model.structure.materials import KnownMaterial, known_material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 
 
 class _MaterialByName:
     """Annotation of a material that may be given by name."""
 
-    def read(self, value: object) -> object:
-        """Replace the name of a material by its numbers."""
-        if not isinstance(value, str):
-            return value
-        known = material(value)
-        return MaterialSection(name=known.name, E=known.E, rho=known.rho, nu=known.nu)
+    def read(self, value: object, section: core_schema.ValidatorFunctionWrapHandler) -> object:
+        """Look up a material by its name: its numbers may depend on the thickness."""
+        return known_material(value) if isinstance(value, str) else section(value)
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        return core_schema.no_info_before_validator_function(self.read, handler(source))
+        section = handler.generate_schema(MaterialSection)
+        return core_schema.no_info_wrap_validator_function(self.read, section)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
+
+
+def _modulus(at_least: float = 1e3) -> Quantity:
+    return Quantity(MODULUS, at_least=at_least, at_most=1e13)
 
 
 class _OrNone:
@@ -90,8 +95,21 @@ class _OrNone:
         return {"anyOf": [handler(schema), {"const": "none"}]}
 
 
+ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI]
+
+ISOTROPIC = frozenset({"E", "nu"})
+ORTHOTROPIC = frozenset({"E1", "E2", "G12", "G13", "G23", "nu12"})
+"""Numbers of a material that is the same in all directions, and of one with a grain."""
+
+
 class MaterialSection(Section):
-    """A material by its numbers."""
+    """A material by its numbers: `E` and `nu`, or those along and across a grain."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": [*sorted(ISOTROPIC)]}, {"required": [*sorted(ORTHOTROPIC)]}]
+        }
+    )
 
     name: Identifier = "custom"
     """Displayed only.
@@ -99,17 +117,50 @@ class MaterialSection(Section):
     Limits: a name
     """
 
-    E: Annotated[float, Quantity(MODULUS, at_least=1e3, at_most=1e13)]
-    """Young's modulus."""
+    E: Annotated[float, _modulus()] | None = None
+    """Young's modulus.
+
+    Default: required, or those with a grain
+    """
 
     rho: Annotated[float, Quantity(DENSITY, at_least=1, at_most=1e5)]
     """Density."""
 
-    nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)]
-    """Poisson's ratio."""
+    nu: Annotated[float, Quantity(RATIO, above=-1, below=0.5)] | None = None
+    """Poisson's ratio.
+
+    Default: required, or those with a grain
+    """
+
+    E1: Annotated[float, _modulus()] | None = None
+    """Young's modulus along the grain, in place of `E`, see [boards](#boards)."""
+
+    E2: Annotated[float, _modulus()] | None = None
+    """Across the grain."""
+
+    G12: Annotated[float, _modulus()] | None = None
+    """Shear modulus in the plane of the board."""
+
+    nu12: Annotated[float, Quantity(RATIO, above=-5, below=5)] | None = None
+    """Contraction across the grain by a stress along it, in place of `nu`.
+
+    Limits: above -5, below 5; less than the root of E1 / E2
+    """
+
+    G13: Annotated[float, _modulus()] | None = None
+    """Transverse shear modulus along the grain."""
+
+    G23: Annotated[float, _modulus()] | None = None
+    """Transverse shear modulus across it, of wood the rolling shear."""
+
+    by_frequency: ModulusRows | None = None
+    """As that of a [layer](#layers), of a plate of an isotropic material that depends on it.
+
+    Limits: 2 rows or more, by ascending frequency
+    """
 
 
-MaterialOrName = Annotated[MaterialSection, _MaterialByName()]
+MaterialOrName = Annotated[MaterialSection | KnownMaterial, _MaterialByName()]
 
 
 class LayerSection(Section):
@@ -124,9 +175,7 @@ class LayerSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
     """Eta of the layer itself, E (1 + i eta), beside the `loss_factor` of the plate."""
 
-    by_frequency: Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI] | None = (
-        None
-    )
+    by_frequency: ModulusRows | None = None
     """`[[frequency in Hz, factor of E, loss factor], ...]`: linear in the logarithms of frequency
     and factor, constant outside; in place of `loss_factor`.
 
@@ -181,6 +230,11 @@ class PlateSection(Section):
     Default: required, or `layers`
     """
 
+    grain: Literal["length", "width"] = "length"
+    """Which side the grain of a board runs along: axis 1 of its material, of plywood the grain of
+    its faces.
+    """
+
     layers: Annotated[list[LayerSection], Field(min_length=1, max_length=20)] | None = None
     """A laminate instead of `thickness` and `material`, see [layers](#layers)."""
 
@@ -193,8 +247,11 @@ class PlateSection(Section):
     Limits: see there
     """
 
-    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] = 0.01
-    """Structural damping eta of a hysteretic stiffness (1 + i eta) K, of the mounted plate."""
+    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
+    """Structural damping eta of a hysteretic stiffness (1 + i eta) K, of the mounted plate.
+
+    Default: 0.01; of `plywood` and `mdf` 0.02, of `pine` and `spruce` 0.015
+    """
 
     loss_exponent: Annotated[
         float, Quantity(RATIO, at_least=-MAX_LOSS_EXPONENT, at_most=MAX_LOSS_EXPONENT)
@@ -210,17 +267,90 @@ class PlateSection(Section):
     """
 
 
+Edges = Literal["edges"]
+Points = Annotated[int, Field(ge=3, le=40)]
+
+
 class MassSection(Section):
-    """A mass on the plate, at a point or on a disc."""
+    """A mass on the plate, at a point or on a disc, or along all edges."""
 
-    at: Place
-    """`[x, y]`, on the plate."""
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": ["at", "mass"]}, {"required": ["along", "mass_per_length"]}]
+        }
+    )
 
-    mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)]
-    """Its mass."""
+    at: Place | None = None
+    """`[x, y]`, on the plate.
+
+    Default: required, or `along`
+    """
+
+    mass: Annotated[float, Quantity(MASS, at_least=0, at_most=10)] | None = None
+    """Its mass.
+
+    Default: required with `at`
+    """
 
     foot: Foot = 0.0
     """Radius of the disc on which it sits, 0 for a point."""
+
+    along: Edges | None = None
+    """`edges` for a frame that is bonded to all of them, in place of `at`."""
+
+    mass_per_length: Annotated[float, Quantity(LINE_MASS, at_least=0, at_most=100)] | None = None
+    """Of such a frame.
+
+    Default: required with `along`
+    """
+
+    points: Points = DEFAULT_POINTS
+    """Of each edge, at which a frame acts; more for many waves along it."""
+
+
+class SupportSection(Section):
+    """A foot under the plate, or what holds its edges; it is not driven."""
+
+    at: Place | None = None
+    """`[x, y]`, on the plate.
+
+    Default: required, or `along`
+    """
+
+    kind: Literal["foam", "rubber"] | None = None
+    """A foot of 2 or 30 kN/m, which `stiffness` replaces."""
+
+    stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)] | None = None
+    """Of its spring.
+
+    Default: required with `at`, or `kind`
+    """
+
+    loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
+    """Eta of the spring, k (1 + i eta).
+
+    Default: 0.15, or 0 with `damping`
+    """
+
+    damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None
+    """Of a viscous damper, in place of a loss factor, or beside one that is given."""
+
+    foot: Foot = 0.0
+    """Radius of the disc on which it presses, 0 for a point; required from 1 MN/m on."""
+
+    along: Edges | None = None
+    """`edges` for what holds all of them, as foam tape, in place of `at`."""
+
+    stiffness_per_length: (
+        Annotated[float, Quantity(LINE_STIFFNESS, above=0, at_most=1e9)] | None
+    ) = None
+    """Of what holds the edges.
+
+    Default: required with `along`
+    """
+
+    points: Points = DEFAULT_POINTS
+    """Of each edge, at which it acts; more for many waves along it."""
 
 
 class AmplifierSection(Section):
@@ -377,7 +507,12 @@ class RigSection(Section):
     """ERAs, or exciters, by name, see [eras](#eras) and [exciters](#exciters)."""
 
     masses: Annotated[dict[Identifier, MassSection], Field(max_length=64, default_factory=dict)]
-    """Point masses by name, see [masses](#masses)."""
+    """Masses by name, see [masses](#masses)."""
+
+    supports: Annotated[
+        dict[Identifier, SupportSection], Field(max_length=64, default_factory=dict)
+    ]
+    """What holds the plate and is not driven, by name, see [supports](#supports)."""
 
     amplifiers: Annotated[dict[Identifier, AmplifierSection], Field(min_length=1)]
     """Amplifiers by name, see [amplifiers](#amplifiers)."""

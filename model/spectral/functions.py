@@ -176,13 +176,14 @@ def _polynomials(x: FloatArray, length: float, degree: int) -> FloatArray:
     return np.asarray(legvander(2 * x / length - 1, degree) * scale)
 
 
-def edge_decays(section: CrossSection) -> tuple[float, ...]:
+def edge_decays(section: CrossSection, along: int) -> tuple[float, ...]:
     """Decays [1/m] of the boundary layers of a laminate's free edge, the widest first.
 
-    Displacements along an edge twist the layers against each other: twist v'' = slip v over the
-    distance from it. Of one homogeneous layer k = sqrt(10) / h.
+    along: 0 for those along x, of edges across it, 1 for those along y. Displacements along an edge
+    twist the layers against each other: twist v'' = slip v over the distance from it. Of one
+    homogeneous layer k = sqrt(10) / h, of a board times sqrt(G23 / G12) or sqrt(G13 / G12).
     """
-    slip, twist = np.real(section.slip), np.real(section.twist)
+    slip, twist = np.real(section.slip[1 - along]), np.real(section.twist)
     squares = linalg.eigh(slip, twist, eigvals_only=True)[1:]
     decays: list[float] = []
     for k in np.sqrt(np.maximum(squares, 0)):

@@ -6,9 +6,10 @@ plate's compliance in all shorter waves, the mean over all directions phi of
 
     1 / (4 pi D k²) + ln(k_max / k) / (2 pi S),    k = min(a / |cos phi|, b / |sin phi|),
 
-D the flexural and S the shear rigidity. The square of a Legendre polynomial waves along the plate,
-and so does what is missing in all higher ones: at x = L (1 - cos t) / 2 there is 1 + o times as
-much in all waves that end at a, so that a is to be divided by sqrt(1 + o),
+D the flexural rigidity, of a board that towards phi, and S the shear rigidity. The square of a
+Legendre polynomial waves along the plate, and so does what is missing in all higher ones: at
+x = L (1 - cos t) / 2 there is 1 + o times as much in all waves that end at a, so that a is to be
+divided by sqrt(1 + o),
 
     o = cos(2 (p - 1) t) / ((p - 1) sin t).
 
@@ -168,11 +169,12 @@ def unresolved_at(
     at_corner = edge.prod(axis=1) / ratio_at_edge**2
     bending = 1 + edge.sum(axis=1) + (_CORNER - 1 - 2 * ratio_at_edge) * at_corner
     mean = wavelengths2.mean(axis=1)
+    softness = D / plate.rigidity_towards(_COS2)  # 1 of what is the same in all directions
     logarithm = np.log(np.maximum(1, wavelengths2 / h**2)).mean(axis=1) / 2
     images = (1 + edge / ratio_at_edge).prod(axis=1)
     return UnresolvedCompliance(
         places,
-        bending * mean / (4 * np.pi * D),
+        bending * (wavelengths2 * softness).mean(axis=1) / (4 * np.pi * D),
         images * logarithm / (2 * np.pi * plate.shear_rigidity),
         mean**-0.5,
         images * math.log(10) / (2 * np.pi * plate.shear_rigidity),

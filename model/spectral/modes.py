@@ -102,11 +102,11 @@ class SpectralPlate:
         self._opposite = opposite_motions(self._layers)
         self._mass = self._opposite.T @ interface_mass(self._layers) @ self._opposite
         moduli = [layer.modulus(middle) for layer in self._layers]
-        decays = edge_decays(section_of(self._layers, moduli, self._corrections))
+        section = section_of(self._layers, moduli, self._corrections)
         nx, ny = degrees
-        self._x = _functions(plate.length, nx, decays)
+        self._x = _functions(plate.length, nx, edge_decays(section, 0))
         # A degree of 0 is a strip of an infinite width: nothing varies along y.
-        self._y = _functions(plate.width, ny, decays if ny else ())
+        self._y = _functions(plate.width, ny, edge_decays(section, 1) if ny else ())
 
     def functions(self, parity: tuple[int, int]) -> ClassFunctions:
         """Functions of a symmetry class."""

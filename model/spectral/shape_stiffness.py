@@ -3,12 +3,12 @@
 Displacements along the plate follow deflections by least energy: a change of stiffness dK then
 changes the energy of shapes v by v^T dK v, to first order without a solve of another plate. By a
 side it has a closed form (`class_stiffness`); by Poisson's ratio nu of a layer, which all layers
-have changed alike, K (1 - nu²) is linear.
+have changed alike, by what a small change of it does to the section, in which K is linear.
 
 What the air behind a plate adds is left out, and how rotary inertia changes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from model.structure.laminate_section import (
 )
 from model.structure.plate import LaminateLayer, Plate
 
-_NUS = (0.0, 0.4)  # of a difference: any two
+_STEP = 1e-4  # of Poisson's ratio: exact to its square
 
 
 def stiffness_slopes(
@@ -43,37 +43,65 @@ def stiffness_slopes(
     """
     layers = layers_of(plate)
     corrections = shear_corrections(layers)
-    moduli = np.array([layer.modulus(frequency).real for layer in layers])
-    nus = np.array([layer.material.nu for layer in layers])
+    moduli = [layer.modulus(frequency).real for layer in layers]
 
-    def section(moduli: FloatArray, nu: float | None = None) -> CrossSection:
-        changed = layers if nu is None else [_with_nu(each, nu) for each in layers]
-        return section_of(changed, moduli.tolist(), corrections)
+    def section(further_nu: float) -> CrossSection:
+        changed = [_with_nu(each, further_nu) for each in layers]
+        return section_of(changed, moduli, corrections)
 
-    nominal = section(moduli)
-    decays = edge_decays(nominal)
-    x, y = (
-        EdgedFunctions(side, degree, decays)
-        for side, degree in zip((plate.length, plate.width), degrees, strict=True)
-    )
+    nominal = section(0.0)
     slopes = np.zeros((3, *2 * unknowns[0].shape[1:]))
-    scale = 1 - nus**2
+    for of, v in _shapes(plate, degrees, unknowns, nominal):
+        for side in range(2):
+            slopes[side] += v.T @ class_stiffness(of, nominal, side) @ v
+        for step in (_STEP, -_STEP):
+            slopes[2] += v.T @ class_stiffness(of, section(step)) @ v / (2 * step)
+    return slopes
+
+
+def grain_slopes(
+    plate: Plate, degrees: tuple[int, int], unknowns: Sequence[FloatArray]
+) -> FloatArray:
+    """Derivatives of the stiffness of shapes (r,) of a board, (2, r), each by itself.
+
+    By the logarithms of its modulus across the length and of its shear modulus in the plane.
+    unknowns: as of `stiffness_slopes`.
+    """
+    layers = layers_of(plate)
+    material, thickness = plate.material, plate.thickness
+
+    def section(**shares: float) -> CrossSection:
+        other = replace(material, orthotropy=replace(material.shares, **shares))
+        layer = LaminateLayer(other, thickness)
+        return section_of([layer], [material.E], shear_corrections(layers))
+
+    slopes = np.zeros((2, unknowns[0].shape[1]))
+    for of, v in _shapes(plate, degrees, unknowns, section()):
+        for number, key in enumerate(("e2", "g12")):
+            own = getattr(material.shares, key)
+            for step in (_STEP, -_STEP):
+                K = class_stiffness(of, section(**{key: own * (1 + step)}))
+                slopes[number] += np.einsum("nr,nr->r", v, K @ v) / (2 * step)
+    return slopes
+
+
+def _shapes(
+    plate: Plate, degrees: tuple[int, int], unknowns: Sequence[FloatArray], nominal: CrossSection
+) -> Iterator[tuple[ClassFunctions, FloatArray]]:
+    """Yield of each class its functions, and shapes with their displacements along the plate."""
+    layers = layers_of(plate)
+    x, y = (
+        EdgedFunctions(side, degree, edge_decays(nominal, along))
+        for along, (side, degree) in enumerate(
+            zip((plate.length, plate.width), degrees, strict=True)
+        )
+    )
     shift = (2 * np.pi * plate.lowest_bending_frequency) ** 2
     for parity, w in zip(CLASSES, unknowns, strict=True):
         of = ClassFunctions(x, y, parity, len(layers) + 1)
         along = follow(of, class_stiffness(of, nominal), interface_mass(layers), shift) @ w
-        v = np.vstack([w, along])
-        for side in range(2):
-            slopes[side] += v.T @ class_stiffness(of, nominal, side) @ v
-        low, high = _NUS
-        for changed, share in (
-            (section(moduli * (1 - high**2) / scale, high), 1 / (high - low)),
-            (section(moduli * (1 - low**2) / scale, low), -1 / (high - low)),
-            (section(moduli * 2 * nus / scale), 1.0),
-        ):
-            slopes[2] += share * (v.T @ class_stiffness(of, changed) @ v)
-    return slopes
+        yield of, np.vstack([w, along])
 
 
-def _with_nu(layer: LaminateLayer, nu: float) -> LaminateLayer:
-    return replace(layer, material=replace(layer.material, nu=nu))
+def _with_nu(layer: LaminateLayer, further: float) -> LaminateLayer:
+    return replace(layer, material=replace(layer.material, nu=layer.material.nu + further))

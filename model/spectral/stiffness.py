@@ -8,6 +8,8 @@ interfaces:
     stretch (u_x,x u_x,x + u_y,y u_y,y) + 2 across u_x,x u_y,y + twist (u_x,y + u_y,x)²
     + slip (u_x² + u_y²) + 2 lever (u_x w,x + u_y w,y) + shear (w,x² + w,y²)
 
+with other stretch, slip, lever and shear along x than along y where a material has a grain.
+
 Air in a gap behind the plate, in the natural shapes of the pressure between its edges. Sealed
 edges hold the flow back, grad p is zero across them: cosines. At open edges p = 0: sines. The
 displacement of the air along the gap is a sum of a grad(psi) / k over these shapes psi of
@@ -88,7 +90,7 @@ def class_stiffness(
     stretch, across, twist, slip = (
         np.real(each) for each in (section.stretch, section.across, section.twist, section.slip)
     )
-    lever, shear = np.real(section.lever)[None], np.full((1, 1), np.real(section.shear))
+    lever, shear = np.real(section.lever)[:, None], np.real(section.shear)[:, None, None]
     w = slice(0, of.deflections)
     u = slice(w.stop, w.stop + of.interfaces * xx * xy)
     v = slice(u.stop, of.size)
@@ -101,22 +103,22 @@ def class_stiffness(
         factor = 1 if by_side is None else -powers[by_side]
         return _product(factor * matrix, _product(along_x, along_y))
 
-    K[w, w] = laid(shear, x.slope_squares[a][:wx, :wx], np.eye(wy), 2, 0)
-    K[w, w] += laid(shear, np.eye(wx), y.slope_squares[b][:wy, :wy], 0, 2)
+    K[w, w] = laid(shear[0], x.slope_squares[a][:wx, :wx], np.eye(wy), 2, 0)
+    K[w, w] += laid(shear[1], np.eye(wx), y.slope_squares[b][:wy, :wy], 0, 2)
     K[u, u] = (
-        laid(stretch, x.slope_squares[-a], np.eye(xy), 4, 0)
+        laid(stretch[0], x.slope_squares[-a], np.eye(xy), 4, 0)
         + laid(twist, np.eye(xx), y.slope_squares[b], 2, 2)
-        + laid(slip, np.eye(xx), np.eye(xy), 2, 0)
+        + laid(slip[0], np.eye(xx), np.eye(xy), 2, 0)
     )
     K[v, v] = (
-        laid(stretch, np.eye(yx), y.slope_squares[-b], 0, 4)
+        laid(stretch[1], np.eye(yx), y.slope_squares[-b], 0, 4)
         + laid(twist, x.slope_squares[a], np.eye(yy), 2, 2)
-        + laid(slip, np.eye(yx), np.eye(yy), 0, 2)
+        + laid(slip[1], np.eye(yx), np.eye(yy), 0, 2)
     )
     K[u, v] = laid(across, x.slope_products[-a], y.slope_products[-b].T, 2, 2)
     K[u, v] += laid(twist, x.slope_products[a].T, y.slope_products[b], 2, 2)
-    K[w, u] = laid(lever, x.slope_products[a][:wx], np.eye(wy, xy), 2, 0)
-    K[w, v] = laid(lever, np.eye(wx, yx), y.slope_products[b][:wy], 0, 2)
+    K[w, u] = laid(lever[0], x.slope_products[a][:wx], np.eye(wy, xy), 2, 0)
+    K[w, v] = laid(lever[1], np.eye(wx, yx), y.slope_products[b][:wy], 0, 2)
     K[v, u], K[u, w], K[v, w] = K[u, v].T, K[w, u].T, K[w, v].T
     return K
 

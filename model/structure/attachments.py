@@ -390,7 +390,7 @@ class PointLoad:
     """A spring [N/m] and a damper [N s/m] to the ground, and a mass [kg], at x, y [m].
 
     foot [m]: radius of the disc on which it acts, 0 for a point. It follows the mean deflection;
-    its rotary inertia is not modelled.
+    its rotary inertia is not modelled. loss_factor: eta of the spring, k (1 + i eta), as of foam.
     """
 
     x: float
@@ -399,10 +399,12 @@ class PointLoad:
     damping: float = 0.0
     mass: float = 0.0
     foot: float = 0.0
+    loss_factor: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
-        expect_values(self, "point load", at_least="stiffness damping mass foot", finite="x y")
+        held = "stiffness damping mass foot loss_factor"
+        expect_values(self, "point load", at_least=held, finite="x y")
 
     @property
     def in_time(self) -> InTime:
@@ -410,8 +412,12 @@ class PointLoad:
         return InTime(self.mass, self.stiffness, self.damping)
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """D = k + i omega c - omega² m [N/m], of the shape of omega [rad/s]."""
-        return np.asarray(self.stiffness + 1j * omega * self.damping - omega**2 * self.mass)
+        """D = k (1 + i eta) + i omega c - omega² m [N/m], of the shape of omega [rad/s].
+
+        At negative frequencies, as in the lower sideband of a fast ramp, the conjugate.
+        """
+        lossy = self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega))
+        return np.asarray(lossy + 1j * omega * self.damping - omega**2 * self.mass)
 
 
 Complex = TypeVar("Complex", bound="np.complexfloating[Any, Any]")

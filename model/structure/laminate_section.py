@@ -33,9 +33,10 @@ class Bending:
 class CrossSection:
     """Stiffness per area of n layers in the displacements u along the plate at n + 1 interfaces.
 
-    stretch, across, twist (n + 1, n + 1) [N/m]: of u_x,x u_x,x, of u_x,x u_y,y, and of
-    (u_x,y + u_y,x)²; slip (n + 1, n + 1) [N/m³]: of u u; lever (n + 1,) [N/m²] and shear [N/m]: of
-    u w,x and of (w,x)². Linear in the moduli, complex with losses.
+    across, twist (n + 1, n + 1) [N/m]: of u_x,x u_y,y and of (u_x,y + u_y,x)². Along x and then
+    along y: stretch (2, n + 1, n + 1) [N/m]: of u_x,x u_x,x; slip (2, n + 1, n + 1) [N/m³]: of u u;
+    lever (2, n + 1) [N/m²] and shear (2,) [N/m]: of u w,x and of (w,x)². Linear in the moduli,
+    complex with losses.
     """
 
     stretch: ComplexArray
@@ -43,7 +44,7 @@ class CrossSection:
     twist: ComplexArray
     slip: ComplexArray
     lever: ComplexArray
-    shear: complex
+    shear: ComplexArray
 
     def in_motions(self, motions: FloatArray) -> "CrossSection":
         """The section in k motions of the interfaces, each a column (n + 1, k)."""
@@ -51,7 +52,7 @@ class CrossSection:
             motions.T @ each @ motions
             for each in (self.stretch, self.across, self.twist, self.slip)
         )
-        return CrossSection(stretch, across, twist, slip, motions.T @ self.lever, self.shear)
+        return CrossSection(stretch, across, twist, slip, self.lever @ motions, self.shear)
 
 
 def opposite_motions(layers: Sequence[LaminateLayer]) -> FloatArray:
@@ -72,21 +73,23 @@ def section_of(
 ) -> CrossSection:
     """Section of layers with these Young's moduli [Pa]; corrections: of `shear_corrections`."""
     size = len(layers) + 1
-    stretch, across, twist, slip = (np.zeros((size, size), dtype=complex) for _ in range(4))
-    lever = np.zeros(size, dtype=complex)
-    shear = 0j
+    across, twist = (np.zeros((size, size), dtype=complex) for _ in range(2))
+    stretch, slip = (np.zeros((2, size, size), dtype=complex) for _ in range(2))
+    lever = np.zeros((2, size), dtype=complex)
+    shear = np.zeros(2, dtype=complex)
     ends = np.array([-1.0, 1.0])
     for number, (layer, modulus, kappa) in enumerate(zip(layers, moduli, corrections, strict=True)):
-        nu, h = layer.material.nu, layer.thickness
+        shares, h = layer.material.shares, layer.thickness
         own = slice(number, number + 2)
         linear = h / 6 * np.array([[2.0, 1.0], [1.0, 2.0]])
-        plane, G = modulus / (1 - nu**2), modulus / (2 * (1 + nu))
-        stretch[own, own] += plane * linear
-        across[own, own] += nu * plane * linear
-        twist[own, own] += G * linear
-        slip[own, own] += kappa * G / h * np.outer(ends, ends)
-        lever[own] += kappa * G * ends
-        shear += kappa * G * h
+        plane = modulus / layer.material.plane_stress
+        across[own, own] += layer.material.nu * shares.e2 * plane * linear
+        twist[own, own] += shares.g12 * modulus * linear
+        for side, (E, G) in enumerate([(1.0, shares.g13), (shares.e2, shares.g23)]):
+            stretch[side, own, own] += E * plane * linear
+            slip[side, own, own] += kappa * G * modulus / h * np.outer(ends, ends)
+            lever[side, own] += kappa * G * modulus * ends
+            shear[side] += kappa * G * modulus * h
     return CrossSection(stretch, across, twist, slip, lever, shear)
 
 
@@ -109,7 +112,7 @@ def slide_frequency(laminate: Laminate, frequency: float) -> float:
     """
     layers = laminate.layers
     moduli = [layer.modulus(frequency).real for layer in layers]
-    slip = section_of(layers, moduli, shear_corrections(layers)).slip.real
+    slip = section_of(layers, moduli, shear_corrections(layers)).slip[0].real
     squares = np.linalg.eigvals(np.linalg.solve(interface_mass(layers), slip)).real
     return math.sqrt(np.sort(squares)[1]) / (2 * math.pi)
 
@@ -171,8 +174,9 @@ def wave_rigidity(laminate: Laminate, wavenumber: complex, frequency: float) -> 
         return freely_sliding(layers).rigidity + 0j
     moduli = [layer.modulus(frequency) for layer in layers]
     section = section_of(layers, moduli, shear_corrections(layers))
-    moved = np.linalg.solve(k2 * section.stretch + section.slip, section.lever)
-    return complex((section.shear - section.lever @ moved) / k2)
+    stretch, slip, lever = section.stretch[0], section.slip[0], section.lever[0]
+    moved = np.linalg.solve(k2 * stretch + slip, lever)
+    return complex((section.shear[0] - lever @ moved) / k2)
 
 
 def wavenumber_of(laminate: Laminate, frequency: float) -> complex:
@@ -255,7 +259,7 @@ def _homogeneous(
         width=width,
         thickness=_rounded(thickness),
         material=Material(
-            "laminate",
+            laminate.layers[0].material.name if len(laminate.layers) == 1 else "laminate",
             E=_rounded(12 * bent.rigidity * (1 - bent.nu**2) / thickness**3),
             rho=_rounded(density / thickness),
             nu=_rounded(bent.nu),

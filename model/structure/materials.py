@@ -2,12 +2,17 @@
 
 An installed package adds one by an entry point of the group `era_haptics.materials` that leads to
 a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
+
+Moduli of plywood are those of its veneers: E of the grain where it runs along, and none across it
+(Handbook of Finnish Plywood), so that in bending, with the cross veneers between heights a and b
+from the middle, E2 h³ = 8 E sum (b³ - a³) and E1 + E2 = E.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from model.errors import InputError
-from model.structure.plate import Material
+from model.structure.plate import Material, Orthotropy
 from registry.plugins import PluginRegistry
 
 
@@ -17,14 +22,62 @@ class KnownMaterial:
 
     source: of E, rho and nu; variation: between grades and measurements;
     loss_factor: order of the bare material's own (Cremer and Heckl, Structure-Borne Sound, 2nd ed.;
-    of polycarbonate only an order). What is built in loses far more at its joints, so a rig's loss
-    factor does not follow from its material.
+    of polycarbonate only an order). What is built in loses more at its joints: a rig's default is
+    1 %, or own_loss where the material itself loses more. by_frequency: rows of frequency [Hz],
+    factor of E and loss factor of what depends on it, as of a layer. by_thickness: the material of
+    a board so thick [m], where `material` is that of one of them.
     """
 
     material: Material
     source: str
     variation: str
     loss_factor: str
+    own_loss: float = 0.0
+    by_frequency: tuple[tuple[float, float, float], ...] = ()
+    by_thickness: Callable[[float], Material] | None = None
+
+    def of_thickness(self, thickness: float) -> Material:
+        """The material of a board of a thickness [m]."""
+        return self.material if self.by_thickness is None else self.by_thickness(thickness)
+
+
+VENEER = 1.4e-3  # m; before the faces are sanded to boards of 1.4 n - 0.6 mm
+_SANDED = 0.6e-3
+
+
+def plies(thickness: float) -> int:
+    """Number of veneers of a birch plywood board of a thickness [m]: the nearest odd one."""
+    return max(3, 2 * round(((thickness + _SANDED) / VENEER - 1) / 2) + 1)
+
+
+def plywood(thickness: float) -> Material:
+    """Birch plywood of a thickness [m], the grain of its faces along the plate's length.
+
+    Boards between those made have veneers thinner or thicker in proportion.
+    """
+    count = plies(thickness)
+    board = VENEER * count - _SANDED
+    # Heights from the middle at which the grain turns, outwards; the outermost are the faces.
+    heights = [VENEER * (n + 0.5) for n in range((count - 1) // 2)]
+    sign = 1 if count % 4 == 3 else -1  # whether the middle veneer is a cross one
+    across = sum(sign * (-1) ** n * (2 * h / board) ** 3 for n, h in enumerate(heights))
+    E, G = 17.5e9, 0.62e9
+    along = E * (1 - across)
+    shares = Orthotropy(across / (1 - across), G / along, 0.35e9 / along, 0.25e9 / along)
+    return Material("plywood", E=along, rho=680.0, nu=0.05, orthotropy=shares)
+
+
+def _wood(
+    name: str,
+    E1: float,
+    E2: float,
+    *,
+    rho: float,
+    nu: float,
+    G: tuple[float, float, float],
+) -> Material:
+    """A material with a grain by moduli in GPa; G in the plane, along and across the grain."""
+    return Material(name, 1e9 * E1, rho, nu, Orthotropy(*(each / E1 for each in (E2, *G))))
 
 
 _KNOWN = (
@@ -54,11 +107,14 @@ _KNOWN = (
         loss_factor="0.0006 to 0.002",
     ),
     KnownMaterial(
-        Material("acrylic", E=3.3e9, rho=1190.0, nu=0.37),
-        source="Plexiglas GS (cast PMMA), data sheet, E by ISO 527 at 1 mm/min, 23 °C",
-        variation="E 2.8 to 3.4 GPa by sheet and grade; at vibration frequencies up to about "
-        "4.7 GPa, falling as it warms",
-        loss_factor="0.02 to 0.04",
+        Material("acrylic", E=4.6e9, rho=1190.0, nu=0.37),
+        source="rho and nu Plexiglas GS (cast PMMA), data sheet; E 4.2, 4.6 and 5 GPa at 10, 100 "
+        "and 1000 Hz, assumed: as its beta relaxation has it near room temperature; the sheet's "
+        "3.3 GPa is that of a slow tensile test (ISO 527)",
+        variation="20 % in E and in loss, assumed; falling as it warms",
+        loss_factor="0.075, 0.06 and 0.045 at 10, 100 and 1000 Hz, assumed; taken as its own, "
+        "beside that of the plate",
+        by_frequency=((10.0, 4.2 / 4.6, 0.075), (100.0, 1.0, 0.06), (1000.0, 5.0 / 4.6, 0.045)),
     ),
     KnownMaterial(
         Material("polycarbonate", E=2.4e9, rho=1200.0, nu=0.38),
@@ -67,9 +123,60 @@ _KNOWN = (
         variation="E 2.1 to 2.4 GPa, rho 1190 to 1220 kg/m³, nu 0.37 to 0.40",
         loss_factor="0.01",
     ),
+    KnownMaterial(
+        plywood(6.4e-3),
+        source="birch, by its thickness of 3 plies (3.6 mm), 5 (6.4), 7 (9.2), 9 (12) and so on; "
+        "E1, E2, G12, nu12 and rho Handbook of Finnish Plywood, from memory: veneers of 17.5 GPa, "
+        "crosswise counted 0; G13 and G23, of which the cross plies roll, assumed",
+        variation="E 10 %, E1 : E2 falls from 16 at 3 plies to 2.7 at 5 and 1.6 at 9; G12 0.6 to "
+        "0.75 GPa, G13 and G23 30 %; 6.5 mm by name are 6.1 to 6.9 (a trade sheet, 670 kg/m³); "
+        "shops cut along and across the faces' grain",
+        loss_factor="0.01 to 0.03, assumed",
+        own_loss=0.02,
+        by_thickness=plywood,
+    ),
+    KnownMaterial(
+        _wood("pine", 11.0, 0.8, rho=520.0, nu=0.35, G=(0.85, 0.85, 0.14)),
+        source="a board of glued staves; ratios of the moduli Wood Handbook FPL-GTR-282, loblolly "
+        "pine, from memory (ET / EL 0.078, GLT / EL 0.081, GRT / EL 0.013); E and rho assumed",
+        variation="E1 10 to 12 GPa, E2 0.5 to 1, G12 0.7 to 1, nu12 0.3 to 0.45, rho 500 to "
+        "550 kg/m³",
+        loss_factor="0.01 to 0.02, assumed",
+        own_loss=0.015,
+    ),
+    KnownMaterial(
+        _wood("spruce", 10.0, 0.45, rho=430.0, nu=0.42, G=(0.8, 0.8, 0.04)),
+        source="Sitka spruce, flat sawn; E1 and E2 Acta Acustica 2025, aacus240113, table 5 (9.05 "
+        "and 0.40 GPa static, 9.66 and 0.49 by ultrasound); ratios of G23 and nu12 Wood Handbook "
+        "FPL-GTR-282, from memory",
+        variation="E1 9 to 12 GPa, E2 0.4 to 0.5, quarter sawn 0.8 to 1.0; G12 0.7 to 1.1, nu12 "
+        "0.37 to 0.47, rho 400 to 450 kg/m³",
+        loss_factor="0.006 to 0.01 along the grain, 0.02 across, assumed",
+        own_loss=0.015,
+    ),
+    KnownMaterial(
+        Material("mdf", E=3.4e9, rho=780.0, nu=0.3),
+        source="rho Hunt et al., BioResources 8(1) 115, 2013, of boards of 3.7 mm; E 2.7 GPa (EN "
+        "622-5, from memory) times their 1.26, dynamic over static; nu assumed",
+        variation="E 2.7 to 4 GPa, rho 700 (8.1 mm) to 830 (2.6 mm) kg/m³, nu 0.25 to 0.3",
+        loss_factor="0.01 to 0.03, assumed",
+        own_loss=0.02,
+    ),
+    KnownMaterial(
+        _wood("carbon", 66.0, 66.0, rho=1550.0, nu=0.06, G=(3.5, 3.0, 3.0)),
+        source="woven sheet at 0 and 90 degrees; E, G12 and nu12 Queen Mary University of London, "
+        "page on CFRP (62.7 to 68.7 GPa, 3.5, 0.058); G13 and G23 assumed",
+        variation="E 63 to 69 GPa, in bending to 80 (azom 632), rho 1500 to 1600 kg/m³; "
+        "unidirectional sheet: 103 to 145 and 7.4 to 10.5 GPa, give its numbers",
+        loss_factor="0.002 to 0.01, assumed",
+    ),
 )
 
 KNOWN_MATERIALS = {known.material.name: known for known in _KNOWN}
+KNOWN_MATERIALS["float-glass"] = replace(
+    KNOWN_MATERIALS["soda-lime-glass"],
+    material=replace(KNOWN_MATERIALS["soda-lime-glass"].material, name="float-glass"),
+)
 """Materials that come with this package, by name."""
 
 _MATERIALS: PluginRegistry[KnownMaterial] = PluginRegistry(

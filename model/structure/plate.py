@@ -35,35 +35,92 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import numpy as np
+
 from model.arguments import expect_between, expect_values
+from model.arrays import FloatArray
 from model.errors import InputError
 
 
 @dataclass(frozen=True)
-class Material:
-    """An isotropic, linear material.
+class Orthotropy:
+    """Moduli of a material with a grain, each as a share of E, the one along the plate's length.
 
-    E: Young's modulus [Pa]; rho: density [kg/m³]; nu: Poisson's ratio.
+    e2: across it; g12: shear in the plane; g13, g23: transverse shear along the length and across.
+    """
+
+    e2: float
+    g12: float
+    g13: float
+    g23: float
+
+    def __post_init__(self) -> None:
+        """Refuse moduli that are not above zero."""
+        expect_values(self, "orthotropic material", above="e2 g12 g13 g23")
+
+
+@dataclass(frozen=True)
+class Material:
+    """A linear material, isotropic unless it has a grain.
+
+    E: Young's modulus [Pa]; rho: density [kg/m³]; nu: Poisson's ratio. With a grain E is that along
+    the plate's length, nu the contraction across it by a stress along it (nu_12).
     """
 
     name: str
     E: float
     rho: float
     nu: float
+    orthotropy: Orthotropy | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values of no isotropic solid."""
+        """Refuse values of no solid."""
         expect_values(self, f"material {self.name}", above="E rho")
-        if not -1 < self.nu < 0.5:
+        if self.orthotropy is None and not -1 < self.nu < 0.5:
             raise InputError(
                 f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
                 "0.2 to 0.45)"
             )
+        if not self.nu**2 * self.shares.e2 < 1:  # of no elastic energy; also of NaN
+            raise InputError(
+                f"material {self.name}: nu12 must be less than the root of E1 / E2, "
+                f"{self.shares.e2**-0.5:.3g}, got {self.nu}"
+            )
 
     @property
-    def shear_modulus(self) -> float:
-        """G = E / 2 (1 + nu) [Pa]."""
-        return self.E / (2 * (1 + self.nu))
+    def shares(self) -> Orthotropy:
+        """Moduli as shares of E: an isotropic one has G = E / 2 (1 + nu) in all planes."""
+        if self.orthotropy is not None:
+            return self.orthotropy
+        shear = 1 / (2 * (1 + self.nu))
+        return Orthotropy(1.0, shear, shear, shear)
+
+    @property
+    def moduli(self) -> dict[str, float]:
+        """Its moduli [Pa] by the keys of a rig file."""
+        of = self.orthotropy
+        if of is None:
+            return {"E": self.E}
+        shares = {"E1": 1.0, "E2": of.e2, "G12": of.g12, "G13": of.g13, "G23": of.g23}
+        return {key: share * self.E for key, share in shares.items()}
+
+    @property
+    def plane_stress(self) -> float:
+        """1 - nu_12 nu_21, by which moduli are divided in a plate."""
+        return 1 - self.nu**2 * self.shares.e2
+
+    def turned(self) -> "Material":
+        """The material with its grain turned by a right angle."""
+        of = self.orthotropy
+        if of is None:
+            return self
+        return Material(
+            self.name,
+            E=self.E * of.e2,
+            rho=self.rho,
+            nu=self.nu * of.e2,
+            orthotropy=Orthotropy(1 / of.e2, *(g / of.e2 for g in (of.g12, of.g23, of.g13))),
+        )
 
 
 class Bond(StrEnum):
@@ -86,8 +143,39 @@ class Sheet:
 
     @property
     def flexural_rigidity(self) -> float:
-        """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7."""
-        return self.material.E * self.thickness**3 / (12 * (1 - self.material.nu**2))
+        """Flexural rigidity D = E h³ / 12 (1 - nu²) [N m], paper Eq. 7.
+
+        Of a board the geometric mean of those along and across its length.
+        """
+        return math.sqrt(self.material.shares.e2) * self._along
+
+    def rigidity_towards(self, cos2: FloatArray | float) -> FloatArray:
+        """Flexural rigidity [N m] of straight waves, by the squared cosine of their direction.
+
+        To the length: D1 c⁴ + 2 (nu12 D2 + 2 D12) c² s² + D2 s⁴.
+        """
+        d1, mixed, d2 = self._rigidities
+        sin2 = 1 - np.asarray(cos2)
+        return np.asarray(d1 * cos2**2 + 2 * mixed * cos2 * sin2 + d2 * sin2**2)
+
+    @property
+    def least_rigidity(self) -> float:
+        """Flexural rigidity [N m] in the direction of the shortest waves."""
+        d1, mixed, d2 = self._rigidities
+        if mixed >= min(d1, d2):
+            return min(d1, d2)
+        return (d1 * d2 - mixed**2) / (d1 - 2 * mixed + d2)  # between both sides
+
+    @property
+    def _along(self) -> float:
+        return self.material.E * self.thickness**3 / (12 * self.material.plane_stress)
+
+    @property
+    def _rigidities(self) -> tuple[float, float, float]:
+        """D1, nu12 D2 + 2 D12, and D2."""
+        of, own = self.material, self._along
+        twist = of.shares.g12 * of.plane_stress
+        return own, own * (of.nu * of.shares.e2 + 2 * twist), own * of.shares.e2
 
 
 @dataclass(frozen=True)
@@ -136,6 +224,11 @@ class Laminate:
         """Refuse a laminate without layers, and losses of layers that slide."""
         if not self.layers:
             raise InputError("laminate: must have at least one layer")
+        if grained := [each.material.name for each in self.layers if each.material.orthotropy]:
+            raise InputError(
+                f"laminate: layers must be isotropic, got {grained[0]}; give a board by thickness "
+                "and material of the plate"
+            )
         if self.bond is Bond.NONE and not all(layer.is_elastic for layer in self.layers):
             raise InputError(
                 "laminate: layers must be without loss_factor and by_frequency with bond none; "
@@ -307,8 +400,12 @@ class Plate(Sheet):
 
     @property
     def shear_rigidity(self) -> float:
-        """Shear rigidity kappa G h [N/m], paper Eq. 7."""
-        return SHEAR_CORRECTION * self.material.shear_modulus * self.thickness
+        """Shear rigidity kappa G h [N/m], paper Eq. 7; of a board the mean of its directions.
+
+        Of the compliance: 1 / (S1 c² + S2 s²) has the mean 1 / sqrt(S1 S2).
+        """
+        G = self.material.E * math.sqrt(self.material.shares.g13 * self.material.shares.g23)
+        return SHEAR_CORRECTION * G * self.thickness
 
     @property
     def lowest_bending_frequency(self) -> float:
@@ -319,16 +416,17 @@ class Plate(Sheet):
         return self.bending_frequency(2 * max(self.length, self.width))
 
     def bending_wavelength(self, frequency: float) -> float:
-        """Wavelength [m] of a bending wave at a frequency [Hz] in the thin-plate limit."""
+        """Wavelength [m] of a bending wave at a frequency [Hz] in the thin-plate limit.
+
+        Of a board the shortest of all directions.
+        """
         omega = 2 * math.pi * frequency
-        wavenumber = (self.surface_density * omega**2 / self.flexural_rigidity) ** 0.25
+        wavenumber = (self.surface_density * omega**2 / self.least_rigidity) ** 0.25
         return float(2 * math.pi / wavenumber)
 
     def bending_frequency(self, wavelength: float) -> float:
         """Frequency [Hz] of a bending wave of a wavelength [m] in the thin-plate limit."""
-        return (
-            2 * math.pi * math.sqrt(self.flexural_rigidity / self.surface_density) / wavelength**2
-        )
+        return 2 * math.pi * math.sqrt(self.least_rigidity / self.surface_density) / wavelength**2
 
     def wave_stiffness(self, frequency: float) -> float:
         """Dynamic stiffness of an infinite plate under a point force, |F / w| [N/m]."""
@@ -341,8 +439,9 @@ class Plate(Sheet):
         Area term of the mode count of a thin plate, pi S / wavelength², and a quarter more for its
         edges.
         """
-        wavelength = self.bending_wavelength(frequency)
-        return math.ceil(1.25 * math.pi * self.length * self.width / wavelength**2)
+        stretch = math.sqrt(self.least_rigidity / self.flexural_rigidity)
+        area = self.length * self.width * stretch / self.bending_wavelength(frequency) ** 2
+        return math.ceil(1.25 * math.pi * area)
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""

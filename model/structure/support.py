@@ -69,8 +69,8 @@ def support_problem(
         return None
     return (
         f"the plate is not supported: its lowest rigid-body frequency must be at least "
-        f"{MIN_RIGID_BODY_FREQUENCY:g} Hz, got {lowest:.2g} Hz; put at least three ERAs or feet "
-        "under it, stiff enough and not in one line; a free exciter holds nothing"
+        f"{MIN_RIGID_BODY_FREQUENCY:g} Hz, got {lowest:.2g} Hz; put at least three ERAs or "
+        "supports under it, stiff enough and not in one line; a free exciter holds nothing"
     )
 
 

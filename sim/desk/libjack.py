@@ -3,13 +3,13 @@
 import ctypes
 import ctypes.util
 import re
-from collections import Counter
 from collections.abc import Iterable
 from contextlib import closing
 from functools import cache
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from registry.suggestions import did_you_mean
 
 _AUDIO = b"32 bit float mono audio"
 IS_INPUT, IS_OUTPUT = 1, 2
@@ -65,6 +65,10 @@ def libjack() -> ctypes.CDLL:
     raise InputError("jack: libjack must be installed; Debian: apt install jackd2")
 
 
+class NoSound(LinkError):
+    """No sound server runs, or it has no sound card yet: what may be waited for."""
+
+
 class JackClient:
     """A client of the running server; rate [Hz], block [frames]: the server's.
 
@@ -84,7 +88,7 @@ class JackClient:
                 )
             is_down = status.value & _SERVER_FAILED
             reason = "no server is running" if is_down else "it refused a client"
-            raise LinkError(
+            raise (NoSound if is_down else LinkError)(
                 f"jack: {reason} (status {status.value:#x}); start one, as in jackd -d alsa "
                 "-r 48000 -p 128, by the same user; JACK_DEFAULT_SERVER names another than default"
             )
@@ -99,15 +103,31 @@ class JackClient:
         return _names(libjack().jack_get_ports(self.pointer, pattern, _AUDIO, flags))
 
     def first_ports(self, other: str, flag: int, count: int) -> list[str]:
-        """The first of such ports; raises InputError where there are fewer."""
+        """The first of such ports; InputError where there are fewer, NoSound without a card."""
         found = self.ports_of(other, flag)
+        what = "outputs" if flag == IS_INPUT else "inputs"  # of the other client
+        if not found and count and not other:
+            raise NoSound(f"jack: the server has no {what} of a sound card; check that it is found")
         if len(found) < count:
-            what = "outputs" if flag == IS_INPUT else "inputs"  # of the other client
+            known = [] if found else [name for name, *_ in self.clients() if name != other]
             raise InputError(
-                f"--device {jack_name(other)} must have {count} {what}, got {len(found)}; list "
-                "devices with era soft-amp --list"
+                f"--device {jack_name(other)} must have {count} {what}, got {len(found)}; "
+                f"{did_you_mean(jack_name(other), map(jack_name, known))}list devices with "
+                "era soft-amp --list"
             )
         return found[:count]
+
+    def clients(self) -> list[tuple[str, int, int]]:
+        """The hardware ("") and each client with ports of audio: name, outputs, inputs.
+
+        Outputs are what it plays: ports that take samples.
+        """
+        ports = _names(libjack().jack_get_ports(self.pointer, None, _AUDIO, 0))
+        names = dict.fromkeys(["", *(port.partition(":")[0] for port in ports)])
+        return [
+            (name, len(self.ports_of(name, IS_INPUT)), len(self.ports_of(name, IS_OUTPUT)))
+            for name in names
+        ]
 
     def takers(self, other: str, count: int) -> list[str]:
         """The first ports of a client that take samples; LinkError where one is played to."""
@@ -170,16 +190,6 @@ def check_free(other: str, channels: int) -> None:
     """Raise LinkError where another program plays to one of the first ports of a client."""
     with closing(JackClient("era-check")) as client:
         client.check_free(client.ports_of(other, IS_INPUT)[:channels], device=other)
-
-
-def jack_devices(flag: int) -> dict[str, int]:
-    """Clients of the server with such ports: their number, by what --device takes.
-
-    flag: IS_INPUT or IS_OUTPUT. Raises InputError, LinkError.
-    """
-    with closing(JackClient("era-list")) as client:
-        ports = _names(libjack().jack_get_ports(client.pointer, None, _AUDIO, flag))
-    return {f"jack:{name}": n for name, n in Counter(p.split(":")[0] for p in ports).items()}
 
 
 def _names(listed: "ctypes._Pointer[_Text]") -> list[str]:

@@ -1,28 +1,26 @@
 """`era measure`: frequency responses of a plate through a sound card."""
 
-import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from model.commands.options import JsonOption, RigArgument, next_line, print_report
+from model.errors import InputError
 
 if TYPE_CHECKING:
+    from sim.desk.measuring.desk import Desk
     from sim.desk.measuring.measure import Measured, Stepped
+    from sim.desk.measuring.multisine import Multisine
+    from sim.desk.measuring.sound_card import SoundCard
 
 DEFAULT_LEVEL = 0.3
 
 
 def measure(
     rig_file: RigArgument,
-    device: Annotated[
-        str,
-        typer.Option(
-            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
-        ),
-    ],
     sensors_file: Annotated[
         Path,
         typer.Option(
@@ -34,6 +32,20 @@ def measure(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="MEASURED.uff|.csv", help="File to write.")
     ],
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE", help="Sound card: jack, jack:CLIENT, or a device of PortAudio."
+        ),
+    ] = None,
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE|DIR",
+            help="In place of --device: a stepped sine that was recorded, .wav, or measured, .csv.",
+        ),
+    ] = None,
     frequencies: Annotated[
         str | None,
         typer.Option(
@@ -47,73 +59,132 @@ def measure(
     periods: Annotated[
         int, typer.Option(metavar="N", help="Seconds of each run that count.", min=2, max=60)
     ] = 2,
+    mass: Annotated[
+        float | None,
+        typer.Option(
+            "--sensor-mass",
+            metavar="G",
+            help="Mass of a sensor that is moved, in grams; default: column mass_g of --sensors.",
+            min=0,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="One sensor is moved: go on from what --output has."),
+    ] = False,
+    y_cable: Annotated[
+        bool,
+        typer.Option(
+            "--y-cable", help="No output is left: that of the last ERA is the cable's, too."
+        ),
+    ] = False,
     stepped: Annotated[
         bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
     ] = False,
     seed: Annotated[int, typer.Option(metavar="N", help="Draw other phases.", min=0)] = 0,
+    impedance: Annotated[
+        bool,
+        typer.Option(
+            "--impedance",
+            help="Measure an exciter instead: era measure --impedance --help.",
+            show_default=False,
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a plate through a sound card.
 
     Play on all ERAs at once and record accelerometers. A cable leads from the output after those of
-    the ERAs to the input after those of the sensors: it tells the delay, and lost blocks, whose run
-    is repeated. The file is for era calibrate.
+    the ERAs, or beside the last of them (--y-cable), to the input after those of the sensors: it
+    tells the delay, and lost blocks, whose run is repeated. Where all lines of --sensors have one
+    input, one sensor is moved from line to line: the terminal says where to. The file is for era
+    calibrate, and for era rig identify --measured.
     """
-    from model.calibration.responses_file import write_responses_csv, write_responses_uff
-    from model.commands.options import progress_bar
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
-    from sim.desk.measuring.live_plot import live_plot
-    from sim.desk.measuring.measure import check_by_steps, open_desk
-    from sim.desk.measuring.measure import measure as measured_by
+    from sim.desk.measuring.desk import Desk
+    from sim.desk.measuring.measure import open_desk
+    from sim.sensors.sensor_file import are_places, read_sensors
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")
     rig = load_rig(rig_file)
     lines = parse_frequencies(frequencies) if frequencies else None
-    started = time.perf_counter()
-    check: Stepped | None = None
-    with open_desk(rig, sensors_file, device, level=level, frequencies=lines, seed=seed) as (
-        desk,
-        card,
-        multisine,
+    desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True), y_cable)
+    is_moved = are_places(desk.sensors)
+    if (device is None) == (source is None):
+        raise InputError("give --device, a sound card, or --from, what another has measured")
+    for option, is_wrong, needs in (
+        ("--frequencies", source is not None and lines is not None, "--device"),
+        ("--stepped", source is not None and stepped, "--device"),
+        ("--resume", source is not None and resume, "--device"),
+        ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
+        ("--stepped", stepped and is_moved, "sensors that stay where they are"),
+        ("--stepped", stepped and y_cable, "an output of the cable's own"),
+        ("--y-cable", source is not None and y_cable, "--device"),
     ):
+        if is_wrong:
+            raise InputError(f"{option} needs {needs}; leave it out")
+    is_whole = True
+    if source is not None:
+        from sim.desk.measuring.stepped_import import measured_from
+
+        rows, answer = measured_from(source, desk, output)
+    else:
+        opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)
+        if is_moved:
+            from sim.desk.measuring.moved_dialogue import measure_by_moving
+
+            rows, answer, is_whole = measure_by_moving(
+                desk, opened, output, periods=periods, is_resumed=resume
+            )
+        else:
+            rows, answer = _measure_at_once(desk, opened, output, periods=periods, stepped=stepped)
+    if is_whole:
+        next_words = ("calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated"))
+        rows.append(next_line("era", *next_words))
+    print_report(rows, answer, as_json=as_json)
+
+
+def _measure_at_once(
+    desk: "Desk",
+    opened: "AbstractContextManager[tuple[SoundCard, Multisine]]",
+    output: Path,
+    *,
+    periods: int,
+    stepped: bool,
+) -> tuple[list[str], dict[str, Any]]:
+    """Measure with all sensors where they stay; write the file, and return the report."""
+    from model.calibration.responses_file import write_responses
+    from model.commands.options import Stopwatch, progress_bar
+    from sim.desk.measuring.live_plot import live_plot
+    from sim.desk.measuring.measure import check_by_steps
+    from sim.desk.measuring.measure import measure as measured_by
+
+    check: Stepped | None = None
+    with Stopwatch() as timed, opened as (card, multisine):
         with live_plot(multisine, desk.sensors) as show:
             found = measured_by(desk, card, multisine, periods=periods, show=show)
         if stepped:
             with progress_bar("tones") as progress:
-                check = check_by_steps(desk, card, found, level=level, progress=progress)
+                check = check_by_steps(desk, card, found, level=multisine.level, progress=progress)
         rate = card.rate
-    write = write_responses_csv if output.suffix.lower() == ".csv" else write_responses_uff
-    write(output, found.responses, rig)
-    elapsed = time.perf_counter() - started
+    write_responses(output, found.responses, desk.rig)
     rows = [
         *_rows(found, check, rate=rate),
-        f"measured in {elapsed:.1f} s; wrote {output}",
-        next_line("era", "calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated")),
+        f"measured in {timed.elapsed:.1f} s; wrote {output}",
     ]
-    answer = _as_json(found, check) | {"measure_time_s": elapsed, "files": [str(output)]}
-    print_report(rows, answer, as_json=as_json)
+    return rows, _as_json(found, check) | {"measure_time_s": timed.elapsed, "files": [str(output)]}
 
 
 def _as_json(found: "Measured", check: "Stepped | None") -> dict[str, Any]:
-    import numpy as np
-
     names = found.responses.sensors
     return {
         "frequencies_hz": found.responses.frequencies.tolist(),
         "latency_s": found.latency,
         "repeated_runs": found.repeated,
-        "sensors": {
-            name: {
-                "coherence_median": float(np.median(found.coherence[:, n])),
-                "coherence_min": float(found.coherence[:, n].min()),
-                "noise_relative": float(np.median(found.std[:, n])),
-                "square_law_relative": float(found.even[n]),
-            }
-            for n, name in enumerate(names)
-        },
+        "sensors": {name: found.quality(n) for n, name in enumerate(names)},
         "stepped": None if check is None else check.as_json(),
     }
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drivers.errors import LinkError
 from model.errors import InputError
 from sim.desk.soft_amp.settings import Law, Protocol, Settings
 
@@ -73,21 +72,30 @@ def soft_amp(
     serial_number: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Serial number, at most 30 bytes.")
     ] = None,
-    list_devices: Annotated[bool, typer.Option("--list", help="List devices and exit.")] = False,
+    list_devices: Annotated[
+        bool,
+        typer.Option("--list", help="List devices: outputs, inputs, rates, blocks; and exit."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="List as one JSON object.")] = False,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Exit at the end of standard input.")
     ] = False,
 ) -> None:
     """Be an amplifier that plays through a sound device. Print its URL; Ctrl-C ends.
 
-    Level 1 is full scale of the device. Silent within 50 ms once its host or itself is killed.
+    Wait, in fault, for a sound server that does not run. Silence is samples of zero. Level 1 is
+    full scale of the device. Silent within 50 ms once its host or itself is killed.
     """
+    from model.commands.options import print_report
+    from sim.desk.devices import listed_devices
     from sim.desk.soft_amp.library import library
-    from sim.desk.soft_amp.supervisor import Supervisor, underruns
+    from sim.desk.soft_amp.supervisor import Supervisor
 
     if list_devices:
-        _list()
+        print_report(*listed_devices(), as_json=as_json)
         return
+    if as_json:
+        raise InputError("--json must be with --list; add it, or omit --json")
     if device is None or channels is None:
         missing = "--device" if device is None else "--channels"
         raise InputError(f"{missing} is missing; era soft-amp --list lists devices")
@@ -106,23 +114,17 @@ def soft_amp(
     library()  # compiled here, where its errors are told
     with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
         supervisor = Supervisor(
-            settings, place, report=lambda line: print(f"soft-amp: {line}", file=sys.stderr)
+            settings,
+            place,
+            report=lambda line: print(f"soft-amp: {line}", file=sys.stderr, flush=True),
         )
         try:
-            opened = supervisor.start()
+            supervisor.start()
             for url in place.urls(settings.amplifiers, protocol=protocol):
                 print(url, flush=True)
-            priority = "real-time" if supervisor.counters.is_realtime & 1 else "ordinary"
-            print(
-                f"soft-amp: {opened['device']}, {channels} channels, {opened['rate']} Hz, blocks "
-                f"of {opened['block']} frames, {priority} priority",
-                file=sys.stderr,
-                flush=True,
-            )
             with suppress(KeyboardInterrupt):
                 supervisor.watch(until=sys.stdin.fileno() if until_eof else None)
-            counted = underruns(supervisor.counters, rate=opened["rate"])
-            print(f"soft-amp: {counted}", file=sys.stderr)
+            print(f"soft-amp: {supervisor.underruns()}", file=sys.stderr)
         finally:
             supervisor.end()
 
@@ -161,19 +163,3 @@ def _place(
     if modbus_tcp is not None:
         return tcp_place(modbus_tcp, protocol=Protocol.MODBUS)
     return terminal_place(link)
-
-
-def _list() -> None:
-    from sim.desk.libjack import IS_INPUT, jack_devices
-    from sim.desk.soft_amp.output import portaudio_devices
-
-    try:
-        for name, channels in jack_devices(IS_INPUT).items():
-            print(f"{name}: {channels} channels")
-    except (InputError, LinkError) as problem:
-        print(f"no JACK: {problem}", file=sys.stderr)
-    try:
-        for number, name, channels, rate in portaudio_devices():
-            print(f"{number}: {name}: {channels} channels, {rate:g} Hz")
-    except InputError as problem:
-        print(f"no PortAudio: {problem}", file=sys.stderr)

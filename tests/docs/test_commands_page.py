@@ -28,6 +28,8 @@ def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperC
         else:
             assert isinstance(command, TyperCommand)
             yield full, command
+            for flag, variant in getattr(command, "variants", {}).items():
+                yield f"{full} {flag}", variant
 
 
 def test_page_lists_every_command_with_its_options() -> None:
@@ -79,6 +81,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110"],
         ["plate", "show", RIG],
         ["plate", "materials"],
+        ["plate", "template", RIG, "-o", "template.svg"],
         ["table", "build", RIG, "-o", "another.npz", *COARSE],
         ["table", "show", "table.npz"],
         ["table", "query", "table.npz", "--target", "0.06,0.05", "--quiet", "0.2,0.1"],

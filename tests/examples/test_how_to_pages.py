@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "how-to"
 PIP = ROOT / "tests" / "support" / "built_pip.py"
 NAMES = [
+    "a-plate-for-a-weekend",
     "add-a-content-format",
     "add-a-material",
     "add-a-touch-source",

@@ -1,16 +1,22 @@
-"""The service's unit and its drop-in, checked by systemd itself."""
+"""The service's unit and its drop-in, and those of a plate at home, checked by systemd itself."""
 
+import os
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import yaml
 
 import model
 from installed_program import installed_program
 
 FOLDER = Path(model.__file__).parents[1] / "examples" / "systemd"
+WEEKEND = FOLDER.parent / "weekend"
+AT_HOME = ("era-sound-server", "era-soft-amp", "era-plate")
+"""In the order in which they start."""
 MAX_EXPOSURE = 2.0
 """On systemd's scale from 0 to 10, where `OK` ends at 4.9."""
 
@@ -35,3 +41,35 @@ def test_unit_is_valid_and_hardened(tmp_path: Path, is_allowed: bool) -> None:
     found = re.search(r"Overall exposure level for era-haptics.service: ([\d.]+)", judged.stdout)
     assert found is not None
     assert float(found[1]) <= MAX_EXPOSURE
+
+
+def test_units_at_home_are_valid_and_start_one_after_the_other(tmp_path: Path) -> None:
+    """systemd accepts them as a user's; each wants and follows the one before it.
+
+    The link is that of the rig; the card has an output for each exciter, an input for the sensor
+    and one for the cable.
+    """
+    program = installed_program("systemd-analyze", package="systemd")
+    texts = {}
+    for name in AT_HOME:
+        texts[name] = (WEEKEND / f"{name}.service").read_text("utf-8")
+        text = re.sub(r"ExecStart=\S+", f"ExecStart={sys.executable}", texts[name])
+        text = text.replace("%h/era-haptics/.venv/bin/era", sys.executable)
+        (tmp_path / f"{name}.service").write_text(text.replace("%h/plate", "/"), "utf-8")
+    verified = subprocess.run(
+        [program, "--user", "verify", *tmp_path.iterdir()],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path), "SYSTEMD_UNIT_PATH": f"{tmp_path}:"},
+    )
+    assert (verified.returncode, verified.stderr) == (0, "")
+    for before, name in pairwise(AT_HOME):
+        for key in ("Wants", "After"):
+            assert f"\n{key}={before}.service\n" in texts[name]
+    rig = yaml.safe_load((WEEKEND / "rig.yaml").read_text("utf-8"))
+    (amplifier,) = rig["amplifiers"].values()
+    (link,) = re.findall(r"--link (\S+)", texts["era-soft-amp"])
+    assert amplifier["url"] == f"serial://{link}"
+    outputs, inputs = map(int, re.findall(r"--(?:out|in)channels (\d+)", texts["era-sound-server"]))
+    assert (outputs, inputs) == (len(rig["eras"]), 2)
+    assert f"--channels {len(rig['eras'])} " in texts["era-soft-amp"]

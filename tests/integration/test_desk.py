@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.desk.chain import chain
 from benchmarks.desk.identified import identified_errors
-from benchmarks.desk.session import PLATE, Desk, desk
+from benchmarks.desk.session import EXAMPLES, PLATE, Desk, desk
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from model.calibration.responses import responses_of
@@ -69,6 +69,38 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
     assert len(errors) == 16
     for error in errors:
         assert abs(error.relative) < limits[error.kind], error
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    """The same plate with one sensor of 2 g, which is moved to the twelve places."""
+    folder = tmp_path_factory.mktemp("moved")
+    text = (EXAMPLES / "sensors.csv").read_text("utf-8")
+    head, *lines = text.splitlines()
+    rows = (line.split(",") for line in lines)
+    one = [",".join([*row[:3], "1", *row[4:], "2"]) for row in rows]
+    with desk(folder, seed=SEED, mesh=MESH, sensors="\n".join([f"{head},mass_g", *one, ""])) as it:
+        yield it
+
+
+def test_plate_is_identified_by_one_sensor_of_known_mass(moved: Desk) -> None:
+    """Guided through twelve places, through JACK: with its mass the plate is explained, and known.
+
+    Without it is refused.
+    """
+    arguments = ["rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv"]
+    arguments += ["-o", "measured.uff", "--frequencies", "51:491:40"]
+    moved.measure_by_moving(*arguments)
+    identified = ("rig", "identify", "rig.yaml", "-o", "identified.yaml", "--measured")
+    told = moved.run(*identified, "measured.uff")
+    limits = {"stiffness": 0.03, "place": 1e-3, "gain": 0.03}
+    errors = identified_errors(load_rig(moved.folder / "identified.yaml"), moved.truth)
+    for error in (each for each in errors if each.kind in limits):
+        assert abs(error.relative) < limits[error.kind], error
+    bare = (moved.folder / "measured.uff").read_text("utf-8").replace("mass_g=2 ", "mass_g=0 ")
+    (moved.folder / "bare.uff").write_text(bare, "utf-8")
+    without = moved.run(*identified, "bare.uff", status=1)
+    assert (told["explained"], without["explained"]) == (True, False)
 
 
 def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:

@@ -65,7 +65,7 @@ class WatchedWire:
         self.started_at: dict[Direction, float] = {}
         """When [s] partial frames began."""
         self._pending: dict[Hashable, Request] = {}  # by key of the reply
-        self._recent: deque[bytes] = deque(maxlen=_COPIES)  # frames of the host
+        self._recent: deque[tuple[float, bytes]] = deque(maxlen=_COPIES)  # of the host, and when
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
         self._damaged_at = -math.inf  # when a frame of the host was damaged last [s]
@@ -161,8 +161,10 @@ class WatchedWire:
 
     def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
         """Process a frame of the host."""
-        is_copy = self.is_disturbed(time) and raw in self._recent
-        self._recent.append(raw)
+        # Numbers of requests begin anew: what was sent long ago is no copy.
+        recent = [each for then, each in self._recent if time <= then + RECOVERY]
+        is_copy = self.is_disturbed(time) and raw in recent
+        self._recent.append((time, raw))
         if isinstance(message, Notice):
             self._noticed(time, message)
         if not isinstance(message, Request):

@@ -17,11 +17,12 @@ class Desk:
     """How a rig is wired to a sound card: its ERAs by their channels, counted from 1; a loop-back.
 
     The loop-back is a cable from the output after those of the ERAs to the input after those of
-    the sensors.
+    the sensors; or, where a card has no output left, it has that of the last ERA (is_shared).
     """
 
     rig: Rig
     sensors: tuple[WiredSensor, ...]
+    is_shared: bool = False
 
     @property
     def eras(self) -> list[tuple[str, int]]:
@@ -32,7 +33,13 @@ class Desk:
     @property
     def output(self) -> int:
         """Output of the loop-back, the last one."""
-        return max(at for _, at in self.eras) + 1
+        return max(at for _, at in self.eras) + (not self.is_shared)
+
+    @property
+    def sources(self) -> list[int]:
+        """Output of each source: of the ERAs in their order, and of a loop-back of its own."""
+        outputs = [at for _, at in self.eras]
+        return outputs if self.is_shared else [*outputs, self.output]
 
     @property
     def input(self) -> int:
@@ -61,18 +68,20 @@ class Desk:
 
         looped (f,): of the loop-back.
         """
+        masses = np.array([sensor.mass for sensor in self.sensors])
         plain = values[:, self.columns, : len(self.full_levels)] / converters(looped)[:, None, None]
         return Responses(
             tuple(sensor.name for sensor in self.sensors),
             np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
             frequencies,
             plain.transpose(0, 2, 1) / self.full_levels[:, None] / self.sensitivities,
+            masses=masses if masses.any() else None,
         )
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:
-        """Samples (n, outputs) of the sources (n, eras + 1), the loop-back last."""
+        """Samples (n, outputs) of the sources (n, sources)."""
         found = np.zeros((len(sources), self.output))
-        found[:, [*(at - 1 for _, at in self.eras), self.output - 1]] = sources
+        found[:, [at - 1 for at in self.sources]] = sources
         return found
 
     @property

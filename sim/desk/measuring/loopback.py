@@ -112,6 +112,7 @@ _FULL = 0.999  # of full scale
 _LOOPED = 0.05  # of a sample that a loop-back brings back at least
 _CROSSTALK = 0.02  # of it, that other outputs may
 _COHERENT = 0.9  # in the median over frequencies
+_FAINT = 0.01  # of full scale: what converters themselves add is heard beside it
 _MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
 
 
@@ -158,35 +159,39 @@ def check_wiring(
 ) -> None:
     """Raise InputError where the loop-back shows inputs or outputs to be swapped.
 
-    eras: name and output of each source, in order; the loop-back is the last one.
+    eras: name and output of each source, in order; the loop-back is the last one, or of the ERA
+    that has its output.
     """
     came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
     named = {sensor.input: f"of sensor {sensor.name}" for sensor in sensors}
-    *_, second, first = np.sort(came[loopback - 1])
+    own = next((n for n, (_, at) in enumerate(eras) if at == output), len(eras))
+    first, others = came.max(axis=1), np.sort(came, axis=1)[:, -2]
+    alone = (first > _LOOPED) & (others < _CROSSTALK * first)  # of one output, as cables are
     source = int(came[loopback - 1].argmax())
-    if source < len(eras) and first > _LOOPED and second < _CROSSTALK * first:
+    if source != own and alone[loopback - 1]:
         name, at = eras[source]
         raise InputError(
             f"input {loopback} must bring back output {output}, got output {at} of ERA {name}: "
             "outputs are swapped; exchange their cables"
         )
-    back = int(came[:, -1].argmax()) + 1
-    if back != loopback and came[back - 1, -1] > _LOOPED:
+    back = int(np.where(alone & (came.argmax(axis=1) == own), first, 0).argmax()) + 1
+    if back != loopback and came[back - 1, own] > _LOOPED and alone[back - 1]:
         raise InputError(
             f"the loop-back of output {output} must come back at input {loopback}, got it at input "
             f"{back}, {named.get(back, 'of no sensor')}: inputs are swapped; exchange their cables"
         )
-    if came[loopback - 1, -1] < _LOOPED:
+    looped = came[loopback - 1, own]
+    if looped < _LOOPED:
         raise InputError(
             f"input {loopback} must bring back output {output} as the loop-back, got "
-            f"{came[loopback - 1, -1]:.2g} of it; connect them by a cable"
+            f"{looped:.2g} of it; connect them by a cable"
         )
-    others = came[loopback - 1, : len(eras)]
-    if others.max(initial=0) > _CROSSTALK * came[loopback - 1, -1]:
-        name, at = eras[int(others.argmax())]
+    crosstalk = np.where(np.arange(len(eras)) == own, 0, came[loopback - 1, : len(eras)])
+    if crosstalk.max(initial=0) > _CROSSTALK * looped:
+        name, at = eras[int(crosstalk.argmax())]
         raise InputError(
-            f"the loop-back must be output {output} alone, got {others.max():.2g} of output {at} "
-            f"of ERA {name} too; check mixers and monitoring of the sound card"
+            f"the loop-back must be output {output} alone, got {crosstalk.max():.2g} of output "
+            f"{at} of ERA {name} too; check mixers and monitoring of the sound card"
         )
 
 
@@ -213,22 +218,32 @@ def check_clocks(
 
 
 def check_coherence(
-    found: Estimate, sensors: Sequence[WiredSensor], eras: Sequence[tuple[str, int]]
+    found: Estimate,
+    recorded: Sequence[FloatArray],
+    sensors: Sequence[WiredSensor],
+    eras: Sequence[tuple[str, int]],
 ) -> None:
-    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing."""
+    """Raise LinkError for sensors that hear something else, and for ERAs that move nothing.
+
+    found: of what was recorded, runs (n, inputs) each.
+    """
     columns = [sensor.input - 1 for sensor in sensors]
     coherence = np.median(found.coherence[:, columns], axis=0)
-    incoherent = [
-        f"{sensor.name} ({each:.2f})"
-        for sensor, each in zip(sensors, coherence, strict=True)
-        if each < _COHERENT
-    ]
-    if incoherent:
-        raise LinkError(
-            f"coherence must be at least {_COHERENT:g} in the median, got {', '.join(incoherent)}; "
-            "check how these sensors are mounted, their cables and mains hum, choose a higher "
-            "--level or more --periods, or delete their lines"
-        )
+    peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
+    for are_faint, remedy in (
+        (True, "too low a level: choose a higher --level, or turn up the gain of the input"),
+        (False, "fix these sensors to the plate, check their cables and mains hum"),
+    ):
+        incoherent = [
+            f"{sensor.name} ({each:.2f}, input up to {100 * peak:.2g} % of full scale)"
+            for sensor, each, peak in zip(sensors, coherence, peaks, strict=True)
+            if each < _COHERENT and (peak < _FAINT) == are_faint
+        ]
+        if incoherent:
+            raise LinkError(
+                f"coherence must be at least {_COHERENT:g} in the median, got "
+                f"{', '.join(incoherent)}; {remedy}"
+            )
     moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
     for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):
         if each < _MOVED:

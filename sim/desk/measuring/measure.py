@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.progress import Progress, unseen
-from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import (
     check_clocks,
@@ -24,7 +22,6 @@ from sim.desk.measuring.loopback import (
 )
 from sim.desk.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
 from sim.desk.measuring.sound_card import SoundCard, open_card
-from sim.sensors.sensor_file import read_sensors
 
 _SETTLING = 1.0  # s; T60 of the paper's plate
 _TAIL = 0.05  # s; longer than the ramp
@@ -74,7 +71,9 @@ def play_run(
         kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
         check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
         looped = kept[:, desk.input - 1]
-        gain = multisine.found(looped) / multisine.played(number)[:, -1]
+        gain = (
+            multisine.found(looped) / multisine.played(number)[:, desk.sources.index(desk.output)]
+        )
         # The cable decides: drivers report losses that were none, and miss others.
         same = is_whole(looped, samples=multisine.samples)
         same = same and (before is None or is_as_late(gain, before))
@@ -115,31 +114,39 @@ class Measured:
     repeated: int
     looped: ComplexArray
 
+    def quality(self, sensor: int) -> dict[str, float]:
+        """How well a sensor was heard, by its number, for programs."""
+        return {
+            "coherence_median": float(np.median(self.coherence[:, sensor])),
+            "coherence_min": float(self.coherence[:, sensor].min()),
+            "noise_relative": float(np.median(self.std[:, sensor])),
+            "square_law_relative": float(self.even[sensor]),
+        }
+
 
 @contextmanager
 def open_desk(
-    rig: Rig,
-    sensors_file: Path,
+    desk: Desk,
     device: str,
     *,
     level: float | None,
     frequencies: FloatArray | None,
     seed: int,
-) -> Iterator[tuple[Desk, SoundCard, Multisine]]:
-    """A rig at an open device, and the multisine for it.
+) -> Iterator[tuple[SoundCard, Multisine]]:
+    """An open device for a desk, and the multisine for it.
 
     level: None for 0.3, or less where the rig's limits allow less; frequencies (f,) [Hz], None for
     odd ones within its limits. Raises InputError, LinkError.
     """
-    desk = Desk(rig, read_sensors(sensors_file, rig.plate))
     level = min(LEVEL, desk.highest) if level is None else level
     desk.check(level)
     if frequencies is None:
-        frequencies = default_frequencies(rig.limits.frequency_min, rig.limits.frequency_max)
+        limits = desk.rig.limits
+        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
     opened = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
     with closing(opened) as card:
-        yield desk, card, Multisine(frequencies, len(desk.eras) + 1, card.rate, level, seed)
+        yield card, Multisine(frequencies, len(desk.sources), card.rate, level, seed)
 
 
 def measure(
@@ -175,9 +182,10 @@ def measure(
     check_clocks(multisine, recorded, desk.sensors, loopback=desk.input)
     if is_lost:
         raise blocks_lost()
-    check_coherence(found, desk.sensors, desk.eras)
-    looped, columns = found.values[:, desk.input - 1, -1], desk.columns
-    rms = np.sqrt((np.abs(found.values[:, columns, :-1]) ** 2).mean(axis=(0, 2)))
+    check_coherence(found, recorded, desk.sensors, desk.eras)
+    looped, columns = found.values[:, desk.input - 1, desk.sources.index(desk.output)], desk.columns
+    of_eras = found.values[:, columns, : len(desk.eras)]
+    rms = np.sqrt((np.abs(of_eras) ** 2).mean(axis=(0, 2)))
     return Measured(
         desk.responses(multisine.frequencies, found.values, looped),
         found.coherence[:, columns],

@@ -22,6 +22,7 @@ from sim.desk.measuring.loopback import converters
 from sim.desk.measuring.measure import Measured, Run, blocks_lost, measure, open_desk, play_run
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import SoundCard
+from sim.sensors.sensor_file import read_sensors
 
 _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
 _COMPARED = 2  # lines of it
@@ -32,14 +33,14 @@ def measure_plate(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> 
 
     Raises InputError, LinkError, as `era measure` does.
     """
+    desk = Desk(rig, read_sensors(settings.sensors_file, rig.plate))
     with open_desk(
-        rig,
-        settings.sensors_file,
+        desk,
         settings.device,
         level=settings.level,
         frequencies=settings.frequencies,
         seed=settings.seed,
-    ) as (desk, card, multisine):
+    ) as (card, multisine):
         return measure_through(desk, card, multisine, periods=settings.periods, progress=progress)
 
 
@@ -87,7 +88,7 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
     responses = found.responses
     values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
     plain = Measurement.of(
-        [Sensor(sensor.name, x=sensor.x, y=sensor.y) for sensor in desk.sensors],
+        [Sensor(each.name, x=each.x, y=each.y, mass=each.mass) for each in desk.sensors],
         responses.frequencies,
         values,
     )

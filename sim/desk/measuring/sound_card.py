@@ -60,6 +60,10 @@ class Ports(ctypes.Structure):
     )
 
 
+class DeviceLost(LinkError):
+    """A device that is gone, or takes no samples, in the middle of a run."""
+
+
 class SoundCard(ABC):
     """An open device with some outputs and inputs, the first ones that it has.
 
@@ -87,8 +91,8 @@ class SoundCard(ABC):
     def run(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
 
-        `gaps` counts holes in the sound. Raises LinkError for a device that is gone or takes no
-        samples, ValueError for samples beyond the limit.
+        `gaps` counts holes in the sound. Raises DeviceLost, ValueError for samples beyond the
+        limit.
         """
         transfer = self._transfer
         before = transfer.gaps
@@ -100,7 +104,7 @@ class SoundCard(ABC):
                 if transfer.position != done:
                     done, since = transfer.position, time.monotonic()
                 elif transfer.is_lost or time.monotonic() - since > _STALLED:
-                    raise LinkError(f"{self.name}: the device was lost, or takes no samples")
+                    raise DeviceLost(f"{self.name}: the device was lost, or takes no samples")
         finally:
             if done < len(found):
                 self.close()  # the callback still has the memory

@@ -1,9 +1,12 @@
 """The process that plays; `sim.desk.soft_amp.supervisor` starts, watches and, if need be, kills it.
 
-    python -m sim.desk.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RECOVERING
+    python -m sim.desk.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RATE
 
-SETTINGS as JSON, then descriptors, -1 for none; RECOVERING: 1 if it follows one that lost its
-device. It prints one line of JSON for each event.
+SETTINGS as JSON, then descriptors, -1 for none; RATE [Hz]: of the process that it follows, in
+fault; 0 for the first one. It prints one line of JSON for each event.
+
+Where there is no device yet, or no more, the lines are served meanwhile, in fault. One that comes
+with another rate is for another process: time is counted by the rate that the lines began with.
 """
 
 import json
@@ -15,11 +18,13 @@ from types import FrameType
 
 from drivers.errors import LinkError
 from model.errors import InputError
+from sim.desk.libjack import NoSound
 from sim.desk.soft_amp.engine import Counters, Engine, counters_in
 from sim.desk.soft_amp.output import Output, open_output
 from sim.desk.soft_amp.settings import Settings
 
-REFUSED, LOST = 2, 75
+REFUSED, LOST, OTHER_RATE = 2, 75, 76
+_DEFAULT_RATE = 48_000  # Hz; until the device says its own
 _POLL = 0.02  # s
 _RETRY = 0.5  # s
 _FIRST_BLOCK = 5.0  # s
@@ -33,7 +38,7 @@ class _Ended(Exception):
 def main() -> None:
     """Play until a signal comes, or the device has gone."""
     settings = Settings.from_json(sys.argv[1])
-    counters_file, terminal, listening, parent, recovering = map(int, sys.argv[2:])
+    counters_file, terminal, listening, parent, rate = map(int, sys.argv[2:])
     _end_with_parent()
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: that is for the parent
@@ -41,13 +46,13 @@ def main() -> None:
     output: Output | None = None
     engine = None
 
-    def start(rate: int) -> Engine:
+    def start(rate: int, *, is_recovering: bool) -> Engine:
         engine = Engine()
         engine.start(
             settings,
             rate=rate,
             counters=counters,
-            is_recovering=bool(recovering),
+            is_recovering=is_recovering,
             terminal=terminal,
             listening=listening,
             parent=parent,
@@ -55,13 +60,17 @@ def main() -> None:
         return engine
 
     try:
-        if recovering:  # hosts are to hear of the fault before the device is back
-            assert settings.rate is not None  # noqa: S101  that of the device before
-            engine = start(settings.rate)
-            output = _reopened(settings)
-        else:
-            output = open_output(settings)
-            engine = start(output.rate)
+        output = None if rate else _opened(settings)
+        if output is not None:
+            engine = start(output.rate, is_recovering=False)
+        else:  # hosts are to hear of the fault before the device is there
+            assumed = rate or settings.rate or _DEFAULT_RATE
+            engine = start(assumed, is_recovering=True)
+            output = _awaited(settings, rate=assumed)
+            if output.rate != assumed:
+                _tell(event="other rate", rate=output.rate)
+                output.close()
+                os._exit(OTHER_RATE)
         output.start(engine)
         engine.take_over()
         _wait_for_sound(counters, output)
@@ -84,12 +93,21 @@ def main() -> None:
         os._exit(REFUSED)
 
 
-def _reopened(settings: Settings) -> Output:
-    """The device, as soon as it is back."""
+def _opened(settings: Settings) -> Output | None:
+    """The device, None without a sound server; raises InputError, LinkError."""
+    try:
+        return open_output(settings)
+    except NoSound:
+        return None
+
+
+def _awaited(settings: Settings, *, rate: int) -> Output:
+    """The device, as soon as it is there, with why it is not until then; rate [Hz]: meanwhile."""
     while True:
         try:
             return open_output(settings)
-        except (InputError, LinkError):
+        except (InputError, LinkError) as problem:
+            _tell(event="waiting", rate=rate, reason=str(problem))
             time.sleep(_RETRY)
 
 

@@ -8,7 +8,8 @@ from typing import Any, TypeAlias
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.desk.libjack import IS_OUTPUT, JackClient, check_free, jack_name, libjack
+from registry.suggestions import did_you_mean
+from sim.desk.libjack import IS_OUTPUT, JackClient, NoSound, check_free, jack_name, libjack
 from sim.desk.soft_amp.engine import Engine, JackCalls
 from sim.desk.soft_amp.library import address_of
 from sim.desk.soft_amp.settings import Settings, check_rate
@@ -114,14 +115,22 @@ def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
     try:
         found = library.query_devices(number, None if inputs else "output")
     except (ValueError, library.PortAudioError) as problem:
+        known = [each["name"] for each in library.query_devices()]
+        if not known:
+            raise NoSound(
+                "PortAudio: it has no device; connect a sound card, or start its sound server"
+            ) from None
         raise InputError(
-            f"--device {device}: {str(problem).splitlines()[0]}; list devices with "
-            "era soft-amp --list"
+            f"--device {device}: {str(problem).splitlines()[0]}; "
+            f"{did_you_mean(device, known)}list devices with era soft-amp --list"
         ) from None
     for what, count in (("output", outputs), ("input", inputs)):
         offered = found[f"max_{what}_channels"]
         if offered < count:
-            raise InputError(f"--device {found['name']} must have {count} {what}s, got {offered}")
+            raise InputError(
+                f"--device {found['name']} must have {count} {what}s, got {offered}; list devices "
+                "with era soft-amp --list"
+            )
     if outputs and "JACK" in library.query_hostapis(found["hostapi"])["name"]:
         check_free(found["name"], outputs)
     return found
@@ -158,28 +167,17 @@ def portaudio_stream(
     return stream
 
 
-def portaudio_devices() -> list[tuple[int, str, int, float]]:
-    """Number, name, output channels and rate [Hz] of each device that plays; InputError."""
-    library = sounddevice()
-    hosts = library.query_hostapis()
-    return [
-        (
-            number,
-            f"{device['name']}, {hosts[device['hostapi']]['name']}",
-            device["max_output_channels"],
-            device["default_samplerate"],
-        )
-        for number, device in enumerate(library.query_devices())
-        if device["max_output_channels"] > 0
-    ]
-
-
 def may_be_realtime() -> bool:
     """Whether this process may raise the priority of its threads."""
     limit, _ = (
         resource.getrlimit(resource.RLIMIT_RTPRIO) if hasattr(resource, "RLIMIT_RTPRIO") else (0, 0)
     )
     return limit != 0 or os.geteuid() == 0
+
+
+def default_block() -> int:
+    """Frames of a block of PortAudio, unless stated."""
+    return _WITH_PRIORITY if may_be_realtime() else _WITHOUT
 
 
 class PortAudioOutput:
@@ -189,12 +187,15 @@ class PortAudioOutput:
         self._library = sounddevice()
         # A device that came since is not seen otherwise.
         self._library._terminate()
-        self._library._initialize()
+        try:
+            self._library._initialize()
+        except self._library.PortAudioError as problem:
+            raise NoSound(f"PortAudio: {problem.args[0]}; start its sound server") from None
         self._settings = settings
         device = portaudio_device(settings.device, outputs=settings.channels)
         self.name, self._number = device["name"], device["index"]
         self.rate = check_rate(settings.rate or device["default_samplerate"], what=self.name)
-        self.block = settings.block or (_WITH_PRIORITY if may_be_realtime() else _WITHOUT)
+        self.block = settings.block or default_block()
         try:
             self._library.check_output_settings(
                 self._number, settings.channels, "float32", samplerate=self.rate
@@ -207,7 +208,10 @@ class PortAudioOutput:
         text, number = str(problem.args[0]), problem.args[1] if len(problem.args) > 1 else 0
         match number:  # of portaudio.h
             case -9997:  # paInvalidSampleRate
-                return InputError(f"--rate: {self.name} does not offer {self.rate} Hz; try 48000")
+                return InputError(
+                    f"--rate must be one that {self.name} offers, got {self.rate} Hz; omit it for "
+                    "its own, or try 48000"
+                )
             case -9998:  # paInvalidChannelCount
                 return InputError(
                     f"--channels: {self.name} does not offer {self._settings.channels} channels"
@@ -250,7 +254,10 @@ Output: TypeAlias = JackOutput | PortAudioOutput
 
 
 def open_output(settings: Settings) -> Output:
-    """Open the device of an amplifier; InputError, LinkError where it is busy or gone."""
+    """Open the device of an amplifier; InputError, LinkError where it is busy or gone.
+
+    NoSound where there is no sound server or card yet.
+    """
     kind, _, name = settings.device.partition(":")
     if kind == "jack":
         return JackOutput(settings, destination=name)

@@ -13,12 +13,11 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from typing import Any
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.desk.soft_amp.__main__ import LOST
+from sim.desk.soft_amp.__main__ import LOST, OTHER_RATE
 from sim.desk.soft_amp.engine import Counters, counters_in, new_file
 from sim.desk.soft_amp.settings import Place, Settings
 
@@ -33,6 +32,7 @@ _END = 2.0  # s
 _PAUSE = 0.5  # s between starts
 _PRIORITY = 2  # SCHED_RR
 _BLOCKS = 4  # that a stall lasts at least
+_ENDED = {LOST: "the device was lost", OTHER_RATE: "the device has another rate"}
 
 Report = Callable[[str], None]
 
@@ -54,10 +54,13 @@ class Supervisor:
         self._rest = b""
         self._reported = 0.0
         self._seen = (0, 0)
+        self._said: set[str] = set()
+        self._rate = 0  # Hz; of the device, or until it says its own
+        self._was_open = False
 
-    def start(self) -> dict[str, Any]:
-        """Start to play; return what was opened: `device`, `rate` [Hz], `block` [frames]."""
-        self._launch(is_recovering=False)
+    def start(self) -> None:
+        """Start to play, or to wait for a sound server."""
+        self._launch()
         end = time.monotonic() + _START
         while time.monotonic() < end:
             for event in self._events(_POLL):
@@ -65,8 +68,8 @@ class Supervisor:
                     self.end()
                     kind = InputError if event["is_input"] else LinkError
                     raise kind(event["reason"])
-                self._settings = replace(self._settings, rate=event["rate"])
-                return event
+                self._take(event)
+                return
             if self._status() is not None:
                 break
         self.end()
@@ -77,22 +80,42 @@ class Supervisor:
         _raise_priority()
         blocks, since, looked = -1, time.monotonic(), time.monotonic()
         while True:
+            status = self._status()  # before what it says, of which nothing is left then
             for event in self._events(_POLL):
-                self._report(f"{event['device']} is open again, disarmed")
+                self._take(event)
             now = time.monotonic()
             if self.counters.blocks != blocks or now - looked > _HELD_UP:
                 blocks, since = self.counters.blocks, now
             looked = now
-            stall = max(STALL, _BLOCKS * self.counters.block / (self._settings.rate or 48_000))
-            if self.counters.is_streaming and now - since > stall:
+            stall = max(STALL, _BLOCKS * self.counters.block / (self._rate or 48_000))
+            if status is not None:
+                self._restart(_ENDED.get(status, f"it ended with {status}"))
+            elif self.counters.is_streaming and now - since > stall:
                 self._kill()
                 self._restart(f"no sound was made for {1e3 * (now - since):.0f} ms")
-            elif (status := self._status()) is not None:
-                lost = "the device was lost" if status == LOST else f"it ended with {status}"
-                self._restart(lost)
             self._report_underruns(now)
             if until is not None and _has_ended(until):
                 return
+
+    def _take(self, event: dict[str, Any]) -> None:
+        """Report an event of the process that plays; a reason once, until it plays again."""
+        self._rate = event.get("rate", self._rate)
+        if event["event"] == "ready":
+            self._said.clear()
+            priority = "real-time" if self.counters.is_realtime & 1 else "ordinary"
+            opened = "open again, disarmed: " if self._was_open else ""
+            self._was_open = True
+            self._report(
+                f"{opened}{event['device']}, {self._settings.channels} channels, {event['rate']} "
+                f"Hz, blocks of {event['block']} frames, {priority} priority"
+            )
+        elif "reason" in event:
+            self._say(f"silent and in fault, waiting: {event['reason']}")
+
+    def _say(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._report(line)
 
     def end(self) -> None:
         """Let it fall silent and end; kill it where it does not."""
@@ -105,7 +128,7 @@ class Supervisor:
                 self._kill()
         self._stack.close()
 
-    def _launch(self, *, is_recovering: bool) -> None:
+    def _launch(self) -> None:
         self._stack.close()
         life, kept = os.pipe()
         self._stack.callback(os.close, kept)
@@ -116,7 +139,7 @@ class Supervisor:
                 *(sys.executable, "-P", "-m", "sim.desk.soft_amp"),
                 self._settings.to_json(),
                 *map(str, inherited),
-                str(int(is_recovering)),
+                str(self._rate),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -130,9 +153,9 @@ class Supervisor:
         self._rest = b""
 
     def _restart(self, reason: str) -> None:
-        self._report(f"silent and in fault: {reason}; opening {self._settings.device} again")
+        self._say(f"silent and in fault: {reason}; opening {self._settings.device} again")
         time.sleep(_PAUSE)
-        self._launch(is_recovering=True)
+        self._launch()
 
     def _kill(self) -> None:
         assert self._process is not None  # noqa: S101  launched before
@@ -158,15 +181,14 @@ class Supervisor:
         seen = (self.counters.gaps, self.counters.xruns)
         if seen != self._seen and now - self._reported > _REPORT:
             self._seen, self._reported = seen, now
-            self._report(underruns(self.counters, rate=self._settings.rate or 48_000))
+            self._report(self.underruns())
 
-
-def underruns(counters: Counters, *, rate: float) -> str:
-    """Underruns in words; rate [Hz]."""
-    return (
-        f"{counters.gaps} gaps in the sound, {counters.xruns} underruns reported by the driver, in "
-        f"{counters.frames / rate:.0f} s"
-    )
+    def underruns(self) -> str:
+        """Underruns in words."""
+        return (
+            f"{self.counters.gaps} gaps in the sound, {self.counters.xruns} underruns reported by "
+            f"the driver, in {self.counters.frames / (self._rate or 48_000):.0f} s"
+        )
 
 
 def _has_ended(descriptor: int) -> bool:

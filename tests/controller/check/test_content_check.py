@@ -14,6 +14,7 @@ from controller.check.content_check import check_content, kept_shares
 from controller.check.simulated_touch import loaded_plate
 from controller.cli.commands import app
 from controller.content.pattern import Pattern, Transient
+from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold, over_threshold
 from model.table.build import build_table
@@ -149,6 +150,12 @@ def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> 
     assert result.exit_code == 1
     assert "lost too much, at least 100 % must be" in result.stdout
     assert "dB above quiet fingers" in result.stdout
+
+
+def test_level_beyond_all_is_refused_as_it_was_given() -> None:
+    """Not as what becomes of it in the file."""
+    with pytest.raises(InputError, match="level must be between -100 and 60 dB SL, got 70;"):
+        check_content(Pattern(0.3, ((0.0, 0.5), (0.3, 0.5))), table(), 70.0, at=AT)
 
 
 def test_what_is_felt_is_written_as_sound(tmp_path: Path) -> None:

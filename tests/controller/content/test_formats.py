@@ -1,5 +1,6 @@
 """Files of content: which are refused before their format reads them, and what none may do."""
 
+import math
 import os
 import random
 from collections.abc import Callable
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from controller.content.ahap import Ahap
 from controller.content.formats import (
     content_formats,
     named_content,
@@ -57,12 +59,14 @@ def test_named_contents_are_felt(tmp_path: Path) -> None:
         (
             "ahap",
             '{\n"Pattern": [1 2]}',
-            ":2: is not valid JSON: Expecting ',' delimiter in column 15",
+            ":2: is not valid JSON: Expecting ',' delimiter in column 15; correct it there",
         ),
+        ("ahap", '{"Pattern": [', ":1: is not valid JSON: .*; its end is missing: export it again"),
+        ("haptic", b" " * (2 << 20) + b"{}", "is larger than 2 MiB; shorten the content"),
         ("haptic", '{"a": [1,]}', "is not valid JSON"),
         ("ahap", b'{\n"\xff"}', ":2: byte 0xff is no UTF-8"),
         ("ahap", '{"a":\n' + "[" * 20 + "]" * 20 + "}", ":2: is nested more than 20 levels deep"),
-        ("ahap", '{"a": [' + "{}," * 100_001 + "{}]}", "has more than 100000 objects and lists"),
+        ("ahap", '{"a": [' + "0," * 99_999 + "0]}", "has more than 100000 values"),
         (
             "ahap",
             '{"Pattern": [{\n"b": 1,\n"b": 2}]}',
@@ -112,6 +116,34 @@ def test_damaged_file_is_read_or_refused(read: Read, name: str) -> None:
             values += [each.intensity for each in pattern.transients]
             assert all(0 <= value <= 1 for value in values)
             assert 0 <= pattern.duration <= 60
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        (Pattern(-1.0), "must last 0 s or longer, got -1 s"),
+        (Pattern(math.nan), "must last 0 s or longer, got nan s"),
+        (Pattern(61.0), "must end within 60 s, got 61 s"),
+        (Pattern(1.0, ((0.0, 3.0),)), r"intensity\[0\] must be 0 to 1, got 3 at 0 s"),
+        (
+            Pattern(1.0, (), ((0.0, 0.1), (0.5, math.nan))),
+            r"sharpness\[1\] must be .* nan at 0.5 s",
+        ),
+        (Pattern(1.0, ((0.5, 1.0), (0.4, 1.0))), r"intensity\[1\] must be 0.5 to 60 s, got 0.4 s"),
+        (
+            Pattern(1.0, transients=(Transient(0.1, 1.0, 1.5),)),
+            r"sharpness of transients\[0\] must be 0 to 1, got 1.5 at 0.1 s",
+        ),
+    ],
+    ids=["backwards", "no number", "long", "too strong", "no sharpness", "order", "transient"],
+)
+def test_what_a_format_makes_is_within_bounds(
+    read: Read, monkeypatch: pytest.MonkeyPatch, pattern: Pattern, words: str
+) -> None:
+    """Or the file is refused: an intensity of 3 would be felt 20 dB above its level."""
+    monkeypatch.setattr(Ahap, "read", lambda *_: pattern)
+    with pytest.raises(InputError, match=rf"content\.ahap: .*{words}"):
+        read("ahap", "")
 
 
 def test_points_and_taps_of_a_program() -> None:

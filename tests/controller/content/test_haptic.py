@@ -54,7 +54,10 @@ def test_intensity_is_the_root_of_amplitude(read: Read) -> None:
             haptic({"time": 0, "amplitude": 0.5, "emphasis": {"amplitude": 0.4, "frequency": 0.5}}),
             r":15: .*emphasis\.amplitude: must be at least the amplitude there, 0\.5, got 0\.4",
         ),
-        (haptic({"time": 60.5, "amplitude": 0}), r"amplitude\[0\]: must end within 60 s"),
+        (
+            haptic({"time": 60.5, "amplitude": 0}, frequency=[{"time": 60.4, "frequency": 0}]),
+            r"^\S+:\d+: signals\.continuous\.envelopes\.amplitude\[0\]: must end within 60 s",
+        ),
     ],
 )
 def test_refusal_has_line_and_key(read: Read, given: dict[str, Any], words: str) -> None:

@@ -73,6 +73,18 @@ def test_two_bands_and_what_lies_outside(read: Read) -> None:
     )
 
 
+def test_rates_and_lengths_without_factors_keep_times(read: Read) -> None:
+    """A burst 50 s into 53 s at 1009 samples a second, a prime, as a file of 48 kHz has it."""
+    time = np.arange(1009 * 53) / 1009
+    burst = np.where((time > 50) & (time < 50.2), 0.8 * np.sin(2 * np.pi * 150 * time), 0)
+    times, values = np.array(read("wav", wav(burst.astype(np.float32), 1009)).intensity).T
+    at = np.arange(49, 51, 0.001)
+    is_on = np.interp(at, times, values) > 0.4
+    assert at[is_on.argmax()] == pytest.approx(50, abs=0.01)
+    assert at[len(at) - is_on[::-1].argmax()] == pytest.approx(50.2, abs=0.01)
+    assert values.max() == pytest.approx(0.8, abs=0.03)
+
+
 def test_burst_begins_and_ends_in_time(read: Read) -> None:
     """Half of its intensity is passed within 10 ms of both; silence is 0."""
     signal = np.where((TIME > 0.3) & (TIME < 0.5), sine(0.8, 180), 0)

@@ -267,7 +267,7 @@ async def test_daemon_plays_effects_by_region_and_by_name(
             for played, loop, level, words in (
                 ([*reversed(steady)], False, None, r"points\[1\] time_s must be 30 to 60, got 0"),
                 ([(0.0, 1.1, 0.5)], False, None, r"points\[0\] intensity must be 0 to 1"),
-                (steady, False, 20.1, "level of effect 'points' must be from -20 to 20"),
+                (steady, False, 20.1, "^level must be from -20 to 20 dB SL, got 20.1"),
                 ("alert", True, None, "loop must be left out"),
             ):
                 with pytest.raises(RpcError, match=words):

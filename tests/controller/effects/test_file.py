@@ -201,6 +201,7 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
         ("{kind: file, file: broken.ahap}", "broken.ahap:1"),
         ("{kind: file, file: door.ahap, channel: 2}", "channel must be left out"),
         ("{kind: file, file: door.txt}", "txt"),
+        ("{kind: file, file: succes}", "unknown content 'succes'; did you mean success? known are"),
     ],
     ids=[
         "missing",
@@ -212,6 +213,7 @@ def test_a_layout_names_files_beside_it_and_contents_that_come_along(tmp_path: P
         "broken",
         "channel",
         "format",
+        "mistyped",
     ],
 )
 def test_a_file_that_cannot_be_played_is_a_problem_of_its_layout(

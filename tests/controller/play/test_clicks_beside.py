@@ -13,7 +13,7 @@ from controller.effects.layout import SurfaceLayout, default_effects
 from controller.play.chooser import Chooser
 from controller.play.content import Prediction, Selection, sums_db
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.play.layers import LayerContent
+from controller.play.layer_content import LayerContent
 from controller.play.observer import PlayReport
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey

@@ -14,7 +14,8 @@ from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.layers import LayerContent, Layers, Sets
+from controller.play.layer_content import LayerContent
+from controller.play.layers import Layers, Sets
 from controller.play.observer import PlayReport
 from controller.play.planner import ENDED
 from controller.play.selection import Selector

@@ -171,6 +171,23 @@ async def test_a_stop_amid_a_course_is_silence() -> None:
 
 
 @in_virtual_time
+async def test_a_restart_amid_a_course_is_silence_until_it_is_armed_again() -> None:
+    """Then the resting finger feels what is left, where it would be; no old piece is waited for."""
+    felt = FeelsCourse(Course((0.0, 0.1, 5.0), (0.0, 1.0, 0.5)))
+    async with set_running(knots=32, intent_source=felt) as chain:
+        await looked_at(chain, 0.5, FINGER)
+        chain.far_end.fault("reboot", lasts=0.1)
+        _, levels = await looked_at(chain, 0.6, FINGER)
+        assert not levels.any()
+        (refused,) = chain.refused
+        assert "once the cause is gone, clear and arm again" in refused
+        await chain.operate("clear")
+        await chain.operate("arm")
+        times, levels = await looked_at(chain, 0.8, FINGER)
+        assert furthest(times[50:] - felt.started_at, levels[50:], course=felt.course) < ROUNDING
+
+
+@in_virtual_time
 async def test_a_course_begins_anew_without_a_gap() -> None:
     """Each of its turns is as the first, the seam included, until the finger lifts."""
     felt = FeelsCourse(Course((0.0, 0.2, 0.37), (0.5, 1.0, 0.5)), loops=True)

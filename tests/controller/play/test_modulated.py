@@ -13,7 +13,8 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.content import Content
 from controller.play.intent import Pulse, Target
-from controller.play.layers import LayerContent, Layers, Sets
+from controller.play.layer_content import LayerContent
+from controller.play.layers import Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Layer
 from model.answer.fingers import Placement

@@ -52,12 +52,6 @@ def test_strongest_moments_of_a_course() -> None:
     assert along(0.5, np.zeros(3)).strongest_db == pytest.approx(-120)
 
 
-def test_a_course_goes_on_from_amid_it() -> None:
-    """By hand: half way up a line of 2 s, half of the share and the rest of its knots are left."""
-    left = Course((0.0, 2.0, 3.0), (0.0, 1.0, 0.2)).left(1.0)
-    assert left == Course((0.0, 1.0, 2.0), (0.5, 1.0, 0.2))
-
-
 def beats(frequency: float) -> Course:
     """Beats of a frequency [Hz] that come and go along a raised cosine of 8 s."""
     times = np.linspace(0, 8.0, 1601)

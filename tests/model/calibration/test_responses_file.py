@@ -16,6 +16,7 @@ from model.calibration.responses_file import (
 )
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.structure.exciter import Exciter
 from model.structure.plate import Plate
 
 WRITERS = {"csv": write_responses_csv, "uff": write_responses_uff}
@@ -316,3 +317,37 @@ def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, end
     ):
         with pytest.raises(InputError, match=rf"{path.name}:\d+: .*{named}"):
             responses_of(given, rig)
+
+
+@pytest.mark.parametrize("ending", WRITERS)
+def test_responses_per_volt_are_of_exciters(responses, coarse_rig, tmp_path, ending):
+    """Of a rig with exciters they read back, masses of the sensor too; one of ERAs refuses them."""
+    exciters = tuple(
+        Exciter(era.name, era.x, era.y, 3000.0, 0.8, 0.1, 1e-3, 3.6, 4.3, 3.0)
+        for era in coarse_rig.eras
+    )
+    rig = replace(coarse_rig, eras=exciters)
+    path = tmp_path / f"measured.{ending}"
+    weighed = replace(responses, masses=np.array([2e-3, 2e-3, 1.5e-3]))
+    WRITERS[ending](path, weighed, rig, setting="level 0.1, rig 1a2b3c4d")
+    measured = read_measured(path)
+    assert {each.setting for each in measured} == {"level 0.1, rig 1a2b3c4d"}
+    back = responses_of(measured, rig)
+    order = [back.sensors.index(name) for name in responses.sensors]
+    np.testing.assert_allclose(back.values[:, :, order], responses.values, rtol=1e-11)
+    np.testing.assert_allclose(back.sensor_masses[order], weighed.masses)
+    with pytest.raises(InputError, match=f"measured.{ending}.*per displacement of the base"):
+        responses_of(measured, coarse_rig)
+
+
+def test_sensor_that_cannot_be_moved_is_refused(responses, coarse_rig, tmp_path):
+    """Two masses at one place, one below zero, and one that is a paperweight's."""
+    path = tmp_path / "measured.csv"
+    for grams, cause in (("-1", "sensor_mass_g must be"), ("900", "sensor_mass_g must be")):
+        write_responses_csv(path, replace(responses, masses=np.full(3, 2e-3)), coarse_rig)
+        path.write_text(path.read_text().replace(",2.0\n", f",{grams}\n", 1))
+        with pytest.raises(InputError, match=f"measured.csv:2: {cause}"):
+            read_measured(path)
+    path.write_text(path.read_text().replace(",900\n", ",3.0\n"))
+    with pytest.raises(InputError, match="must have one mass, got"):
+        responses_of(read_measured(path), coarse_rig)

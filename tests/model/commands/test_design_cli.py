@@ -50,7 +50,7 @@ def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     assert len(set(rig.wiring.values())) == 5
     assert set(read_document(tmp_path / "rig.yaml").data["amplifiers"]) == {"main", "amplifier2"}
     assert {Path(name).name for name in found["files"]} == {
-        "rig.yaml", "layouts.csv", "contrast.png", "count.png",
+        "rig.yaml", "layouts.csv", "contrast.png", "count.png", "template.svg",
     }  # fmt: skip
     weight = sum(era["static_load_n"] for era in found["eras"].values())
     assert weight == pytest.approx(9.81 * rig.plate.mass)

@@ -149,7 +149,7 @@ def test_materials_are_listed_with_numbers_and_sources(era, answer):
     entries = answer("materials")["materials"]
     glass = next(entry for entry in entries if entry["name"] == "soda-lime-glass")
     assert (glass["E_pa"], glass["rho_kg_m3"], glass["nu"]) == (70e9, 2500, 0.2)
-    assert len(entries) == 6
+    assert len(entries) == 12
     assert all(entry["source"] for entry in entries)
     text = era("plate", "materials")[1]
     assert all(entry["source"] in text for entry in entries)

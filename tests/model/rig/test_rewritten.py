@@ -13,6 +13,7 @@ from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import PointLoad
 
 RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
 
@@ -63,6 +64,19 @@ eras:
 amplifiers: {m: {url: "sim://"}}
 """
 
+BOARD = (
+    FLOW.replace("thickness: 2 mm, material: steel", "thickness: 6 mm, material: plywood")
+    .replace("width: 0.2,", "width: 0.2, grain: width,")
+    .replace("mesh: 12x9", "supports: {foot: {at: [0.1, 0.1], kind: foam}}  # of foam")
+)
+
+BY_NUMBERS = BOARD.replace(
+    "plywood", "{E1: 12 GPa, E2: 4.8 GPa, G12: 0.7 GPa, G13: 350 MPa, G23: 250 MPa, nu12: 0.05, "
+    "rho: 680}",
+)  # fmt: skip
+
+ACRYLIC = BOARD.replace("plywood", "acrylic")
+
 BONDED = BLOCK.replace("bond: none", "bond: full").replace("12x9", "auto")
 
 
@@ -110,7 +124,13 @@ def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
         assert [[row[0] for row in era.gains] for era in read.eras] == [[50.0, 60.0]] * 4
 
 
-@pytest.mark.parametrize("text", [FLOW, BLOCK, BONDED], ids=["flow", "block", "bonded"])
+TEXTS = {
+    **{"flow": FLOW, "block": BLOCK, "bonded": BONDED},
+    **{"board": BOARD, "by numbers": BY_NUMBERS, "acrylic": ACRYLIC},
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
 def test_rewritten_text_keeps_comments_and_has_every_value(text: str) -> None:
     """Comments of any style stay, and values are those of the other rig, layers' moduli too."""
     document = parse_document("rig.yaml", text)
@@ -122,8 +142,13 @@ def test_rewritten_text_keeps_comments_and_has_every_value(text: str) -> None:
         if "#" in line:
             assert line[line.index("#") :] in written
     back = rig_of(parse_document("new.yaml", written))
-    if back.plate.laminate is None:
-        assert pytest.approx(other.plate.material.E, rel=1e-6) == back.plate.material.E
+    if back.plate.laminate is None or "layers" not in document.data["plate"]:
+        before, after = (
+            each.laminate.layers[0].material if each.laminate else each.plate.material
+            for each in (rig, back)
+        )
+        expected = {key: 1.2345678 * each for key, each in before.moduli.items()}
+        assert after.moduli == pytest.approx(expected, rel=1e-6)
     else:
         moduli = [layer.material.E for layer in back.plate.laminate.layers]
         assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-6)
@@ -154,3 +179,14 @@ def test_small_value_that_reads_back_otherwise_is_refused(monkeypatch: pytest.Mo
     monkeypatch.setattr(rewritten, "_set", lambda *_: None)
     with pytest.raises(InputError, match="read back"):
         rewritten_text(document, rig, other, comment="")
+
+
+def test_a_mass_that_is_found_comes_beside_supports() -> None:
+    """Supports stay, and the mass is read back where it was found."""
+    document = parse_document("rig.yaml", BOARD)
+    rig = rig_of(document)
+    found = PointLoad(0.05, 0.15, mass=0.004)
+    text = rewritten_text(document, rig, replace(rig, masses=(*rig.masses, found)), comment="")
+    back = rig_of(parse_document("rig.yaml", text)).masses
+    assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
+    assert found in back

@@ -61,6 +61,10 @@ LAYERS = """\
 LAMINATE = GOOD.replace("  thickness: 1.5 mm\n  material: aluminium\n", LAYERS).replace(
     "48x36", "auto"
 )
+BOARD = (
+    "{E1: 12 GPa, E2: 5 GPa, G12: 1 GPa, G13: 1 GPa, G23: 1 GPa, nu12: 0.1, rho: 700}"  # of wood
+)
+AT_EDGE, FOOT = "  level: 0.5\nmasses:\n  a", "  level: 0.5\nsupports:\n  a"
 MASS = "masses:\n  cam:\n    at: [0, 0]\n    mass: 5 g"
 
 
@@ -101,6 +105,13 @@ def check_refusal(
         (5, "  material: {E: 70 GPa, rho: 2700, nu: -1}", "5 plate.material.nu"),
         (5, "  material: {E: 70 GPa, nu: 0.3}", "5 plate.material.rho"),
         (5, "  material: {E: 1, rho: 0, nu: 0, F: 1}", "5 plate.material.F"),
+        (5, "  material: {E: 70 GPa, rho: 2700}", "5 plate.material.nu"),
+        (5, "  material: {E: 70 GPa, rho: 2700, nu: 0.3, G12: 1 GPa}", "5 plate.material.G12"),
+        (5, "  material: {rho: 2700}", "5 plate.material.E"),
+        (5, f"  material: {BOARD.replace('nu12: 0.1', 'nu12: 2')}", "5 plate.material"),
+        (5, f"  material: {BOARD.replace(', G23: 1 GPa', '')}", "5 plate.material.G23"),
+        (5, f"  material: {BOARD.replace('rho', 'nu: 0.3, rho')}", "5 plate.material.nu"),
+        (5, "  material: steel\n  grain: wide", "6 plate.grain"),
         # 0.3048 m / (0.17132 m / 6) = 10.67 and 0.2286 m / (0.17132 m / 6) = 8.01
         (6, "mesh: 10x9", "6 mesh"),
         (6, "mesh: 11x8", "6 mesh"),
@@ -130,6 +141,16 @@ def check_refusal(
         (23, "  level: 0.5\nuncertainty:", "24 uncertainty"),
         (23, "  level: 0.5\n" + MASS.replace("\n    mass: 5 g", ""), "25 masses.cam.mass"),
         (23, "  level: 0.5\n" + MASS.replace("cam", "2nd"), "25 masses.2nd"),
+        (23, f"{AT_EDGE}: {{mass: 1 g}}", "25 masses.a.at"),
+        (23, f"{AT_EDGE}: {{along: edges}}", "25 masses.a.mass_per_length"),
+        (23, f"{AT_EDGE}: {{along: edges, mass: 1, mass_per_length: 1}}", "25 masses.a.mass"),
+        (23, f"{AT_EDGE}: {{at: [0, 0], mass: 1, points: 50}}", "25 masses.a.points"),
+        (23, f"{FOOT}: {{at: [0, 0]}}", "25 supports.a.stiffness"),
+        (23, f"{FOOT}: {{at: [0, 1], kind: foam}}", "25 supports.a.at"),
+        (23, f"{FOOT}: {{at: [0, 0], kind: foams}}", "25 supports.a.kind, foam"),
+        (23, f"{FOOT}: {{at: [0, 0], stiffness: 2 MN/m}}", "25 supports.a.foot"),
+        (23, f"{FOOT}: {{along: edges, kind: foam}}", "25 supports.a.kind"),
+        (23, f"{FOOT}: {{along: edges}}", "25 supports.a.stiffness_per_length"),
         (23, "  level: 0.5\nplates: 2", "24 plates, plate"),
         (23, "  level: 0.5\nfingertip: 5", "24 fingertip"),
         (23, "  level: 0.5\nfingertip: {phalanx: 1 g}", "24 fingertip.phalanx, phalanx_mass"),

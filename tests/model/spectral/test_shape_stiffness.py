@@ -9,9 +9,9 @@ from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
-from model.spectral.shape_stiffness import stiffness_slopes
+from model.spectral.shape_stiffness import grain_slopes, stiffness_slopes
 from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Laminate, LaminateLayer, Material, Plate
+from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
 PLATE = Plate(0.3, 0.21, 0.001, GLASS)
@@ -21,6 +21,8 @@ LAYERS = (
     LaminateLayer(GLASS, 0.0006),
 )
 SANDWICH = equivalent_plate(Laminate(LAYERS), length=0.3, width=0.21, frequency=200.0)
+BIRCH = Material("birch", 12.7e9, 680.0, 0.3, Orthotropy(0.38, 0.055, 0.028, 0.02))
+BOARD = Plate(0.3, 0.21, 0.002, BIRCH)
 DEGREES = (13, 11)
 SPECTRAL = SpectralMesh(*DEGREES, 0.3, 0.21)
 ELEMENTARY = Mesh(5, 4, 0.3, 0.21, ELEMENTS["Q5"])
@@ -59,7 +61,11 @@ def changed(plate, number, change):
 
 
 @pytest.mark.parametrize(
-    ("plate", "mesh"), [(PLATE, SPECTRAL), (PLATE, ELEMENTARY), (SANDWICH, SPECTRAL)]
+    ("plate", "mesh"),
+    [
+        *((PLATE, SPECTRAL), (PLATE, ELEMENTARY), (SANDWICH, SPECTRAL)),
+        *((BOARD, SPECTRAL), (BOARD, ELEMENTARY)),
+    ],
 )
 def test_slopes_are_those_of_the_eigenvalues_of_other_plates(plate, mesh):
     """Solved anew a little larger and smaller; rotary inertia accounts for 0.1 %."""
@@ -70,6 +76,21 @@ def test_slopes_are_those_of_the_eigenvalues_of_other_plates(plate, mesh):
         np.testing.assert_allclose(
             np.diagonal(slope) / eigenvalues, expected / eigenvalues, atol=2e-3
         )
+
+
+@pytest.mark.parametrize(("number", "key"), [(0, "e2"), (1, "g12")])
+def test_slopes_by_a_grain_are_those_of_boards_of_other_moduli(number, key):
+    """Solved anew with a modulus across, or of shear in the plane, a little higher and lower."""
+    eigenvalues, unknowns = elastic_modes(BOARD, SPECTRAL)
+    slopes = grain_slopes(BOARD, DEGREES, unknowns)[number]
+
+    def board(change):
+        shares = replace(BIRCH.orthotropy, **{key: getattr(BIRCH.orthotropy, key) * (1 + change)})
+        return replace(BOARD, material=replace(BIRCH, orthotropy=shares))
+
+    more, less = (elastic_modes(board(by), SPECTRAL)[0] for by in (STEP, -STEP))
+    expected = (more - less) / (2 * STEP) / eigenvalues
+    np.testing.assert_allclose(slopes / eigenvalues, expected, atol=2e-3)
 
 
 def test_a_thin_plate_scales_with_the_fourth_power_of_its_size():

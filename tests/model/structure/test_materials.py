@@ -20,7 +20,7 @@ PRINTED = {
     "steel": (210e9, 7850, 0.3),  # EN 1993-1-1, 3.2.6; EN 1991-1-1
     "soda-lime-glass": (70e9, 2500, 0.2),  # EN 572-1
     "chemically-strengthened-glass": (71.5e9, 2420, 0.21),  # Corning Gorilla Glass 2
-    "acrylic": (3.3e9, 1190, 0.37),  # Plexiglas GS
+    "float-glass": (70e9, 2500, 0.2),  # EN 572-1
     "polycarbonate": (2.4e9, 1200, 0.38),  # Makrolon
 }
 

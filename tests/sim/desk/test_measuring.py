@@ -82,6 +82,29 @@ def test_measured_responses_are_those_of_the_plate(
     assert (found.repeated, found.coherence.min() > 0.999) == (0, True)
 
 
+def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
+    rig: Rig, truth: Truth, undisturbed: Measured
+) -> None:
+    """The last ERA's output is the loop-back's, too: four runs, the same responses and delay.
+
+    Inputs exchanged, and another ERA's output in the cable, are told with their places.
+    """
+    desk = Desk(rig, SENSORS, is_shared=True)
+    sines = Multisine(FREQUENCIES, 4, RATE, LEVEL)
+    sound = card(truth, on_outputs=[0, 1, 2, 3, 3])
+    found = measure(desk, sound, sines)
+    difference = found.responses.values - undisturbed.responses.values
+    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
+    assert (sound.runs, desk.output) == (4, 4)
+    assert found.latency * RATE == pytest.approx(DELAY, abs=1)
+    for wires, cause in (
+        ({"on_inputs": [0, 3, 2, 1], "on_outputs": [0, 1, 2, 3, 3]}, "at input 2.*P2"),
+        ({"on_outputs": [0, 1, 2, 3, 1]}, "output 2 of ERA SE"),
+    ):
+        with pytest.raises(InputError, match=cause):
+            measure(desk, card(truth, **wires), sines)
+
+
 def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     """Single tones of single ERAs give the responses that all ERAs gave at once."""
     desk = Desk(rig, SENSORS)

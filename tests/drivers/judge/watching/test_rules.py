@@ -327,6 +327,17 @@ def test_status_amid_a_fault_may_show_a_mark_that_came_twice(
     assert {*talk.found} == broken
 
 
+@pytest.mark.parametrize(("beats", "broken"), [(2, ["credit"]), (13, [])])
+def test_request_with_the_bytes_of_an_old_one_is_no_copy(beats: int, broken: list[str]) -> None:
+    """0.4 s later, on a disturbed wire, it is one, without a reply; 2.6 s later it is new."""
+    talk = Talk().armed().says(kind=hand.GET_STATUS)
+    number = talk.sequence - 1
+    talk.fed(beats - 2).told("faults", "a", are_on=True).told("faults", "a", are_on=False)
+    last = talk.fed(2).rest(0.09).sequence
+    talk.numbered(number).sends(hand.GET_STATUS).rest(0.009).replies(hand.GET_STATUS, hand.status())
+    assert talk.numbered(last).found == broken
+
+
 def test_clock_goes_on_from_where_an_arm_has_shifted_it() -> None:
     """By 16384 steps, 5 s; the status before it was not heard, so that of Arm may show a Mark."""
     talk = Talk().identified().sends(hand.GET_STATUS).rest(0.1)

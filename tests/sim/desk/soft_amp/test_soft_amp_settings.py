@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from model.errors import InputError
+from sim.desk.libjack import NoSound
 from sim.desk.soft_amp.library import compile_engine
 from sim.desk.soft_amp.output import PortAudioOutput, portaudio_stream
 from sim.desk.soft_amp.settings import Law, Place, Protocol, Settings, terminal_place
@@ -86,6 +87,47 @@ def test_block_is_shorter_than_a_reply_may_take(
     monkeypatch.setattr("sim.desk.soft_amp.output.may_be_realtime", lambda: is_realtime)
     output = PortAudioOutput(settings(device="card"))
     assert output.block / output.rate < 0.01
+
+
+class _NoSound(Exception):
+    """What PortAudio raises."""
+
+
+@pytest.mark.parametrize(
+    ("known", "is_down", "problem", "cause"),
+    [
+        ([], True, NoSound, "start its sound server"),
+        ([], False, NoSound, "connect a sound card"),
+        (["Scarlett 4i4"], False, InputError, "did you mean Scarlett 4i4"),
+    ],
+)
+def test_portaudio_without_its_host_is_waited_for(
+    known: list[str],
+    is_down: bool,
+    problem: type[Exception],
+    cause: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As where it cannot begin, or has no device at all; among others a name is mistyped."""
+
+    def initialize() -> None:
+        if is_down:
+            raise _NoSound("Unanticipated host error")
+
+    def query(number: object = None, _kind: object = None) -> object:
+        if number is None:
+            return [{"name": name} for name in known]
+        raise ValueError(f"No output device matching {number!r}")
+
+    library = SimpleNamespace(
+        _terminate=lambda: None,
+        _initialize=initialize,
+        query_devices=query,
+        PortAudioError=_NoSound,
+    )
+    monkeypatch.setattr("sim.desk.soft_amp.output.sounddevice", lambda: library)
+    with pytest.raises(problem, match=cause):
+        PortAudioOutput(settings(device="Scarlet 4i4"))
 
 
 class _Busy:

@@ -3,7 +3,7 @@
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.desk.capture import Capture
+from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS, STATES
 from gateway_bench import wait_for
@@ -95,6 +96,41 @@ async def test_killed_or_stopped_player_is_silent_and_then_in_fault(
     await lines.close()
 
 
+async def test_silence_is_an_open_output_of_zeros(
+    sound: tuple[Capture, dict[str, str]], tmp_path: Path
+) -> None:
+    """After a lost host, a stop and a disarm: connected, no gap, and every sample exactly zero."""
+    _, environment = sound
+    here = capture_on(environment["JACK_DEFAULT_SERVER"], "zeros", 2)
+    options = ("--device", "jack:zeros", "--channels", "2", "--link", str(tmp_path / "amp"))
+    soft_amp = SoftAmp(*options, environment=environment, log=tmp_path / "log")
+    lines = Lines()
+
+    async def silent(end: Callable[[Amplifier], Awaitable[object]] | None) -> None:
+        with host(soft_amp.url, 2) as playing:
+            wait_for(here.is_sounding)
+            playing.kill()
+            playing.wait()
+        if end is not None:
+            amplifier = await linear_amplifier(lines, soft_amp.url)
+            await amplifier.open()
+            await end(amplifier)
+            await lines.close()
+        wait_for(lambda: not here.is_sounding())
+        begin, player = here.position, soft_amp.player
+        _wait_for_samples(here, 0.5)
+        assert not here.samples(here.position - begin).any()
+        assert all(here.is_played_to(f"zeros:in_{n}") for n in (1, 2))
+        assert soft_amp.player == player
+
+    await silent(None)
+    await silent(lambda amplifier: amplifier.stop())
+    await silent(lambda amplifier: amplifier.disarm())
+    soft_amp.end()
+    assert "soft-amp: 0 gaps" in soft_amp.log
+    here.close()
+
+
 def test_refused_device_is_one_message(
     sound: tuple[Capture, dict[str, str]], tmp_path: Path
 ) -> None:
@@ -113,6 +149,7 @@ def test_refused_device_is_one_message(
         ({"rate": 96_000}, "--rate"),
         ({"block": 2 * BLOCK}, "--block"),
         ({"device": "jack:nothing"}, "--device"),
+        ({"device": "jack:crad"}, "did you mean jack:card"),
     ],
 )
 def test_unsuitable_device_is_refused(
@@ -121,7 +158,7 @@ def test_unsuitable_device_is_refused(
     changed: dict[str, object],
     key: str,
 ) -> None:
-    """By the option at fault."""
+    """By the option at fault; a client that was mistyped by the one that was meant."""
     monkeypatch.setenv("JACK_DEFAULT_SERVER", sound[1]["JACK_DEFAULT_SERVER"])
     with pytest.raises(InputError, match=key):
         open_output(replace(SETTINGS, **changed))

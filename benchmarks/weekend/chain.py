@@ -1,0 +1,254 @@
+"""Boards whose parts deviate, measured by one moved sensor, calibrated, touched: against the truth.
+
+    python -m benchmarks.weekend.chain [--boards 10] [--touches 20] [--workers 2] [--report]
+    python -m benchmarks.weekend.chain --measured examples/weekend/measured.uff
+
+Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives and board drawn
+within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. A sensor of 2 g reads
+its responses at twelve places, with noise; `era calibrate` fits the rig. Of a table of that rig and
+one of the board as it is, exactly known but for the loads of fingers, the same random touches are
+answered, and felt on the board in the steady state: contrast beyond 25 dB counts as 25. In memory,
+without a sound card. With --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import era_haptics as era
+from benchmarks.page import write_parts
+from benchmarks.setting import random_contacts, use_one_thread
+from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.calibrate import calibrate
+from model.calibration.responses import Responses
+from model.calibration.responses_file import write_responses
+from model.diagnosis.consistency import check_consistency
+from model.errors import InputError
+from model.finger.fingertip import fingertips_on
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import PointLoad, fingertip_loads
+from model.structure.exciter import Exciter
+from model.table.build import build_table
+from sim.plant.imperfections import draw_imperfections
+
+FORCE_FACTOR, MAGNET, FEET = 0.1, 0.1, 0.3
+"""Beside the rig's uncertainty, standard deviations of what that does not have, relative."""
+SENSOR_MASS, NOISE = 2e-3, 2e-3  # kg; of a sensor's root mean square, each part
+COUNTED_DB = 25.0
+"""Contrast beyond that is not noticed as more."""
+PLACES = np.array(
+    [
+        *([0.07, 0.15], [0.37, 0.08], [0.67, 0.18], [0.94, 0.12]),
+        *([0.14, 0.44], [0.42, 0.53], [0.62, 0.41], [0.91, 0.57]),
+        *([0.06, 0.91], [0.31, 0.80], [0.71, 0.86], [0.96, 0.93]),
+    ]
+)
+"""Of the sensor, as shares of the sides; on no line of symmetry."""
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltBoard:
+    """A board as it is: its rig with true values, drives among them."""
+
+    rig: Rig
+    free: FreePlate
+
+    @classmethod
+    def drawn(cls, rig: Rig, seed: int) -> "BuiltBoard":
+        """Draw a board within the uncertainty of a rig, and of parts beyond it."""
+        rng = np.random.default_rng([SEED, seed])
+        drawn = draw_imperfections(rig, seed=seed)
+        real = drawn.plate.realised(rig)
+        eras = tuple(
+            replace(
+                each,
+                force_factor=each.force_factor * (1 + FORCE_FACTOR * rng.standard_normal()),
+                magnet_mass=each.magnet_mass * (1 + MAGNET * rng.standard_normal()),
+                gains=((100.0, float(abs(gain)), float(np.angle(gain))),),
+            )
+            for each, gain in zip(real.eras, drawn.factors(rig), strict=True)
+            if isinstance(each, Exciter)
+        )
+        feet = tuple(
+            replace(each, stiffness=each.stiffness * float(np.exp(FEET * rng.standard_normal())))
+            for each in real.masses
+        )
+        real = replace(real, eras=eras, masses=feet)
+        free = solve_free_plate(real.plate, real.mesh, frequency_max=real.limits.frequency_max)
+        return cls(real, free)
+
+    def responses(
+        self, points: FloatArray, frequencies: FloatArray, loads: Sequence[Any] = ()
+    ) -> ComplexArray:
+        """Acceleration [m/s²] of each exciter at full level, (f, e, p)."""
+        masses = [*self.rig.masses, *loads]
+        return self.free.acceleration(self.rig.eras, frequencies, points, loads=masses)
+
+    def measured(self, frequencies: FloatArray, seed: int) -> Responses:
+        """Responses by one sensor that is moved, with its noise."""
+        size = np.array([self.rig.plate.length, self.rig.plate.width])
+        points = PLACES * size
+        found = np.concatenate(
+            [
+                self.responses(at[None], frequencies, [PointLoad(at[0], at[1], mass=SENSOR_MASS)])
+                for at in points
+            ],
+            axis=2,
+        )
+        found /= np.array([each.full_level for each in self.rig.eras])[:, None]
+        rms = np.sqrt((np.abs(found) ** 2).mean(axis=(0, 1)))
+        real, imaginary = np.random.default_rng([SEED, seed, 1]).standard_normal((2, *found.shape))
+        return Responses(
+            tuple(f"P{n + 1}" for n in range(len(points))),
+            points,
+            frequencies,
+            found + NOISE * rms * (real + 1j * imaginary),
+            masses=np.full(len(points), SENSOR_MASS),
+        )
+
+    def contrast(self, answer: Any, factors: FloatArray) -> float:
+        """Felt contrast [dB] of an answer under fingers whose loads differ by factors."""
+        plate, fingers = self.rig.plate, [each.finger.at for each in answer.fingers]
+        points, weights = fingertips_on(np.array(fingers), length=plate.length, width=plate.width)
+        loads = [
+            replace(each, fingertip=each.fingertip.multiplied(float(factor)))
+            for each, factor in zip(
+                fingertip_loads(self.rig.fingertip, fingers), factors, strict=True
+            )
+        ]
+
+        def response(frequency: float) -> ComplexArray:
+            at = points.reshape(-1, 2)
+            return np.asarray(self.responses(at, np.array([frequency]), loads)[0])
+
+        return sensed(answer, self.rig, response, weights)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A touch [dB]: promised after calibration, felt by that, and felt by exact knowledge."""
+
+    quiet: int
+    promised: float
+    felt: float
+    exact: float
+
+
+def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Responses]:
+    """Build a board and measure it."""
+    built = BuiltBoard.drawn(rig, seed)
+    lines = np.arange(rig.limits.frequency_min + 1, rig.limits.frequency_max, 10.0)
+    return built, built.measured(lines, seed)
+
+
+def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
+    """Build, measure, calibrate and touch a board; count: for each number of quiet fingers."""
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    built, responses = measured(rig, seed)
+    known = calibrate(rig, responses, check_consistency(rig, responses)).rig
+    frequencies = np.arange(low, high + 1, 10.0)
+    table = build_table(known, frequencies=frequencies, drive_mode="phased")
+    std = Uncertainty(0, 0, 0, 0, 1, rig.uncertainty.fingertip, 0, 0, 0, 0, 0)
+    exact = build_table(
+        replace(built.rig, uncertainty=std), frequencies=frequencies, drive_mode="phased"
+    )
+    rng = np.random.default_rng([SEED, seed, 2])
+    size = (rig.plate.length, rig.plate.width)
+    for number in range(2 * count):
+        quiet = 1 + number % 2
+        target, *others = random_contacts(rng, 1 + quiet, size, margin=EDGE).tolist()
+        factors = np.exp(rig.uncertainty.fingertip * rng.standard_normal(1 + quiet))
+        answers = [
+            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL)
+            for each in (table, exact)
+        ]
+        felt, best = (built.contrast(each, factors) for each in answers)
+        promised = answers[0].fingers[0].promised_contrast_db
+        assert promised is not None
+        yield Touch(quiet, promised, felt, best)
+
+
+def _rig() -> Rig:
+    return load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
+
+
+def outcome(board: int, touched: int) -> "Outcome":
+    """Touches on a board by its number."""
+    use_one_thread()
+    try:
+        return Outcome(board, tuple(touches(_rig(), board, touched)))
+    except InputError as refused:
+        return Outcome(board, (), str(refused))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Touches on a board; or why its calibration was refused."""
+
+    board: int
+    touches: tuple[Touch, ...]
+    refused: str = ""
+
+
+def table(found: Sequence[Outcome]) -> str:
+    """The figures as Markdown."""
+    touches = [each for one in found for each in one.touches]
+    rows = [
+        "| quiet | touches | promised / dB | felt / dB | board exactly known / dB | kept "
+        f"| lost of the first {COUNTED_DB:g} dB, mean |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name in ("1", "2", "all"):
+        some = [each for each in touches if name in ("all", str(each.quiet))]
+        promised, felt, exact = np.transpose([(t.promised, t.felt, t.exact) for t in some])
+        lost = np.minimum(exact, COUNTED_DB) - np.minimum(felt, COUNTED_DB)
+        medians = " | ".join(f"{np.median(each):.1f}" for each in (promised, felt, exact))
+        rows.append(
+            f"| {name} | {len(some)} | {medians} | {100 * (felt >= promised).mean():.0f} % "
+            f"| {lost.mean():.1f} dB |"
+        )
+    refused = [f"board {each.board}: {each.refused}" for each in found if each.refused]
+    text = f"{len(found)} boards, of which `era calibrate` refused {len(refused)}."
+    return "\n".join([*rows, "", text, *refused])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.weekend.chain", description=__doc__)
+    parser.add_argument("--boards", type=int, default=10)
+    parser.add_argument("--touches", type=int, default=20, help="for each number of quiet fingers")
+    parser.add_argument("--first", type=int, default=0, help="number of the first board")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--report", action="store_true")
+    parser.add_argument("--measured", type=Path, help="only write what the sensor reads of --first")
+    options = parser.parse_args()
+    if options.measured:
+        rig = _rig()
+        write_responses(options.measured, measured(rig, options.first)[1], rig)
+        return
+    found = []
+    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+        numbers = range(options.first, options.first + options.boards)
+        for job in [pool.submit(outcome, number, options.touches) for number in numbers]:
+            found.append(job.result())
+            one = found[-1]
+            print(one.refused or table([one]).splitlines()[-3], flush=True)
+    text = table(found)
+    print(f"\n{text}")
+    if options.report:
+        counts = f"--boards {options.boards} --touches {options.touches}"
+        run = f"Printed by `python -m benchmarks.weekend.chain {counts} --report`."
+        write_parts(PAGE, {"chain": f"{run}\n\n{text}"})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""An impedance through a sound card: voltage before a resistor, and over it, of one multisine.
+
+    output ──┬── exciter ──┬── resistor R ── ground
+            V_1           V_2                         Z = R (V_1 / V_2 - 1)
+
+Delay, filters and gain of the two inputs are taken as the same; one input that is moved from the
+first place to the second has them the same, whatever they are.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
+from model.files.csv_file import read_lines, write_columns
+from sim.desk.measuring.impedance import HIGH, LOW
+from sim.desk.measuring.loopback import SILENT
+from sim.desk.measuring.multisine import Multisine
+from sim.desk.measuring.single_run import settled
+from sim.desk.measuring.sound_card import SoundCard
+
+_LINES = 120
+_FULL = 0.999  # of full scale
+_COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
+
+
+def default_lines() -> FloatArray:
+    """Whole frequencies [Hz] from 10 to 1000, nearly at equal ratios."""
+    return np.unique(np.geomspace(LOW, HIGH, _LINES).round())
+
+
+def measured_impedance(
+    card: SoundCard,
+    *,
+    inputs: tuple[int, ...],
+    series: float,
+    level: float,
+    periods: int,
+    move: Callable[[str], None],
+) -> tuple[FloatArray, ComplexArray]:
+    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of what is in series with a resistor [ohm].
+
+    inputs: before and over the resistor, counted from 1, or one that is moved: move is then called
+    with where to, before each run. Raises InputError, LinkError.
+    """
+    sines = Multisine(default_lines(), 1, card.rate, level)
+    voltages = []
+    for n, place in enumerate(("before the exciter", "over the resistor")):
+        if len(inputs) == 1:
+            move(place)
+        if n == 0 or len(inputs) == 1:
+            recorded = settled(card, sines, 1, outputs=1, periods=periods)
+        voltage = recorded[:, inputs[min(n, len(inputs) - 1)] - 1]
+        _check(voltage, f"input {inputs[min(n, len(inputs) - 1)]}, {place}")
+        voltages.append(sines.found(voltage))
+    return sines.frequencies, np.asarray(series * (voltages[0] / voltages[1] - 1))
+
+
+def _check(voltage: FloatArray, what: str) -> None:
+    if np.abs(voltage).max() >= _FULL:
+        raise InputError(f"{what}: clipped; turn down the gain of the input, or --level")
+    if np.sqrt((voltage**2).mean()) < SILENT:
+        raise LinkError(
+            f"{what}: silent; check the circuit, the output's volume and the cable of the input"
+        )
+
+
+def write_impedance(path: Path, frequencies: FloatArray, impedance: ComplexArray) -> None:
+    """Write a file of frequencies [Hz] and an impedance [ohm], atomically; raises OSError."""
+    columns = (frequencies, impedance.real, impedance.imag)
+    write_columns(path, dict(zip(_COLUMNS, columns, strict=True)))
+
+
+def read_impedance(path: Path) -> tuple[FloatArray, ComplexArray]:
+    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of a file; raises InputError."""
+    rows = np.array(
+        [[line.number(name) for name in _COLUMNS] for line in read_lines(path, _COLUMNS)]
+    ).reshape(-1, 3)
+    if len(rows) and rows[:, 0].min() <= 0:
+        raise InputError(f"{path}: frequency_hz must be above 0, got {rows[:, 0].min():g}")
+    return rows[:, 0], rows[:, 1] + 1j * rows[:, 2]

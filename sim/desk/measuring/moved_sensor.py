@@ -1,0 +1,203 @@
+"""A plate measured with one sensor that is moved from place to place, by a person at a terminal.
+
+Every place is a measurement of its own. Its phases are relative to the loop-back, so that places
+measured minutes apart agree; the sensor's gain is one. What is measured is written after each
+place, so that the rest can be measured another time.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import ComplexArray, FloatArray
+from model.calibration.responses import MeasuredValue, Responses, responses_of
+from model.calibration.responses_file import read_measured, write_responses
+from model.errors import InputError
+from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.measure import Measured, measure
+from sim.desk.measuring.multisine import Multisine
+from sim.desk.measuring.sound_card import DeviceLost, SoundCard
+from sim.sensors.sensor_file import WiredSensor
+
+_SAME = 0.02  # of the response, or so many times its noise:
+_OF_NOISE = 3.0
+_APART = 5e-3  # m; nearer places may sound alike
+_AT = 5e-4  # m; places of a file are those of the sensors within that
+_NOISY = 0.03  # of the response
+
+Ask = Callable[[str], str]
+"""Shows a person what to do and returns what was typed; "q" where nobody answers."""
+Tell = Callable[[str], None]
+"""Shows a person a line."""
+
+
+def setting_of(desk: Desk, multisine: Multisine) -> str:
+    """What must be the same at all places, in words of a file."""
+    return f"level {multisine.level:g}, rig {desk.rig.fingerprint[:8]}"
+
+
+@dataclass(eq=False)
+class PlacesFile:
+    """What is measured at places of a desk, and the file that keeps it.
+
+    values (f, eras) [1/s²] by the name of a place.
+    """
+
+    path: Path
+    desk: Desk
+    frequencies: FloatArray
+    setting: str
+    values: dict[str, ComplexArray] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> list[WiredSensor]:
+        """Places that are not measured, in the order of their file."""
+        return [place for place in self.desk.sensors if place.name not in self.values]
+
+    def read(self) -> None:
+        """Go on from the file; raises InputError where it is of another measurement."""
+        measured = read_measured(self.path)
+        for each in measured:
+            self._check(each)
+        found = responses_of(measured, self.desk.rig)
+        if (
+            found.skipped
+            or found.frequencies.shape != self.frequencies.shape
+            or not np.allclose(found.frequencies, self.frequencies, rtol=0, atol=1e-6)
+        ):
+            raise self._other("frequencies", _span(self.frequencies), _span(found.frequencies))
+        for at, values in zip(found.points.tolist(), found.values.transpose(2, 0, 1), strict=True):
+            self.values[self._place_at(at).name] = values
+
+    def keep(self, place: WiredSensor, found: Measured) -> None:
+        """Write the file with another place; raises OSError."""
+        self.values[place.name] = found.responses.values[:, :, 0]
+        write_responses(self.path, self.responses, self.desk.rig, setting=self.setting)
+
+    @property
+    def responses(self) -> Responses:
+        """All that is measured."""
+        places = [place for place in self.desk.sensors if place.name in self.values]
+        masses = np.array([place.mass for place in places])
+        return Responses(
+            tuple(place.name for place in places),
+            np.array([[place.x, place.y] for place in places]),
+            self.frequencies,
+            np.stack([self.values[place.name] for place in places], axis=2),
+            masses=masses if masses.any() else None,
+        )
+
+    def _check(self, each: MeasuredValue) -> None:
+        """Refuse a value of another setting, place or sensor."""
+        if each.setting != self.setting:
+            raise self._other("level and rig", self.setting, each.setting or "none stated")
+        place = self._place_at(each.point)
+        if not math.isclose(each.sensor_mass, place.mass, rel_tol=1e-6, abs_tol=1e-9):
+            grams = [f"{1e3 * mass:g} g" for mass in (place.mass, each.sensor_mass)]
+            raise self._other("the sensor's mass", *grams)
+
+    def _place_at(self, at: Sequence[float]) -> WiredSensor:
+        for place in self.desk.sensors:
+            if math.dist((place.x, place.y), at) <= _AT:
+                return place
+        raise self._other("places", "one at each line of --sensors", f"({at[0]:g}, {at[1]:g}) m")
+
+    def _other(self, what: str, wanted: str, got: str) -> InputError:
+        return InputError(
+            f"--resume {self.path}: {what} must be {wanted}, got {got} in the file; measure as it "
+            "was begun, or leave out --resume and write another file"
+        )
+
+
+def measure_places(
+    file: PlacesFile,
+    card: SoundCard,
+    multisine: Multisine,
+    *,
+    periods: int,
+    ask: Ask,
+    tell: Tell,
+) -> dict[str, Measured]:
+    """Guide a person through the missing places; returns what was measured now, by place.
+
+    A place that fails a check is told with its remedy, and asked for again. Raises DeviceLost,
+    OSError; what was measured before is in the file then.
+    """
+    found: dict[str, Measured] = {}
+    todo = file.missing
+    last: WiredSensor | None = None
+    tell(
+        "Enter measures a place, r the one before again, s skips it, q stops; what is measured is "
+        "kept"
+    )
+    while todo:
+        place = todo[0]
+        number = file.desk.sensors.index(place) + 1
+        reply = ask(
+            f"Put the sensor at {place.name}, x {1e3 * place.x:g} mm, y {1e3 * place.y:g} mm "
+            f"(place {number} of {len(file.desk.sensors)}), then Enter: "
+        )
+        match reply.strip().lower():
+            case "q":
+                break
+            case "s":
+                todo.pop(0)
+            case "r" if last is not None:
+                todo.insert(0, last)
+                last = None
+            case "r":
+                tell("no place was measured just before; Enter, s or q")
+            case "":
+                try:
+                    measured = measure(
+                        replace(file.desk, sensors=(place,)), card, multisine, periods=periods
+                    )
+                    _check_moved(file, place, measured)
+                except DeviceLost:
+                    raise
+                except (InputError, LinkError) as problem:
+                    tell(f"{place.name} is not kept: {problem}")
+                    continue
+                file.keep(place, measured)
+                found[place.name] = measured
+                last = todo.pop(0)
+                tell(_line(place, measured))
+            case _:
+                tell(f"a reply must be Enter, r, s or q, got {reply.strip()[:20]!r}")
+    return found
+
+
+def _check_moved(file: PlacesFile, place: WiredSensor, found: Measured) -> None:
+    """Raise InputError for a response that is that of another place."""
+    own = found.responses.values[:, :, 0]
+    limit = max(_SAME, _OF_NOISE * float(np.median(found.std)))
+    for other in file.desk.sensors:
+        is_near = math.dist((place.x, place.y), (other.x, other.y)) < _APART
+        before = file.values.get(other.name)
+        if before is None or is_near or other.name == place.name:
+            continue
+        difference = float(np.linalg.norm(own - before) / np.linalg.norm(before))
+        if difference < limit:
+            raise InputError(
+                f"response must differ from that at {other.name} by more than {100 * limit:.1f} %, "
+                f"got {100 * difference:.1f} %: the sensor is still there; move it to {place.name}"
+            )
+
+
+def _line(place: WiredSensor, found: Measured) -> str:
+    noise = float(np.median(found.std))
+    text = (
+        f"{place.name}: coherence {np.median(found.coherence):.4f}, noise {100 * noise:.2f} % of "
+        "the response; kept"
+    )
+    if noise > _NOISY:
+        text += "; it is noisy: raise --periods in another measurement"
+    return text
+
+
+def _span(frequencies: FloatArray) -> str:
+    return f"{len(frequencies)} from {frequencies[0]:g} to {frequencies[-1]:g} Hz"

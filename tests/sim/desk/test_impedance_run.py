@@ -1,0 +1,171 @@
+"""`era measure --impedance` through a sound card in memory, and through a real audio server."""
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks.desk_plate.jack_plate import JackPlate
+from drivers.errors import LinkError
+from exciter_circuit import ExciterCircuit
+from exciter_rig import exciter_rig_text
+from installed_program import ERA
+from model.arrays import Float32Array, FloatArray
+from model.rig.file import parse_rig
+from sim.desk.impedance_cli import app
+from sim.desk.libjack import JackClient
+from sim.desk.measuring.sound_card import SoundCard
+from sound_card import jack_server
+
+RATE = 48_000
+WEIGHT = 1e3 * (ExciterCircuit.COIL + ExciterCircuit.MAGNET)  # g
+PARTS = {
+    "resistance": ExciterCircuit.RESISTANCE,
+    "force_factor": ExciterCircuit.FORCE_FACTOR,
+    "coil_mass": ExciterCircuit.COIL,
+    "weight": ExciterCircuit.MAGNET,
+    "resonance": np.sqrt(ExciterCircuit.STIFFNESS / ExciterCircuit.MAGNET) / (2 * np.pi),
+    "q": np.sqrt(ExciterCircuit.STIFFNESS * ExciterCircuit.MAGNET) / ExciterCircuit.DAMPING,
+}
+
+
+class MemoryCard(SoundCard):
+    """The circuit as a sound card; inputs: which of its two voltages each input has."""
+
+    def __init__(self, circuit: ExciterCircuit, inputs: Sequence[int] = (0, 1)) -> None:
+        self.circuit, self.name, self.rate, self.gaps = circuit, "memory", float(RATE), 0
+        self.inputs = inputs
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Advance the circuit."""
+        return self.circuit.advance(played)[:, list(self.inputs)].astype(np.float32)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class MovedCard(MemoryCard):
+    """One input, which is before the exciter in the first run, and over the resistor then."""
+
+    runs = 0
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Advance the circuit."""
+        found = super().run(played)[:, [self.runs]]
+        self.runs += 1
+        return found
+
+
+def measured(
+    monkeypatch: pytest.MonkeyPatch, card: SoundCard, *arguments: object, typed: str = ""
+) -> tuple[int, str]:
+    """Exit status of the command with a card in memory, and its last line."""
+    monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
+    words = ["--impedance", "--device", "x", "--json", *map(str, arguments)]
+    done = CliRunner().invoke(app, words, input=typed)
+    return done.exit_code, done.stdout.splitlines()[-1] if done.stdout else str(done.exception)
+
+
+def test_parts_come_from_two_runs_and_a_scale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Free with two inputs, glued with one that is moved: each part to 1 %, of the true circuit."""
+    free, glued = tmp_path / "free.csv", tmp_path / "glued.csv"
+    circuit = ExciterCircuit(is_glued=False, rate=RATE)
+    status, _ = measured(monkeypatch, MemoryCard(circuit), "-o", free)
+    assert status == 0
+    circuit = ExciterCircuit(is_glued=True, rate=RATE)
+    status, told = measured(
+        monkeypatch, MovedCard(circuit), "-o", glued, "--free", free, "--weight", WEIGHT,
+        "--inputs", "1", typed="\n\n",
+    )  # fmt: skip
+    assert status == 0
+    _check(json.loads(told))
+    done = CliRunner().invoke(
+        app,
+        ["--impedance", "--free", str(free), "--glued", str(glued), "--weight", "110.9"],
+    )
+    assert done.exit_code == 0
+    assert exciter_of_lines(done.stdout) == pytest.approx(
+        {
+            "stiffness": ExciterCircuit.STIFFNESS,
+            "damping": ExciterCircuit.DAMPING,
+            "force_factor": ExciterCircuit.FORCE_FACTOR,
+            "coil_mass": ExciterCircuit.COIL,
+            "magnet_mass": ExciterCircuit.MAGNET,
+            "inductance": ExciterCircuit.INDUCTANCE,
+            "resistance": ExciterCircuit.RESISTANCE,
+        },
+        rel=0.01,
+    )
+
+
+def exciter_of_lines(told: str) -> dict[str, float]:
+    """The exciter of a rig in which the printed keys are pasted, in SI units."""
+    keys = [line.partition("#")[0].strip() for line in told.splitlines() if line[:4] == "    "]
+    rig = parse_rig("pasted.yaml", exciter_rig_text(", ".join([*keys, "power: 1 W"])))
+    names = "stiffness damping force_factor coil_mass magnet_mass inductance resistance"
+    return {name: getattr(rig.eras[0], name) for name in names.split()}
+
+
+def test_wrong_circuits_write_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inputs exchanged; an input without a cable; both by their cause."""
+    output = tmp_path / "z.csv"
+    for inputs, cause in (((1, 0), "first input is before"), ((0, 0), "open or short circuit")):
+        card = MemoryCard(ExciterCircuit(is_glued=True, rate=RATE), inputs)
+        status, message = measured(monkeypatch, card, "-o", output)
+        assert status == 1  # of the runner; the program makes 2 of it
+        assert cause in message
+    assert not output.exists()
+
+
+def _check(told: dict[str, dict[str, dict[str, float]]]) -> None:
+    values = told["values"]
+    for name, true in PARTS.items():
+        assert values[name]["value"] == pytest.approx(true, rel=0.01), name
+        assert values[name]["half_width_90"] < 0.01 * true
+
+
+@pytest.mark.real_time
+@pytest.mark.skipif(
+    not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
+)
+def test_parts_are_found_through_a_real_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two commands of the installed program, a simulated exciter as a client of the server."""
+    name = f"coil{os.getpid()}"
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
+    with jack_server(name) as server:
+        for is_glued in (False, True):
+            with closing(_client("desk")) as client:
+                circuit = ExciterCircuit(is_glued=is_glued, rate=RATE)
+                plate = JackPlate(client, circuit)  # type: ignore[arg-type]  # called by JACK
+                plate.start()
+                more = ("--free", "0.csv", "--weight", str(WEIGHT)) if is_glued else ()
+                done = subprocess.run(
+                    [ERA, "measure", "--impedance", "--device", "jack:desk", "--json", "-o",
+                     f"{is_glued:d}.csv", *more],
+                    cwd=tmp_path, env=server.environment, capture_output=True, check=True,
+                )  # fmt: skip
+                plate.wait(0)
+    _check(json.loads(done.stdout))
+
+
+def _client(name: str) -> JackClient:
+    end = time.monotonic() + 20
+    while True:
+        try:
+            return JackClient(name, is_only=True)
+        except LinkError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.05)

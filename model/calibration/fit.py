@@ -4,7 +4,8 @@
 
 d measured, a of the model as sensors of some scales read it, g a complex gain of every frequency
 and ERA. Gains are projected out (`model.calibration.variable_projection`); z is searched: the
-rig's values, which no prior holds, scales of sensors and form errors, which tolerances hold.
+rig's values, which no prior holds, scales of sensors, form errors and what data sheets know better,
+which tolerances hold.
 
 Noise has a constant part and a part in proportion to the response, both estimated from the
 residuals. What a check's plate leaves shows the outliers, the worst of a row first, since one pulls
@@ -102,7 +103,7 @@ class CalibrationProblem:
     def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
         space, held = self.plate.model.space, self.searched.copy()
-        held[self.plate.numbers] = False
+        held[self.plate.numbers] = self.free & self.plate.held
         held[space.groups["sensor_scale"]] &= ~self.free_scales
         rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
         if self.free_scales.all():

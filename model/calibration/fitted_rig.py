@@ -161,6 +161,9 @@ def uncertainty_of(
         "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
+    feet = before.supports * fit.error[problem.plate.model.space.groups["supports"]]
+    if feet.any():
+        fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(feet**2)), _MODEL_ERROR))
     if known["modulus"]:
         fitted |= Uncertainty.of_frequency(_rounded(rms("modulus") / 2))
     return Uncertainty.clipped(**asdict(before) | fitted)

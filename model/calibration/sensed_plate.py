@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
@@ -87,6 +88,14 @@ class SensedPlate:
         )
         return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
 
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Which fitted values (n,) a prior holds, as a data sheet's coil and magnet of an exciter."""
+        exciters = {era.name for era in self.rig.eras if "force_factor" in era.fields}
+        return np.array(
+            [row.kind in ("bolt_mass", "magnet_mass") and row.era in exciters for row in self.rows]
+        )
+
     @property
     def masses(self) -> FloatArray:
         """Mass of the sensor at each point while it measures there, (s,) [kg]."""
@@ -129,8 +138,9 @@ class SensedPlate:
         """The rig with the fitted values of z."""
         own = np.zeros(len(z))
         own[self.numbers] = z[self.numbers]
-        factor = self.model.space.groups["force_factor"]
-        own[factor] = z[factor]  # with the damping that was found beside it
+        for kind in ("force_factor", "supports"):
+            beside = self.model.space.groups[kind]
+            own[beside] = z[beside]  # with the damping that was found beside them
         values = Values.of(self.rig, self.model.space, own)
         return rig_with(self.rig, values, self.rig.uncertainty)
 

@@ -150,7 +150,7 @@ def _by_places(plate: PlateAt) -> Columns:
 
 
 def _by_attachments(plate: PlateAt) -> Columns:
-    """By the values of ERAs, which also drive through them, and by the parts of fingers."""
+    """By the values of ERAs, which also drive through them, by feet and the parts of fingers."""
     model, values, Y = plate.model, plate.values, plate.responses
     n = plate.force.shape[1]
     eras, slopes = np.arange(n), [each.slopes(model.omega) for each in plate.sources]
@@ -165,6 +165,8 @@ def _by_attachments(plate: PlateAt) -> Columns:
     found["damping_added"] = found["damping"]
     found["damping_each"] = found["damping"] * values.damping
     found["damping"] = found["damping_each"].sum(axis=-1, keepdims=True)
+    feet = np.array([n + number for number in model.rig.feet], dtype=int)
+    found["supports"] = _held(plate, feet, values.supports * model.springs)
     first = n + len(model.rig.masses) + model.mass_count
     by_finger = [
         _held(plate, np.full(4, first + number), slopes)
@@ -215,6 +217,7 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "damping_added",
         "bolt_mass",
         *EXCITER_KINDS,
+        "supports",
         "fingers",
     ),
     _by_gains: (

@@ -11,7 +11,7 @@ A sensor of mass m_s loads the plate only while it measures: one that is moved f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -156,6 +156,12 @@ class ForwardModel:
         return attached_stiffness(self.omega, self.rig.masses)
 
     @cached_property
+    def springs(self) -> ComplexArray:
+        """Dynamic stiffness of the springs of the rig's feet, with their losses (f, q) [N/m]."""
+        feet = [replace(self.rig.masses[n], mass=0.0, damping=0.0) for n in self.rig.feet]
+        return attached_stiffness(self.omega, feet)
+
+    @cached_property
     def drive_gains(self) -> ComplexArray:
         """Gains of the rig's ERAs in its file, (f, eras)."""
         return np.array([era.gain(self.frequencies) for era in self.rig.eras]).T
@@ -261,9 +267,11 @@ class PlateAt:
             for each, logs in zip(model.fingers, values.fingers, strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
+        fixed = model.fixed_stiffness.copy()
+        fixed[:, list(model.rig.feet)] += (values.supports - 1) * model.springs
         held = [
             attached_stiffness(model.omega, self.sources),
-            model.fixed_stiffness,
+            fixed,
             -(w**2) * values.masses[:, 0],
             *(load[:, None] for load, _ in loads),
             np.zeros((len(w), len(model.pads))),

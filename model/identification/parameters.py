@@ -14,6 +14,7 @@ from model.identification.form_errors import MASS_CELLS
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import damping_from_ratio
+from model.structure.feet_and_frames import FEET_DEVIATE
 from model.structure.plate import MAX_LOSS_EXPONENT
 
 MODE_SHIFTS = 12
@@ -89,6 +90,8 @@ KINDS = {
     "masses": Kind(2e-3, *_WEIGHT),
     "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
     "mode_losses": Kind(0.5),
+    # Of each foot.
+    "supports": Kind(FEET_DEVIATE, bound=math.log(10.0)),
     # Of each group of a finger's load.
     "fingers": Kind(0.5),
     # Form errors: a ruler's, a cutter's, and 1 % of the plate's mass over all cells, as its shares.
@@ -111,6 +114,9 @@ EXCITER_KINDS = ("magnet_mass", "force_factor")
 
 FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
 """Kinds of which a plate with form errors alone has parameters."""
+
+COIL_DEVIATES = 0.2
+"""Standard deviation of the mass of an exciter's coil by its sheet, relative: assumed."""
 
 VALUE_UNITS = {
     "length": "m",
@@ -310,6 +316,8 @@ def space_of(
     add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
     of_mode = KINDS["mode_losses"].std * lossy
     add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
+    feet = [f"stiffness of foot {n}" for n in range(1, len(rig.feet) + 1)]
+    add("supports", feet, uncertainty.supports)
     add("fingers", [])
     has_form = form_of is not None
     add("sensor_scale", [f"scale of sensor {name}" for name in sensors if has_form])
@@ -370,7 +378,19 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
         ).reshape(3, -1)
     for name in of_exciters:
         columns[0, space.groups[name]] *= excites
+    # A coil weighs what its sheet says, but for glue; a response tells it together with a gain.
+    weighs = excites & (bolt > 0)
+    coils = np.flatnonzero(weighs) + space.groups["bolt_mass"].start
+    columns[:, coils] = _known(COIL_DEVIATES * bolt[weighs], -bolt[weighs], bolt[weighs])
+    feet, bound = space.groups["supports"], KINDS["supports"].bound
+    if known := rig.uncertainty.supports:
+        columns[:, feet] = _known(np.full(len(rig.feet), known), -bound, bound)
     return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
+
+
+def _known(std: FloatArray, lower: Number, upper: Number) -> FloatArray:
+    """Standard deviations (m,) and the bounds in them, (3, m)."""
+    return np.array([std, lower / std, upper / std])
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:

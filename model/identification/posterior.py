@@ -92,6 +92,7 @@ class Posterior:
             field=field,
             place=rms["place"],
             harmonic=before.harmonic,
+            supports=_rms(self.std[self.space.groups["supports"]]),
         )
 
 

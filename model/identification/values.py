@@ -24,7 +24,8 @@ class Values:
 
     thickness, modulus: factors; loss_factor at LOSS_FREQUENCY, loss_exponent; stiffness [N/m],
     damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs, bolts of exciters their
-    coils; magnet_mass, force_factor (n,): of exciters, factors; masses (m, 3): kg and x,
+    coils; magnet_mass, force_factor (n,): of exciters, factors; supports (q,): of the stiffness of
+    each foot, factors; masses (m, 3): kg and x,
     y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
     loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
     beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
@@ -46,6 +47,7 @@ class Values:
     bolt_mass: FloatArray
     magnet_mass: FloatArray
     force_factor: FloatArray
+    supports: FloatArray
     places: FloatArray
     masses: FloatArray
     mode_shifts: FloatArray
@@ -89,6 +91,7 @@ class Values:
             bolt_mass=m + own("bolt_mass"),
             magnet_mass=np.exp(np.append(own("magnet_mass"), np.zeros(n))[:n]),
             force_factor=np.exp(np.append(own("force_factor"), np.zeros(n))[:n]),
+            supports=np.exp(own("supports")),
             places=at + own("place").reshape(n, 2),
             masses=masses,
             mode_shifts=own("mode_shifts"),
@@ -159,13 +162,16 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
         )
         for number, era in enumerate(values.sources(rig))
     )
+    masses = list(rig.masses)
+    for foot, factor in zip(rig.feet, values.supports.tolist(), strict=True):
+        masses[foot] = replace(masses[foot], stiffness=factor * masses[foot].stiffness)
     return replace(
         rig,
         plate=plate_with(rig.plate, values),
         laminate=rig.laminate
         and rig.laminate.scaled(modulus=values.modulus, thickness=values.thickness),
         eras=eras,
-        masses=(*rig.masses, *additional_masses(values)),
+        masses=(*masses, *additional_masses(values)),
         uncertainty=uncertainty,
     )
 

@@ -41,7 +41,9 @@ def _viscous(plate: PlateAt) -> FloatArray:
     rig, h = model.rig, plate.functions.thickness
     springs = [each.in_time.stiffness for each in plate.sources]
     masses = [each.in_time.mass for each in plate.sources]
-    springs += [load.stiffness for load in rig.masses] + [0.0] * len(values.masses)
+    factors = np.ones(len(rig.masses))
+    factors[list(rig.feet)] = values.supports
+    springs += [*factors * [load.stiffness for load in rig.masses]] + [0.0] * len(values.masses)
     masses += [load.mass for load in rig.masses] + [*values.masses[:, 0]]
     on_plate = shapes[: len(springs)]
     lossy = _lossy(plate)

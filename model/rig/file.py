@@ -18,10 +18,10 @@ from model.rig.parts import (
     masses_of,
     plate_of,
     supports_of,
+    uncertainty_of,
 )
 from model.rig.rig import Channel, Rig
 from model.rig.sections import RigSection
-from model.rig.uncertainty import Uncertainty
 
 
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
@@ -81,7 +81,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         ),
         supports=tuple(supports),
         laminate=laminate_of(section.plate),
-        uncertainty=Uncertainty(**section.uncertainty.model_dump()),
+        uncertainty=uncertainty_of(section.uncertainty, section.supports.values()),
         fingertip=fingertip_of(section.fingertip),
         threshold=section.threshold,
         promised_thresholds=tuple(section.promised_thresholds),

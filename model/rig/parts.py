@@ -1,6 +1,7 @@
 """Conversion of the sections of a rig file to values of the model."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 from model.rig.key_types import place_on
@@ -13,9 +14,11 @@ from model.rig.sections import (
     MaterialSection,
     PlateSection,
     SupportSection,
+    UncertaintySection,
 )
+from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Fingertip, PointLoad
-from model.structure.feet_and_frames import EDGE_FOOT, FEET, FOOT_LOSS, edge_points
+from model.structure.feet_and_frames import EDGE_FOOT, FEET, FEET_DEVIATE, FOOT_LOSS, edge_points
 from model.structure.laminate_section import equivalent_plate
 from model.structure.materials import KnownMaterial
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Orthotropy, Plate
@@ -137,6 +140,15 @@ def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
         )
         for x, y, length in edge_points(plate, section.points)
     )
+
+
+def uncertainty_of(section: UncertaintySection, feet: Iterable[SupportSection]) -> Uncertainty:
+    """How well the rig is known; its feet by their kind alone as `FEET_DEVIATE`."""
+    stated = section.model_dump(exclude={"supports"})
+    if section.supports is not None:
+        return Uncertainty(**stated, supports=section.supports)
+    by_kind = any(foot.kind is not None and foot.stiffness is None for foot in feet)
+    return Uncertainty(**stated, supports=FEET_DEVIATE if by_kind else 0.0)
 
 
 def limits_of(section: LimitsSection) -> GuardLimits:

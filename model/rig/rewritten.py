@@ -37,7 +37,7 @@ def rewritten_text(
 ) -> str:
     """Return a rig file's text with the values of another rig of the same ERAs, after a comment.
 
-    Written are plate, ERAs and uncertainty where they differ, and further masses after its own.
+    Written are plate, ERAs, feet and uncertainty where they differ, and further masses after its own.
     mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
     InputError where the text, read as a rig, has other values.
     """
@@ -94,6 +94,9 @@ def _values(rig: Rig, document: Document) -> dict[KeyPath, _Written]:
         found["eras", era.name, "at"] = (era.x, era.y)
         for field, key in KINDS[type(era)].keys.items():
             found["eras", era.name, key] = getattr(era, field)
+    feet = [name for name, keys in document.data.get("supports", {}).items() if "at" in keys]
+    for name, number in zip(feet, rig.feet, strict=True):
+        found["supports", name, "stiffness"] = rig.masses[number].stiffness
     return found
 
 

@@ -19,6 +19,7 @@ from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, PointLoad
+from model.structure.feet_and_frames import EDGE_FOOT
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.suggestions import did_you_mean
@@ -120,6 +121,16 @@ class Rig:
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made
+
+    @cached_property
+    def feet(self) -> tuple[int, ...]:
+        """Numbers of the masses that are feet, in the order of their file.
+
+        Springs that are no ERAs without an amplifier, which come after them, and act along no edge.
+        """
+        springs = [number for number, each in enumerate(self.masses) if each.stiffness]
+        feet = springs[: len(springs) - len(self.supports)]
+        return tuple(number for number in feet if self.masses[number].foot != EDGE_FOOT)
 
     @property
     def largest_stiffness(self) -> float:

@@ -417,6 +417,12 @@ class UncertaintySection(Section):
     harmonic: Annotated[float, _within("harmonic")] = Uncertainty.harmonic
     """Second harmonic of each ERA's motion as a share of its own amplitude, of any phase."""
 
+    supports: Annotated[float, _within("supports")] | None = None
+    """Of the stiffness of each foot, relative: of what measurements are fitted by.
+
+    Default: 0.3 where a foot is given by its `kind` alone, else 0
+    """
+
 
 class FingertipSection(Section):
     """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""

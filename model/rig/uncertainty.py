@@ -17,6 +17,7 @@ BOUNDS = {
     "modulus": (0.0, 0.1),
     "place": (0.0, 0.01),
     "harmonic": (0.0, 0.2),
+    "supports": (0.0, 0.5),
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
@@ -37,7 +38,8 @@ class Uncertainty:
     its root mean square over the plate, beside all others; modulus: of the plate's modulus of
     elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
     [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
-    amplitude, of any phase. The defaults are those of a plate as built from its drawing and not
+    amplitude, of any phase; supports: stiffness of each foot, relative, which a fit and simulated
+    plates read, not answers. The defaults are those of a plate as built from its drawing and not
     measured.
     """
 
@@ -52,6 +54,7 @@ class Uncertainty:
     modulus: float = 0.02
     place: float = 0.001
     harmonic: float = 0.01
+    supports: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""

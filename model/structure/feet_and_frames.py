@@ -16,6 +16,9 @@ from model.structure.plate import Plate
 FEET = {"foam": 2e3, "rubber": 30e3}
 """Stiffness [N/m] of a foot by its kind: assumed, of some 2 cm; of one's own weigh and press."""
 
+FEET_DEVIATE = 0.3
+"""Standard deviation of that stiffness, relative: assumed."""
+
 DEFAULT_POINTS = 7
 """Points of each edge."""
 

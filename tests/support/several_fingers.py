@@ -94,7 +94,7 @@ def playable(layers: int = 8) -> PlaybackCapabilities:
     return PlaybackCapabilities(
         "phased",
         ("phased",),
-        Limits((40.0, 320.0), table().strokes),
+        Limits((40.0, 320.0), table().full_levels),
         RAMPS_ONLY,
         layers=layers,
     )

@@ -4,7 +4,7 @@ import hashlib
 from functools import cache
 from importlib import metadata, resources
 
-NUMERICS_VERSION = 22
+NUMERICS_VERSION = 23
 """Version of the numbers that the model computes: kept results of another one are not reused.
 
 Increase it with every change of figures beyond rounding, then record the new figures by

@@ -10,7 +10,7 @@ import platform
 import re
 import sys
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, entry_points, requires, version
@@ -226,5 +226,13 @@ def _fields_of(record: Record) -> set[str]:
 def _keys_of_files() -> frozenset[str]:
     """Every key of the files and of the status at any depth, and of URLs."""
     _, schema = models_json_schema([(each, "validation") for each in _OF_FILES])
-    known = (each.get("properties", ()) for each in schema["$defs"].values())
-    return frozenset(_OTHERS).union(*known)
+    return frozenset(_OTHERS).union(_properties(schema))
+
+
+def _properties(schema: dict[str, Any] | list[Any]) -> Iterator[str]:
+    """Names of properties at any depth of a schema: one of several kinds has its own inside."""
+    if isinstance(schema, dict):
+        yield from schema.get("properties", ())
+    for each in schema.values() if isinstance(schema, dict) else schema:
+        if isinstance(each, dict | list):
+            yield from _properties(each)

@@ -70,10 +70,10 @@ def solved_once():
     """Free plates of the causes that are tried are those of one rig in all tests."""
     solved = {}
 
-    def solve(rig, points, frequencies):
+    def solve(rig, points, frequencies, masses=None):
         key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
         if key not in solved:
-            solved[key] = sensed_plate(rig, points, frequencies)
+            solved[key] = sensed_plate(rig, points, frequencies, masses=masses)
         return solved[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -22,7 +22,8 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.example_rig_path: {},
     era.rig: {
         "plate": SHEET, "eras": {"SW": SPRING}, "amplifiers": {"main": {"url": "sim://"}},
-        "masses": {}, "supports": {}, "mesh": "auto", "limits": {}, "uncertainty": era.Uncertainty(),
+        "masses": {}, "supports": {}, "mesh": "auto", "limits": {},
+        "uncertainty": era.Uncertainty(),
         "fingertip": era.Fingertip(), "threshold": "vibrotactile-probe",
         "promised_thresholds": ["pressing-fingertip"],
     },

@@ -284,23 +284,6 @@ class PlateOnEras:
                 to[row] = part
         return cls(plate, first, *found)
 
-    def with_places(self, shifts: FloatArray) -> "PlateOnEras":
-        """Let the ERAs' places be off, which counts as a further error of their stiffnesses.
-
-        shifts (n, 2, r): change of the shapes at the ERAs, by one standard deviation along x and y.
-        An error of a stiffness that changes the fields of all ERAs by as much, mean square over the
-        plate, of the modelled plate without fingers.
-        """
-        plate, n = self.plate, self.plate.era_count
-        deformed = np.eye(n) * plate.strokes[:, None] - self.moved[:, MODELLED, :n]
-        by_one = np.linalg.norm(self.by_force[:, MODELLED, :n], axis=2)
-        by_one = by_one * np.linalg.norm(deformed, axis=2)
-        changed = [_by_places(self, row, shifts) for row in range(len(by_one))]
-        by_stiffness = np.hypot(np.abs(plate.by_stiffness), changed / by_one)
-        by_stiffness = by_stiffness * np.exp(1j * np.angle(plate.by_stiffness))
-        found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
-        return replace(self, plate=found)
-
     @property
     def fields(self) -> Complex64Array:
         """Accelerations of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
@@ -321,21 +304,3 @@ def _eliminated(
     moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
-
-
-def _by_places(on: PlateOnEras, row: int, shifts: FloatArray) -> FloatArray:
-    """Size of the change of all ERAs' fields together as each is off, (n,) [m/s²].
-
-    At full stroke, accelerations of the coordinates, at a row of the frequencies, of the modelled
-    plate without fingers. An ERA acts with its force F at other shapes, phi + d, and is moved
-    otherwise: a force F d - phi Z d u.
-    """
-    plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
-    g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
-    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
-    tilted = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
-    acting = forces[:, None, :, None] * shifts[:, :, None]
-    acting = acting - tilted[..., None] * plate.shapes[:n, None, None]
-    free = (g * acting).reshape(2 * n * n, -1)
-    found = w2 * free - ((free @ plate.shapes.T) * Z) @ T
-    return np.asarray(np.linalg.norm(found.reshape(n, -1), axis=1))

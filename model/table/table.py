@@ -30,6 +30,7 @@ from model.ensemble.attached_plate import (
 )
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
+from model.ensemble.places import with_places
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.fingertip import (
@@ -361,12 +362,18 @@ class LocalizationTable:
             dispersion=self.modal_dispersion,
         )
 
-    @cached_property
+    @property
     def on_eras(self) -> PlateOnEras:
         """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
+        return self._with_places[0]
+
+    @cached_property
+    def _with_places(self) -> tuple[PlateOnEras, FloatArray]:
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         found = PlateOnEras.of(self.attached, *sorted(counts))
-        return found.with_places(self._shifts_of_eras) if self.uncertainty.place > 0 else found
+        if not self.uncertainty.place:
+            return found, np.zeros(found.plate.forces.shape)
+        return with_places(found, self._shifts_of_eras, self._gram)
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
@@ -380,8 +387,13 @@ class LocalizationTable:
     def error_power(self) -> Float32Array:
         """Mean square over the plate of the error of each ERA's field, (f, eras).
 
-        Of discretisation, and of what else the rig's uncertainty says of fields.
+        `field_error_power`, and what places that are off leave beside errors of stiffnesses.
         """
+        return np.asarray(self.field_error_power + self._with_places[1], dtype=np.float32)
+
+    @cached_property
+    def field_error_power(self) -> Float32Array:
+        """The same by discretisation, and by `field` of the rig's uncertainty."""
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
         found = error**2 * self._mean_square(self.on_eras.fields)
         return np.asarray(found, dtype=np.float32)

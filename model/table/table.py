@@ -59,6 +59,7 @@ from model.structure.attachments import (
     fingertip_loads,
     footprints_of,
 )
+from model.structure.exciter import Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
@@ -373,7 +374,8 @@ class LocalizationTable:
         found = PlateOnEras.of(self.attached, *sorted(counts))
         if not self.uncertainty.place:
             return found, np.zeros(found.plate.forces.shape)
-        return with_places(found, self._shifts_of_eras, self._gram)
+        by_field = [isinstance(each, Exciter) for each in self.eras]
+        return with_places(found, self._shifts_of_eras, self._gram, by_field)
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:

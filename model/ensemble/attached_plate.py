@@ -76,8 +76,14 @@ class Mounts:
 def mounts_of(
     eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
 ) -> Mounts:
-    """ERAs and masses at w (f,) [rad/s], wherever they are."""
-    by_stiffness = uncertainty.stiffness * np.array([era.by_stiffness(w) for era in eras]).T
+    """ERAs and masses at w (f,) [rad/s], wherever they are.
+
+    Errors of stiffnesses by half the difference of one standard deviation to both sides: an
+    exciter's suspension is resonant.
+    """
+    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
+    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
+    by_stiffness = (stiffer - softer) / 2
     by_damping = math.log(uncertainty.damping) * np.array([era.by_damping(w) for era in eras]).T
     strokes = np.array([era.base(w) for era in eras]).T
     each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes

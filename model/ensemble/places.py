@@ -25,10 +25,10 @@ def with_places(
 ) -> tuple[PlateOnEras, FloatArray]:
     """Let the sources' places be off: the plate with larger errors of their stiffnesses.
 
-    And mean square of the error of each source's field beside these [m/s²]², (f, n), at full stroke.
-    shifts (n, 2, r): change of the shapes at the sources, by one standard deviation along x and y;
-    gram (r, r): mean of the shapes' products over the plate; by_field (n,): whether couples count
-    as errors of fields. Of the modelled plate without fingers.
+    And mean square of the error of each source's field beside these [(m/s²)²], (f, n), at full
+    stroke. shifts (n, 2, r): change of the shapes at the sources, by one standard deviation along x
+    and y; gram (r, r): mean of the shapes' products where fingers rest; by_field (n,): whether
+    couples count as errors of fields. Of the modelled plate without fingers.
     """
     plate, n = on.plate, on.plate.era_count
     deformed = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]

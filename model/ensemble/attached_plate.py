@@ -76,8 +76,14 @@ class Mounts:
 def mounts_of(
     eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
 ) -> Mounts:
-    """ERAs and masses at w (f,) [rad/s], wherever they are."""
-    by_stiffness = uncertainty.stiffness * np.array([era.by_stiffness(w) for era in eras]).T
+    """ERAs and masses at w (f,) [rad/s], wherever they are.
+
+    Errors of stiffnesses by half the difference of one standard deviation to both sides: an
+    exciter's suspension is resonant.
+    """
+    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
+    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
+    by_stiffness = (stiffer - softer) / 2
     by_damping = math.log(uncertainty.damping) * np.array([era.by_damping(w) for era in eras]).T
     strokes = np.array([era.base(w) for era in eras]).T
     each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes
@@ -284,23 +290,6 @@ class PlateOnEras:
                 to[row] = part
         return cls(plate, first, *found)
 
-    def with_places(self, shifts: FloatArray) -> "PlateOnEras":
-        """Let the ERAs' places be off, which counts as a further error of their stiffnesses.
-
-        shifts (n, 2, r): change of the shapes at the ERAs, by one standard deviation along x and y.
-        An error of a stiffness that changes the fields of all ERAs by as much, mean square over the
-        plate, of the modelled plate without fingers.
-        """
-        plate, n = self.plate, self.plate.era_count
-        deformed = np.eye(n) * plate.strokes[:, None] - self.moved[:, MODELLED, :n]
-        by_one = np.linalg.norm(self.by_force[:, MODELLED, :n], axis=2)
-        by_one = by_one * np.linalg.norm(deformed, axis=2)
-        changed = [_by_places(self, row, shifts) for row in range(len(by_one))]
-        by_stiffness = np.hypot(np.abs(plate.by_stiffness), changed / by_one)
-        by_stiffness = by_stiffness * np.exp(1j * np.angle(plate.by_stiffness))
-        found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
-        return replace(self, plate=found)
-
     @property
     def fields(self) -> Complex64Array:
         """Accelerations of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
@@ -321,21 +310,3 @@ def _eliminated(
     moved = np.asarray(A @ (K[:, :, :n] * plate.forces[row]))
     by_force = np.asarray(w2 * (K.swapaxes(1, 2) @ modal), dtype=np.complex64)
     return by_force, np.asarray(-coupling / w2**2), moved
-
-
-def _by_places(on: PlateOnEras, row: int, shifts: FloatArray) -> FloatArray:
-    """Size of the change of all ERAs' fields together as each is off, (n,) [m/s²].
-
-    At full stroke, accelerations of the coordinates, at a row of the frequencies, of the modelled
-    plate without fingers. An ERA acts with its force F at other shapes, phi + d, and is moved
-    otherwise: a force F d - phi Z d u.
-    """
-    plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
-    g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]
-    forces = np.diag(plate.forces[row]) - Z[:n, None] * on.moved[row, MODELLED, :n]
-    tilted = Z[:n, None, None] * (shifts @ (on.fields[row] / w2).T)  # (n, 2, n)
-    acting = forces[:, None, :, None] * shifts[:, :, None]
-    acting = acting - tilted[..., None] * plate.shapes[:n, None, None]
-    free = (g * acting).reshape(2 * n * n, -1)
-    found = w2 * free - ((free @ plate.shapes.T) * Z) @ T
-    return np.asarray(np.linalg.norm(found.reshape(n, -1), axis=1))

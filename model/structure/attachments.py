@@ -122,9 +122,6 @@ class Source(Support, Protocol):
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
 
-    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of its stiffness [N/m]."""
-
     def by_damping(self, omega: FloatArray) -> ComplexArray:
         """Change of D with the logarithm of its damping [N/m]."""
 
@@ -250,10 +247,6 @@ class Era(MeasuredGains):
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
         return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
 
-    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of k_b, k_b [N/m]."""
-        return np.full(np.shape(omega), self.stiffness, dtype=complex)
-
     def by_damping(self, omega: FloatArray) -> ComplexArray:
         """Change of D with the logarithm of c, i omega c [N/m]."""
         return np.asarray(1j * omega * self.damping)
@@ -274,7 +267,7 @@ class Era(MeasuredGains):
     def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
         """Changes of D and of the force, which spring and damper pass on from the base."""
         w, base = np.asarray(omega), self.base(omega)
-        held = {"stiffness": self.by_stiffness(w), "damping": 1j * w}
+        held = {"stiffness": np.full(np.shape(w), self.stiffness, dtype=complex), "damping": 1j * w}
         bolt = np.asarray(-(w**2) + 0j), np.zeros(w.shape, dtype=complex)
         found = {kind: (np.asarray(own), np.asarray(own * base)) for kind, own in held.items()}
         return found | {"bolt_mass": bolt}

@@ -144,10 +144,6 @@ class Exciter(MeasuredGains):
             return np.zeros(w.shape, dtype=complex)
         return np.asarray(self._pull(w) / (w**2 * self.magnet_mass))
 
-    def by_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of k, T² k [N/m]."""
-        return np.asarray(self._share(np.asarray(omega)) ** 2 * self.stiffness)
-
     def by_damping(self, omega: FloatArray) -> ComplexArray:
         """Change of D with the logarithm of c, T² i omega c [N/m]."""
         w = np.asarray(omega)

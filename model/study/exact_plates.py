@@ -176,7 +176,7 @@ def _responses(
     at = table.attached, rows, bases[:, None]
     found = accelerations_on(table, discs, fingers, *at, plates)[:, :, 0]
     weights = np.abs(bases) / table.highest_drives[rows]
-    size = np.sqrt((table.error_power[rows] * weights**2).sum(axis=1))
+    size = np.sqrt((table.field_error_power[rows] * weights**2).sum(axis=1))
     deviation = np.repeat(plates.deviation, discs.shape[1], axis=1)
     return rows, (found + np.multiply.outer(deviation, size).swapaxes(1, 2)).transpose(1, 2, 0)
 

@@ -30,6 +30,7 @@ from model.ensemble.attached_plate import (
 )
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
+from model.ensemble.places import with_places
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
 from model.finger.fingertip import (
@@ -58,12 +59,16 @@ from model.structure.attachments import (
     fingertip_loads,
     footprints_of,
 )
+from model.structure.exciter import Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
+
+EDGE = 0.05
+"""Share of each side at its ends in which errors of exciters' fields do not count."""
 
 DEFAULT_FREQUENCIES = np.arange(40.0, 501.0, 10.0)
 """Drive frequencies [Hz] of a table by default, the paper's among them.
@@ -361,12 +366,19 @@ class LocalizationTable:
             dispersion=self.modal_dispersion,
         )
 
-    @cached_property
+    @property
     def on_eras(self) -> PlateOnEras:
         """The plate with its ERAs and masses eliminated, of all thicknesses that answers count."""
+        return self._with_places[0]
+
+    @cached_property
+    def _with_places(self) -> tuple[PlateOnEras, FloatArray]:
         counts = {JUDGING_DRAWS.thicknesses, PROMISED_DRAWS.thicknesses, PROMISED_DRAWS.bases}
         found = PlateOnEras.of(self.attached, *sorted(counts))
-        return found.with_places(self._shifts_of_eras) if self.uncertainty.place > 0 else found
+        if not self.uncertainty.place:
+            return found, np.zeros(found.plate.forces.shape)
+        by_field = [isinstance(each, Exciter) for each in self.eras]
+        return with_places(found, self._shifts_of_eras, self._gram_inside, by_field)
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
@@ -378,10 +390,16 @@ class LocalizationTable:
 
     @cached_property
     def error_power(self) -> Float32Array:
-        """Mean square over the plate of the error of each ERA's field, (f, eras).
+        """Mean square of the error of each ERA's field, (f, eras).
 
-        Of discretisation, and of what else the rig's uncertainty says of fields.
+        `field_error_power`, and of exciters what places that are off leave beside errors of
+        stiffnesses.
         """
+        return np.asarray(self.field_error_power + self._with_places[1], dtype=np.float32)
+
+    @cached_property
+    def field_error_power(self) -> Float32Array:
+        """The same over the plate by discretisation, and by `field` of the rig's uncertainty."""
         error = np.hypot(self.discretisation_error, self.uncertainty.field)[:, None]
         found = error**2 * self._mean_square(self.on_eras.fields)
         return np.asarray(found, dtype=np.float32)
@@ -411,6 +429,14 @@ class LocalizationTable:
     def _mean_square(self, fields: Complex64Array) -> FloatArray:
         """Mean square over the plate of fields in its coordinates (..., r), (...)."""
         return np.asarray(np.vecdot(fields, fields @ self._gram).real, dtype=float)
+
+    @property
+    def _gram_inside(self) -> Float32Array:
+        """Of the plate but its edges, which bend most, and where few fingers rest."""
+        points = self.raster.points
+        inside = (np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)
+        shapes = self.shapes[inside]
+        return np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
 
     @cached_property
     def _gram(self) -> Float32Array:

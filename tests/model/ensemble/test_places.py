@@ -1,16 +1,23 @@
-"""Places of ERAs that are off, as errors of their stiffnesses, by the direct solve."""
+"""Places that are off: of ERAs by the direct solve, of exciters by the plates they stand on."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from benchmarks.direct_plate import direct_acceleration
+from benchmarks.setting import random_contacts
+from model.answer.fingers import Placement
 from model.arrays import ComplexArray
 from model.fem.plate import assemble
+from model.rig.file import load_rig
 from model.rig.uncertainty import Uncertainty
+from model.study.exact_plates import draw_plates, felt_on
 from model.table.build import build_table
+from only import only
 from paper_table import smooth_rig
 
+WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 FREQUENCIES = np.array([60.0, 145.0, 260.0])
 PLACES = ((0.05, 0.04), (0.26, 0.06), (0.24, 0.19), (0.13, 0.12))
 STEP, STIFFER = 1e-4, 1e-3  # m, relative
@@ -44,3 +51,24 @@ def test_places_that_are_off_change_fields_as_much_as_stiffnesses_do() -> None:
         expected = np.hypot(0.01 * k, np.sqrt(by_place / by_spring))
         found = table.on_eras.plate.by_stiffness[:, number].real
         np.testing.assert_allclose(found, expected, rtol=0.03)
+
+
+def test_promises_of_exciters_whose_places_are_off_are_kept_on_nine_of_ten_plates() -> None:
+    """On 60 plates each, solved with exciters where they stand, 24 answers: 86 to 96 % of all.
+
+    Counted as errors of stiffnesses alone 54 % keep them.
+    """
+    known = replace(Uncertainty.none(), gain=0.01, place=0.001)
+    rig = replace(load_rig(WEEKEND), uncertainty=known)
+    table = build_table(rig, frequencies=np.arange(90.0, 301.0, 30.0), drive_mode="phased")
+    rng, kept = np.random.default_rng(3), []
+    for _ in range(24):
+        target, quiet = random_contacts(rng, 2, (0.4, 0.3), margin=0.02).tolist()
+        placed = Placement((tuple(target),), (tuple(quiet),))
+        layer, promise = only(table, placed, drive_mode="phased")
+        plates = draw_plates(rng, known, count=60, era_count=4, contact_count=2)
+        contrast = felt_on(table, placed, layer.excitation, plates).contrast
+        assert contrast is not None
+        assert promise.promised_contrast_db is not None
+        kept.append(20 * np.log10(contrast) >= promise.promised_contrast_db)
+    assert 0.86 <= np.mean(kept) <= 0.96

@@ -161,7 +161,7 @@ def impedance(
     if output is not None and "measured" in circuits:
         following = next_line(
             "era", "measure", FLAG, "--device", str(device), "--free", output, "-o",
-            output.with_stem("glued"), "--weight", "GRAMS",
+            output.with_stem("glued"), "--weight", "GRAMS", "--series", f"{series:g}",
         )  # fmt: skip
     rows = [
         f"{len(default_lines())} frequencies; wrote {output}" if output else None,
@@ -224,7 +224,8 @@ def _rows(
         if key in values:
             value, error = (factor * each for each in values[key])
             text = f"{key}: {value:.4g} {unit}".rstrip()
-            yield f"    {text:28s} # ± {HALF_WIDTH * error:.2g} {unit}".rstrip()
+            held = f"± {HALF_WIDTH * error:.2g} {unit}".rstrip() if error else "as given, exactly"
+            yield f"    {text:28s} # {held}"
         if key == "resonance":
             yield f"    resonance_is: {'mounted' if 'glued' in circuits else 'free'}"
 

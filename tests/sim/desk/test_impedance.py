@@ -57,7 +57,9 @@ TRUE = {
 }
 
 
-@pytest.mark.parametrize(("series_error", "input_error"), [(0.0, 0.0), (0.05, 0.01)])
+@pytest.mark.parametrize(
+    ("series_error", "input_error"), [(0.0, 0.0), (0.05, 0.01)], ids=["noise", "bounds"]
+)
 def test_parts_are_within_their_intervals_in_nine_of_ten_draws(
     series_error: float, input_error: float
 ) -> None:

@@ -1,7 +1,9 @@
 """`era measure --impedance`: what an exciter is, by its impedance and its weight."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -13,7 +15,7 @@ from model.commands.options import JsonOption, next_line, print_report
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from sim.desk.measuring.impedance import Circuit
+    from sim.desk.measuring.impedance import Bench, Circuit
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -53,9 +55,28 @@ def impedance(
     scale_error: Annotated[
         float, typer.Option(metavar="G", help="Standard error of the scale in grams.", min=0)
     ] = 0.1,
+    coil: Annotated[
+        float | None,
+        typer.Option(
+            "--coil-mass",
+            metavar="G",
+            help="Of one run alone: grams of the coil, by its sheet.",
+            min=0.01,
+        ),
+    ] = None,
+    base: Annotated[
+        float | None,
+        typer.Option(
+            metavar="GRAMS", help="Mass of what it is glued to; without it, heavy.", min=1
+        ),
+    ] = None,
     series: Annotated[
         float, typer.Option(metavar="OHM", help="Resistor in series with the exciter.", min=0.1)
     ] = 10.0,
+    series_error: Annotated[
+        float,
+        typer.Option(metavar="PERCENT", help="Tolerance of the resistor.", min=0, max=50),
+    ] = 5.0,
     inputs: Annotated[
         str,
         typer.Option(
@@ -63,6 +84,15 @@ def impedance(
             help="Inputs before the exciter and over the resistor; one number: it is moved.",
         ),
     ] = "1,2",
+    input_error: Annotated[
+        float,
+        typer.Option(
+            metavar="PERCENT",
+            help="Largest difference of the inputs' gains; none where one is moved.",
+            min=0,
+            max=50,
+        ),
+    ] = 1.0,
     level: Annotated[
         float, typer.Option(help="Largest sample of output 1, 1 is full scale.", max=1.0)
     ] = 0.1,
@@ -78,7 +108,7 @@ def impedance(
     holds nine of ten.
     """
     from model.files.replacing import check_ending, check_place
-    from sim.desk.measuring.impedance import exciter_values, fitted
+    from sim.desk.measuring.impedance import Bench, exciter_values, fitted
     from sim.desk.measuring.impedance_run import (
         default_lines,
         measured_impedance,
@@ -95,12 +125,21 @@ def impedance(
         raise InputError(f"{missing} is missing; a measurement needs both, files neither")
     if device is None and not read:
         raise InputError("--device is missing; measure, or give --free and --glued")
+    taken = _inputs(inputs)
+    bench = Bench(
+        _kilograms(weight),
+        _kilograms(coil),
+        math.inf if base is None else 1e-3 * base,
+        1e-3 * scale_error,
+        series,
+        1e-2 * series_error,
+        1e-2 * input_error * (len(taken) - 1),
+    )
     if device is not None and output is not None:
         check_place(output, example="free.csv")
         check_ending(output, ".csv", what="an impedance")
         if len(read) == 2:
             raise InputError("--free and --glued are both given; omit the one that is measured")
-        taken = _inputs(inputs)
         if level <= 0:
             raise InputError(f"--level must be above 0, got {level:g}")
         with closing(open_card(device, outputs=1, inputs=max(taken), limit=level)) as card:
@@ -112,24 +151,33 @@ def impedance(
         fitted(*found, what=device)  # what is no exciter is not written
         write_impedance(output, *found)
     circuits = {name: fitted(*each, what=names[name]) for name, each in read.items()}
-    values = exciter_values(
-        circuits.get("free", circuits.get("measured")),
-        circuits.get("glued"),
-        None if weight is None else 1e-3 * weight,
-        1e-3 * scale_error,
-    )
+    runs = circuits.get("free", circuits.get("measured")), circuits.get("glued")
+    values = exciter_values(*runs, bench)
+    by_light = {}
+    if "glued" in circuits and weight is not None and base is None:
+        lighter = exciter_values(*runs, replace(bench, base=1e-3 * _LIGHT))
+        by_light = {name: lighter[name][0] / values[name][0] - 1 for name in values}
     following = None
     if output is not None and "measured" in circuits:
         following = next_line(
             "era", "measure", FLAG, "--device", str(device), "--free", output, "-o",
-            output.with_stem("glued"), "--weight", "GRAMS",
+            output.with_stem("glued"), "--weight", "GRAMS", "--series", f"{series:g}",
         )  # fmt: skip
     rows = [
         f"{len(default_lines())} frequencies; wrote {output}" if output else None,
-        *_rows(circuits, values),
+        *_rows(circuits, values, bench),
+        *_warnings(circuits, values, by_light),
         following,
     ]
-    print_report(rows, _as_json(circuits, values, output), as_json=as_json)
+    answer = _as_json(circuits, values, output) | {"change_by_light_base": by_light}
+    print_report(rows, answer, as_json=as_json)
+
+
+_LIGHT = 300.0  # g, a base that is not heavy
+
+
+def _kilograms(grams: float | None) -> float | None:
+    return None if grams is None else 1e-3 * grams
 
 
 def _inputs(text: str) -> tuple[int, ...]:
@@ -154,9 +202,11 @@ _UNITS = {
 }
 """Keys of an exciter in a rig file, and the units in which they are printed."""
 
+_BY_BASE = ("resonance", "coil_mass", "stiffness", "force_factor")
+
 
 def _rows(
-    circuits: "Mapping[str, Circuit]", values: Mapping[str, tuple[float, float]]
+    circuits: "Mapping[str, Circuit]", values: Mapping[str, tuple[float, float]], bench: "Bench"
 ) -> Iterator[str]:
     from sim.desk.measuring.impedance import HALF_WIDTH
 
@@ -165,16 +215,38 @@ def _rows(
             f"{name}: resonance {each['resonance']:.4g} Hz, Q_ms {each['q']:.3g}, R "
             f"{each['resistance']:.4g} ohm; the circuit explains all but {100 * each.misfit:.2g} %"
         )
-    yield f"Q_es {values['q_es'][0]:.3g}; keys of an exciter, with what holds nine of ten:"
+    yield (
+        f"Q_es {values['q_es'][0]:.3g}; keys of an exciter, with what holds nine of ten, of a "
+        f"resistor within {100 * bench.series_error:g} % and inputs within "
+        f"{100 * bench.input_error:g} %:"
+    )
     for key, (factor, unit) in _UNITS.items():
         if key in values:
             value, error = (factor * each for each in values[key])
             text = f"{key}: {value:.4g} {unit}".rstrip()
-            yield f"    {text:28s} # ± {HALF_WIDTH * error:.2g} {unit}".rstrip()
+            held = f"± {HALF_WIDTH * error:.2g} {unit}".rstrip() if error else "as given, exactly"
+            yield f"    {text:28s} # {held}"
         if key == "resonance":
             yield f"    resonance_is: {'mounted' if 'glued' in circuits else 'free'}"
+
+
+def _warnings(
+    circuits: "Mapping[str, Circuit]",
+    values: Mapping[str, tuple[float, float]],
+    by_light: Mapping[str, float],
+) -> Iterator[str]:
     if "force_factor" not in values:
-        yield "force factor and masses need --glued and --weight"
+        yield "force factor and masses need --weight, and --glued or --coil-mass"
+        if "glued" not in circuits:
+            yield (
+                "resonance is that of coil and magnet, which both move; a rig's is lower, of the "
+                "coil alone: the root of the magnet's share in the weight"
+            )
+    if by_light:
+        changes = ", ".join(
+            f"{name} {100 * by_light[name]:+.2g} %" for name in _BY_BASE if name in by_light
+        )
+        yield f"taken as glued to something heavy; by --base {_LIGHT:g} grams: {changes}"
 
 
 def _as_json(

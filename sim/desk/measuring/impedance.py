@@ -4,17 +4,24 @@ A coil of resistance R_e and inductance L in a field Bl, on a suspension k, c, h
 
     Z = R_e + i w L + K sqrt(i w) + R_m / (1 + i Q (f / f_0 - f_0 / f)),    R_m = Bl² / c,
 
-K the semi-inductance of eddy currents. Hanging free, coil m and magnet M move against each other:
-w_f² = k (1 / m + 1 / M). Glued to something heavy the coil is held: w_g² = k / M. With the whole
-weight W = m + M therefore
+K the semi-inductance of eddy currents, and w_0² = k / u, u the reduced mass of what moves against
+each other: coil m and magnet M hanging free, m + B and M glued to a mass B. With the whole weight
+W = m + M and r = (f_g / f_f)² therefore
 
-    m = W (f_g / f_f)²,    k = M w_g²,    Bl² = R_m w_g M / Q,    Q_es = Q R_e / R_m.
+    m = r W / (1 + (1 - r) W / B),    k = u w_0²,    Bl² = R_m w_0 u / Q,    Q_es = Q R_e / R_m.
+
+A rig's resonance and Q are those of one mass m_0 on a held spring, the magnet where the coil was
+glued, otherwise the coil: f = f_0 sqrt(u / m_0), and Q sqrt(m_0 / u).
+
+A resistor that is s S in place of S, and a first input that has g times the gain of the second,
+make (Z / s + S) g - S of Z: another circuit of this kind, so that each fitted value tells the true.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from model.arrays import ComplexArray, FloatArray
@@ -41,6 +48,46 @@ _SAME = 0.1  # relative, of Bl² by either run
 
 Known = Mapping[str, tuple[float, float]]
 """Values with their standard errors."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is known beside the impedance.
+
+    weight, coil [kg]: of the whole exciter and of its coil, None if unknown; base [kg]: what it was
+    glued to; scale_error [kg]: standard error of weight and base; series [ohm]: the resistor;
+    series_error, input_error: bounds, relative, of the resistor's error and of the difference of
+    the inputs' gains, of which any value within is as likely (JCGM 100:2008, 4.3.7).
+    """
+
+    weight: float | None = None
+    coil: float | None = None
+    base: float = np.inf
+    scale_error: float = 0.0
+    series: float = 10.0
+    series_error: float = 0.0
+    input_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse masses that contradict each other."""
+        if self.weight is None and (self.coil is not None or np.isfinite(self.base)):
+            raise InputError("--weight is missing; --coil-mass and --base count by it")
+        if self.weight is not None and not (self.coil or 0.0) < self.weight:
+            raise InputError(
+                f"--coil-mass must be below --weight, {1e3 * self.weight:g} g, got "
+                f"{1e3 * (self.coil or 0.0):g} g"
+            )
+
+    @property
+    def values(self) -> FloatArray:
+        """Weight, inverse of the base, factor of the resistor, ratio of the inputs, (4,)."""
+        return np.array([self.weight or 1.0, 1 / self.base, 1.0, 1.0])
+
+    @property
+    def errors(self) -> FloatArray:
+        """Standard errors of these, (4,)."""
+        even = np.array([self.series_error, self.input_error]) / np.sqrt(3)
+        return np.array([self.scale_error, self.scale_error / self.base**2, *even])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,42 +192,51 @@ def _parts(values: ComplexArray) -> FloatArray:
 
 
 def exciter_values(
-    free: Circuit | None, glued: Circuit | None, weight: float | None, weight_error: float
+    free: Circuit | None, glued: Circuit | None, bench: Bench
 ) -> dict[str, tuple[float, float]]:
     """The values of a rig's exciter that follow, each with its standard error.
 
-    weight, weight_error [kg]: of the whole exciter, None if unknown. Raises InputError for runs
-    that are exchanged or not of one exciter.
+    Raises InputError for runs that are exchanged or not of one exciter.
     """
     circuit = glued or free
     if circuit is None:
         raise InputError("--free or --glued is missing; measure one of them, or give its file")
     runs = [each for each in (free, glued) if each is not None]
-    x = np.concatenate([*(each.values for each in runs), [weight or 1.0]])
-    covariance = np.zeros((len(x), len(x)))
-    for n, each in enumerate(runs):
-        covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] = each.covariance
-    covariance[-1, -1] = weight_error**2
+    if len(runs) == 2 and bench.coil is not None:
+        raise InputError("--coil-mass follows from --free and --glued; remove it, or one of them")
+    x = np.concatenate([*(each.values for each in runs), bench.values])
+    covariance = block_diag(*(each.covariance for each in runs), np.diag(bench.errors**2))
 
     def values(x: FloatArray) -> dict[str, float]:
         named = [dict(zip(NAMES, x[6 * n : 6 * n + 6], strict=True)) for n in range(len(runs))]
-        one, has_weight = named[-1], weight is not None
-        root = 1 / np.sqrt(4 * np.pi * INDUCTANCE_AT)
+        one, (weight, by_base, resistor, ratio) = named[-1], x[-4:]
+        coil = bench.coil or 0.0
+        if len(runs) == 2:
+            share = (one["resonance"] / named[0]["resonance"]) ** 2
+            coil = share * weight / (1 + (1 - share) * weight * by_base)
+        magnet = weight - coil
+        if glued is not None:
+            mass, over = magnet, (1 + weight * by_base) / (1 + coil * by_base)  # m_0, m_0 / u
+        else:
+            mass, over = coil, weight / magnet
+        resonance, q = one["resonance"] / np.sqrt(over), one["q"] * np.sqrt(over)
+        resistance = resistor * ((one["resistance"] + bench.series) / ratio - bench.series)
+        motional = one["motional_resistance"] * resistor / ratio
+        semi = one["semi_inductance"] / np.sqrt(4 * np.pi * INDUCTANCE_AT)
         found = {
-            "resonance": one["resonance"],
-            "q": one["q"],
-            "q_es": one["q"] * one["resistance"] / one["motional_resistance"],
-            "resistance": one["resistance"],
-            "inductance": one["inductance"] + one["semi_inductance"] * root,
+            "resonance": resonance,
+            "q": q,
+            "q_es": q * resistance / motional,
+            "resistance": resistance,
+            "inductance": (one["inductance"] + semi) * resistor / ratio,
         }
-        if glued is not None and has_weight:
-            coil = x[-1] * (one["resonance"] / named[0]["resonance"]) ** 2 if free else 0.0
-            omega, magnet = 2 * np.pi * one["resonance"], x[-1] - coil
-            found |= {"coil_mass": coil} if free else {}
+        if bench.weight is not None and mass > 0:
+            omega = 2 * np.pi * resonance
+            found |= {"coil_mass": coil} if coil else {}
             found |= {
                 "weight": magnet,
-                "stiffness": magnet * omega**2,
-                "force_factor": np.sqrt(one["motional_resistance"] * omega * magnet / one["q"]),
+                "stiffness": mass * omega**2,
+                "force_factor": np.sqrt(motional * omega * mass / q),
             }
         return found
 

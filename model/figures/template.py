@@ -216,9 +216,9 @@ def _draw_grain(
     across: tuple[float, float],
     along: tuple[float, float],
 ) -> None:
-    """An arrow along the grain in the middle of what a page shows of the board."""
-    x, y = sum(across) / 2, sum(along) / 2
+    """An arrow along the grain at the lower end of what a page shows of the board."""
     (dx, dy), half = direction, GRAIN / 2
+    x, y = sum(across) / 2, along[0] + CROSS + half * dy
     ends = (x - half * dx, y - half * dy), (x + half * dx, y + half * dy)
     arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
     axes.annotate("", ends[0], ends[1], arrowprops=arrow)

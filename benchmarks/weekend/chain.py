@@ -95,7 +95,7 @@ class BuiltBoard:
         points = np.array([[at.x, at.y] for at in places])
         found = np.concatenate(
             [
-                self.responses(point[None], frequencies, [PointLoad(*point, mass=at.mass)])
+                self.responses(point[None], frequencies, [PointLoad(at.x, at.y, mass=at.mass)])
                 for point, at in zip(points, places, strict=True)
             ],
             axis=2,

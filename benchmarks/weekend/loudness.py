@@ -11,12 +11,14 @@ parts and radiates from both sides, which takes from that.
 import argparse
 import math
 
+import numpy as np
+
 from benchmarks.page import write_parts
 from benchmarks.weekend.boards import ACRYLIC, BIRCH, LOWEST, MDF, PAGE, Board
 from model.finger.perception import detection_threshold
 
 AIR, DISTANCE, REFERENCE = 1.2, 1.0, 20e-6  # kg/m³, m, Pa
-LEVELS, FREQUENCIES = (20, 40), range(100, 251, 10)  # dB SL, Hz
+LEVELS, FREQUENCIES = (20, 40), np.arange(100.0, 251.0, 10.0)  # dB SL, Hz
 
 
 def sound_pressure_level(peak: float, area: float) -> float:
@@ -35,12 +37,9 @@ def table() -> str:
         rig = Board(name, plate, "foam", next(iter(LOWEST))).rig
         area, cells = rig.plate.length * rig.plate.width, []
         for level in LEVELS:
-            peaks = [
-                float(detection_threshold(f, rig.threshold)) * 10 ** (level / 20)
-                for f in FREQUENCIES
-            ]
-            loudest = sound_pressure_level(max(peaks), area)
-            cells.append(f"{min(peaks):.2g} to {max(peaks):.2g} m/s², {loudest:.0f} dB SPL")
+            peaks = detection_threshold(FREQUENCIES, rig.threshold) * 10 ** (level / 20)
+            loudest = sound_pressure_level(peaks.max(), area)
+            cells.append(f"{peaks.min():.2g} to {peaks.max():.2g} m/s², {loudest:.0f} dB SPL")
         size = f"{1000 * rig.plate.length:g} x {1000 * rig.plate.width:g} mm"
         rows.append(f"| {name} {size} | {' | '.join(cells)} |")
     return "\n".join(rows)

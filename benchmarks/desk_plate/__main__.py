@@ -42,6 +42,10 @@ def desk_plate(
     delay: Annotated[
         int, typer.Option(metavar="SAMPLES", help="Delay of the converters.", min=0, max=48_000)
     ] = 73,
+    y_cable: Annotated[
+        bool,
+        typer.Option("--y-cable", help="The loop-back is beside the last ERA, as in era measure."),
+    ] = False,
     mesh: Annotated[
         str | None, typer.Option(metavar="NXxNY", help="Mesh that the plate is solved on.")
     ] = None,
@@ -60,7 +64,8 @@ def desk_plate(
     """Be a plate that deviates from its rig. Print the device to play to; Ctrl-C ends.
 
     Its inputs take what a sound card would play to the ERAs, by their channels, and the loop-back
-    last; its outputs give what accelerometers would record. Everything is simulated.
+    last, which --y-cable leaves out; its outputs give what accelerometers would record. Everything
+    is simulated.
     """
     import gc
 
@@ -78,7 +83,9 @@ def desk_plate(
     client = JackClient(name, is_only=True)
     try:
         converters = Converters(delay=delay, noise=noise)
-        plate = DeskPlate(drawn, sensors, rate=client.rate, converters=converters, seed=seed)
+        plate = DeskPlate(
+            drawn, sensors, rate=client.rate, converters=converters, seed=seed, is_shared=y_cable
+        )
         if truth is not None:
             truth.write_text(json.dumps(drawn.as_json(), indent=1) + "\n", encoding="utf-8")
         running = JackPlate(client, plate)
@@ -87,7 +94,7 @@ def desk_plate(
         running.start()
         print(f"jack:{name}", flush=True)
         print(
-            f"desk-plate: simulated; {plate.outputs} inputs for ERAs and loop-back, "
+            f"desk-plate: simulated; {plate.outputs} inputs for what the card plays, "
             f"{plate.inputs} outputs, {client.rate} Hz, blocks of {client.block} frames",
             file=sys.stderr,
             flush=True,

@@ -11,6 +11,7 @@ from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.structure.attachments import FingertipLoad, fingertip_loads
+from sim.desk.measuring.desk import Desk
 from sim.sensors.sensor_file import WiredSensor, are_places
 
 _LOOPED = 0.9  # of what a cable from an output to an input brings back
@@ -19,8 +20,8 @@ _LOOPED = 0.9  # of what a cable from an output to an input brings back
 class DeskPlate:
     """A plate with accelerometers, a loop-back cable, and fingers on request.
 
-    Outputs of the card: as many as the highest channel of an ERA, and one more for the loop-back.
-    Inputs: those of the sensors, and the next for the loop-back. rate [Hz]. One sensor that is
+    Outputs and inputs of the card are those of a `Desk`; is_shared: the loop-back is a Y-cable
+    beside the last ERA. rate [Hz]. One sensor that is
     moved is at the first of its places, with its mass. `advance`, `set_fingers` and `move_sensor`
     may be called by different threads.
     """
@@ -33,18 +34,19 @@ class DeskPlate:
         rate: float,
         converters: Converters,
         seed: int,
+        is_shared: bool = False,
     ) -> None:
-        rig = truth.rig
         self._truth, self._rate = truth, rate
-        self._columns = [rig.wiring[era.name].number for era in rig.eras]
-        self.outputs = max(self._columns) + 2
+        desk = Desk(truth.rig, tuple(sensors), is_shared)
+        self._columns = [output - 1 for _, output in desk.eras]
+        self._looped, self.outputs = desk.sources[-1] - 1, desk.output
         self._model = DeskModel(truth, np.array([[sensor.x, sensor.y] for sensor in sensors]))
         self._sensors = tuple(sensors)
         self._fingers: tuple[FingertipLoad, ...] = ()
         self._place = 0 if are_places(sensors) else None
         self._channels = SensorChannels(
             sensors if self._place is None else sensors[:1],
-            loopback=max(sensor.input for sensor in sensors) + 1,
+            loopback=desk.input,
             converters=converters,
             rate=rate,
             seed=seed,
@@ -84,7 +86,7 @@ class DeskPlate:
             following.carry_on(self._plate, self._kept)
             self._plate = following
         accelerations = self._plate.advance(played[:, self._columns])
-        return self._channels.samples(accelerations, _LOOPED * played[:, self.outputs - 1])
+        return self._channels.samples(accelerations, _LOOPED * played[:, self._looped])
 
 
 BLOCK_MULTIPLE = SAMPLES

@@ -4,10 +4,11 @@
     python -m benchmarks.weekend.chain --measured examples/weekend/measured.uff
 
 Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives and board drawn
-within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. A sensor of 2 g reads
-its responses at twelve places, with noise; `era calibrate` fits the rig. Of a table of that rig and
-one of the board as it is, exactly known but for the loads of fingers, the same random touches are
-answered, and felt on the board in the steady state: contrast beyond 25 dB counts as 25. In memory,
+within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. The sensor of
+examples/weekend/places.csv reads its responses there, with noise; `era calibrate` fits the rig. Of
+a table of the rig as bought, of the one fitted, and of the board as it is, exactly known but for
+the loads of fingers, the same random touches are answered, and felt on the board in the steady
+state: contrast beyond 25 dB counts as 25. In memory,
 without a sound card. With --report, the page docs/how-to/a-plate-for-a-weekend.md has the table.
 """
 
@@ -40,20 +41,14 @@ from model.structure.attachments import PointLoad, fingertip_loads
 from model.structure.exciter import Exciter
 from model.table.build import build_table
 from sim.plant.imperfections import draw_imperfections
+from sim.sensors.sensor_file import read_sensors
 
+FOLDER = ROOT / "examples" / "weekend"
 FORCE_FACTOR, MAGNET, FEET = 0.1, 0.1, 0.3
 """Beside the rig's uncertainty, standard deviations of what that does not have, relative."""
-SENSOR_MASS, NOISE = 2e-3, 2e-3  # kg; of a sensor's root mean square, each part
+NOISE = 2e-3  # of a sensor's root mean square, each part
 COUNTED_DB = 25.0
 """Contrast beyond that is not noticed as more."""
-PLACES = np.array(
-    [
-        *([0.07, 0.15], [0.37, 0.08], [0.67, 0.18], [0.94, 0.12]),
-        *([0.14, 0.44], [0.42, 0.53], [0.62, 0.41], [0.91, 0.57]),
-        *([0.06, 0.91], [0.31, 0.80], [0.71, 0.86], [0.96, 0.93]),
-    ]
-)
-"""Of the sensor, as shares of the sides; on no line of symmetry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +91,12 @@ class BuiltBoard:
 
     def measured(self, frequencies: FloatArray, seed: int) -> Responses:
         """Responses by one sensor that is moved, with its noise."""
-        size = np.array([self.rig.plate.length, self.rig.plate.width])
-        points = PLACES * size
+        places = read_sensors(FOLDER / "places.csv", self.rig.plate, may_move=True)
+        points = np.array([[at.x, at.y] for at in places])
         found = np.concatenate(
             [
-                self.responses(at[None], frequencies, [PointLoad(at[0], at[1], mass=SENSOR_MASS)])
-                for at in points
+                self.responses(point[None], frequencies, [PointLoad(at.x, at.y, mass=at.mass)])
+                for point, at in zip(points, places, strict=True)
             ],
             axis=2,
         )
@@ -109,11 +104,11 @@ class BuiltBoard:
         rms = np.sqrt((np.abs(found) ** 2).mean(axis=(0, 1)))
         real, imaginary = np.random.default_rng([SEED, seed, 1]).standard_normal((2, *found.shape))
         return Responses(
-            tuple(f"P{n + 1}" for n in range(len(points))),
+            tuple(at.name for at in places),
             points,
             frequencies,
             found + NOISE * rms * (real + 1j * imaginary),
-            masses=np.full(len(points), SENSOR_MASS),
+            masses=np.array([at.mass for at in places]),
         )
 
     def contrast(self, answer: Any, factors: FloatArray) -> float:
@@ -136,9 +131,10 @@ class BuiltBoard:
 
 @dataclass(frozen=True)
 class Touch:
-    """A touch [dB]: promised after calibration, felt by that, and felt by exact knowledge."""
+    """A touch [dB]: promised as bought and calibrated, felt by that, and by exact knowledge."""
 
     quiet: int
+    bought: float
     promised: float
     felt: float
     exact: float
@@ -157,11 +153,12 @@ def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
     built, responses = measured(rig, seed)
     known = calibrate(rig, responses, check_consistency(rig, responses)).rig
     frequencies = np.arange(low, high + 1, 10.0)
-    table = build_table(known, frequencies=frequencies, drive_mode="phased")
     std = Uncertainty(0, 0, 0, 0, 1, rig.uncertainty.fingertip, 0, 0, 0, 0, 0)
-    exact = build_table(
-        replace(built.rig, uncertainty=std), frequencies=frequencies, drive_mode="phased"
-    )
+    exact = replace(built.rig, uncertainty=std)
+    tables = [
+        build_table(each, frequencies=frequencies, drive_mode="phased")
+        for each in (rig, known, exact)
+    ]
     rng = np.random.default_rng([SEED, seed, 2])
     size = (rig.plate.length, rig.plate.width)
     for number in range(2 * count):
@@ -169,17 +166,17 @@ def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
         target, *others = random_contacts(rng, 1 + quiet, size, margin=EDGE).tolist()
         factors = np.exp(rig.uncertainty.fingertip * rng.standard_normal(1 + quiet))
         answers = [
-            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL)
-            for each in (table, exact)
+            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL) for each in tables
         ]
-        felt, best = (built.contrast(each, factors) for each in answers)
-        promised = answers[0].fingers[0].promised_contrast_db
+        felt, best = (built.contrast(each, factors) for each in answers[1:])
+        bought, promised = (each.fingers[0].promised_contrast_db for each in answers[:2])
+        assert bought is not None
         assert promised is not None
-        yield Touch(quiet, promised, felt, best)
+        yield Touch(quiet, bought, promised, felt, best)
 
 
 def _rig() -> Rig:
-    return load_rig(ROOT / "examples" / "weekend" / "rig.yaml")
+    return load_rig(FOLDER / "rig.yaml")
 
 
 def outcome(board: int, touched: int) -> "Outcome":
@@ -204,15 +201,17 @@ def table(found: Sequence[Outcome]) -> str:
     """The figures as Markdown."""
     touches = [each for one in found for each in one.touches]
     rows = [
-        "| quiet | touches | promised / dB | felt / dB | board exactly known / dB | kept "
-        f"| lost of the first {COUNTED_DB:g} dB, mean |",
-        "|---|---|---|---|---|---|---|",
+        "| quiet | touches | promised as bought / dB | promised / dB | felt / dB "
+        f"| board exactly known / dB | kept | lost of the first {COUNTED_DB:g} dB, mean |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name in ("1", "2", "all"):
         some = [each for each in touches if name in ("all", str(each.quiet))]
-        promised, felt, exact = np.transpose([(t.promised, t.felt, t.exact) for t in some])
+        bought, promised, felt, exact = np.transpose(
+            [(t.bought, t.promised, t.felt, t.exact) for t in some]
+        )
         lost = np.minimum(exact, COUNTED_DB) - np.minimum(felt, COUNTED_DB)
-        medians = " | ".join(f"{np.median(each):.1f}" for each in (promised, felt, exact))
+        medians = " | ".join(f"{np.median(each):.1f}" for each in (bought, promised, felt, exact))
         rows.append(
             f"| {name} | {len(some)} | {medians} | {100 * (felt >= promised).mean():.0f} % "
             f"| {lost.mean():.1f} dB |"

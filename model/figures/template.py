@@ -3,7 +3,7 @@
 Lengths are millimetres. A template of the underside is mirrored left to right, its letters are not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
 from math import ceil
@@ -21,12 +21,14 @@ from model.files.array_file import whole_or_nothing
 from model.rig.rig import Rig
 
 MM_PER_INCH = 25.4
-BORDER, STRIP = 12.0, 18.0
+BORDER, STRIP = 12.0, 22.0
 """Paper around the board [mm], and below it, with a ruler."""
 RULER = 100  # mm
 A4 = 210.0, 297.0  # mm
 NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
 CROSS = 6.0  # mm; half of it
+LETTER, LINE = 1.6, 3.2  # mm, of labels
+GRAIN = 40.0  # mm; length of the arrow
 
 Box = tuple[float, float, float, float]
 """Least and greatest x, least and greatest y [mm]."""
@@ -53,6 +55,27 @@ class Template:
         """The board with its border."""
         length, width = self.board
         return -BORDER, max(length, RULER) + BORDER, -BORDER, width + BORDER
+
+    @property
+    def grain(self) -> tuple[float, float] | None:
+        """Its direction, of a board that has one."""
+        if self.rig.plate.material.orthotropy is None:
+            return None
+        data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
+        return (0.0, 1.0) if data.get("plate", {}).get("grain") == "width" else (1.0, 0.0)
+
+    @property
+    def title(self) -> str:
+        """What is seen."""
+        length, width = self.board
+        side = "below, for the underside" if self.is_below else "above, for the touched side"
+        return f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
+
+    def label(self, name: str, at: tuple[float, float]) -> list[str]:
+        """Lines beside a place: its name, of an actuator its output, and where it is."""
+        channel = self.rig.wiring.get(name)
+        output = f", output {channel.number + 1}" if channel else ""
+        return [f"{name}{output}", f"{at[0]:.1f}, {at[1]:.1f}"]
 
     def places(self) -> Iterator[tuple[str, tuple[float, float], float, str]]:
         """Yield name, place and radius [mm], and the style of the circle, of all that is glued."""
@@ -117,8 +140,9 @@ def _page(template: Template, box: Box, *, name: str, edge: float) -> Figure:
     strip = figure.add_axes((0, 0, 1, STRIP / height), xlim=(0, width), ylim=(0, STRIP))
     strip.set_axis_off()
     for tick in range(0, RULER + 1, 10):
-        strip.plot([BORDER + tick] * 2, [8, 13 if tick % 50 == 0 else 11], c="black", lw=0.5)
-    strip.plot([BORDER, BORDER + RULER], [8, 8], c="black", lw=0.5, gid="ruler")
+        strip.plot([BORDER + tick] * 2, [12, 17 if tick % 50 == 0 else 15], c="black", lw=0.5)
+    strip.plot([BORDER, BORDER + RULER], [12, 12], c="black", lw=0.5, gid="ruler")
+    strip.text(BORDER, 7, template.title, size=8)
     strip.text(BORDER, 3, f"{RULER} mm on paper, or print again at 100 %{name}", size=8)
     return figure
 
@@ -139,19 +163,63 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
             axes.plot(*ends, c="black", lw=0.4)
         if radius:
             axes.add_patch(Circle((x, y), radius, fill=False, lw=0.7, ls=style, gid=name))
-        # Beside the cross on the side of the board's middle.
-        is_right = (x < length / 2) != template.is_below
-        away = 6 + 0.75 * radius * 72 / MM_PER_INCH  # points, beyond the circle
-        to = (away if is_right else -away, away)
-        aligned = "left" if is_right else "right"
-        text = f"{name}\n{x:.1f}, {y:.1f}"
+        lines = template.label(name, (x, y))
+        (right, up), away = _beside((x, y), radius, lines, template, box)
         axes.annotate(
-            text, (x, y), to, textcoords="offset points", size=7, ha=aligned, annotation_clip=True
+            "\n".join(lines),
+            (x, y),
+            (right * away, up * away),
+            textcoords="offset points",
+            size=7,
+            ha="left" if right > 0 else "right",
+            va="bottom" if up > 0 else "top",
+            annotation_clip=True,
         )
-    side = "below, for the underside" if template.is_below else "above, for the touched side"
-    text = f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
-    axes.text(length / 2, -8, text, size=8, ha="center", clip_on=True)
+    if template.grain:
+        _draw_grain(
+            axes,
+            template.grain,
+            (max(low, 0), min(high, length)),
+            (max(bottom, 0), min(top, width)),
+        )
     axes.text(-5, -8, "0, 0", size=8, ha="center", clip_on=True)
     arrow: dict[str, Any] = {"arrowprops": {"arrowstyle": "<-", "lw": 0.5}, "annotation_clip": True}
     for name, start, end in (("x", (0, -4), (16, -4)), ("y", (-4, 0), (-4, 16))):
         axes.annotate(name, start, end, size=8, va="center", ha="center", **arrow)
+
+
+def _beside(
+    at: tuple[float, float], radius: float, lines: Sequence[str], template: Template, box: Box
+) -> tuple[tuple[int, int], float]:
+    """Where a label is: rightwards and upwards on paper, 1 or -1; its distance [points].
+
+    On the side of the board's middle, unless a frame is there.
+    """
+    (x, y), (low, high, bottom, top) = at, box
+    across = -1 if template.is_below else 1
+    wide, tall = LETTER * max(map(len, lines)), LINE * len(lines)
+    away = 2 + 0.75 * radius  # mm, beyond the circle
+    right = across if x < template.board[0] / 2 else -across
+    ways = [*product((right, -right), (1, -1))]
+    free = [
+        (to_right, up)
+        for to_right, up in ways
+        if low < x + across * to_right * (away + wide) < high
+        and bottom < y + up * (away + tall) < top
+    ]
+    return (free or ways)[0], away * 72 / MM_PER_INCH
+
+
+def _draw_grain(
+    axes: Axes,
+    direction: tuple[float, float],
+    across: tuple[float, float],
+    along: tuple[float, float],
+) -> None:
+    """An arrow along the grain at the lower end of what a page shows of the board."""
+    (dx, dy), half = direction, GRAIN / 2
+    x, y = sum(across) / 2, along[0] + CROSS + half * dy
+    ends = (x - half * dx, y - half * dy), (x + half * dx, y + half * dy)
+    arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
+    axes.annotate("", ends[0], ends[1], arrowprops=arrow)
+    axes.annotate("grain", (x, y), (3, 3), textcoords="offset points", size=8, color="0.6")

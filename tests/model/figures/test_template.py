@@ -1,6 +1,7 @@
 """Templates in real size: lengths on paper, mirrored for the underside, no fonts, pages of A4."""
 
 import re
+from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from controller.cli.main import run
+from model.figures.template import Template, _pages
 from model.rig.file import load_rig
 from rig_files import write_rig
 
@@ -68,3 +70,43 @@ def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path) ->
     pages = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
     assert [tuple(map(float, each)) for each in pages] == [pytest.approx(A4_POINTS, abs=0.1)] * 2
     assert len(load_rig(rig).eras) == 4
+
+
+def test_labels_keep_off_the_frames_of_pages(rig: Path) -> None:
+    """Of places 11 mm apart all over the board; SW, on channel 0, is labelled with output 1."""
+    places = product(np.arange(0.003, 0.3, 0.011), np.arange(0.003, 0.22, 0.011))
+    sensors = {f"P{n}": (float(x), float(y)) for n, (x, y) in enumerate(places)}
+    found = set()
+    for page in _pages(Template(load_rig(rig), sensors)):
+        page.canvas.draw()
+        axes = page.axes[0]
+        frame = axes.get_window_extent()
+        for label in axes.texts:
+            name, _, place = label.get_text().partition("\n")
+            if place and frame.contains(*axes.transData.transform(label.xy)):
+                letters = label.get_window_extent()
+                assert frame.contains(*letters.min), name
+                assert frame.contains(*letters.max), name
+                found.add(name)
+    assert found >= {*sensors, "SW, output 1"}
+
+
+def test_sensor_off_the_board_is_refused(rig: Path, tmp_path: Path, capsys) -> None:
+    """By its line, and with metres for the millimetres that were meant."""
+    sensors = tmp_path / "sensors.csv"
+    sensors.write_text("sensor,x_m,y_m\nP1,47,41\n", "utf-8")
+    output = tmp_path / "template.svg"
+    arguments = ["plate", "template", str(rig), "--sensors", str(sensors), "-o", str(output)]
+    assert run(arguments) == 2
+    assert re.search(r"sensors\.csv:2: sensor P1 .* 0\.047,0\.041", capsys.readouterr().err)
+    assert not output.exists()
+
+
+def test_grain_is_drawn_along_its_side(tmp_path: Path) -> None:
+    """Plywood with its grain along the width has an arrow along y; a board without grain none."""
+    shown = []
+    for material in ("aluminium", "plywood\n  grain: length", "plywood\n  grain: width"):
+        change = ("material: aluminium", f"material: {material}")
+        made = write_rig(tmp_path / "rig.yaml", change, mesh="auto")
+        shown.append(Template(load_rig(made), {}).grain)
+    assert shown == [None, (1.0, 0.0), (0.0, 1.0)]

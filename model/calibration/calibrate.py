@@ -22,6 +22,7 @@ from model.calibration.calibration_result import (
 from model.calibration.fit import CalibrationProblem, Fit, solve, start_at
 from model.calibration.fitted_rig import (
     gain_rows,
+    lacking_of,
     moved_eras,
     predicted_by,
     rig_of_fit,
@@ -252,7 +253,8 @@ def _report(
         )
     )
     held_out = hold_out(problem, fit, live)
-    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, gains)
+    lacking = lacking_of(fit, gains[:, :, None] * responses * scales)
+    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, lacking)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
         rig=replace(rig, eras=eras, uncertainty=uncertainty),

@@ -36,12 +36,16 @@ from model.calibration.variable_projection import (
     row_rms,
 )
 from model.identification.least_squares import Minimum
+from model.identification.parameters import FORM
 from model.identification.viscous_loss import viscous_difference
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _ROUNDS = 8
 _SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
+CLEAR = 3.0
+"""Standard errors of a place that an ERA is off."""
+
 _HOLD = 1e3  # by which a mean of scales is held
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
@@ -198,6 +202,21 @@ def solve(problem: CalibrationProblem, start: FitStart) -> Fit:
         if is_settled:
             break
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
+
+
+def without_form(problem: CalibrationProblem, fit: Fit) -> FloatArray:
+    """Parameters z (p,) of the plate without form errors that explains best what was measured.
+
+    ERAs stay where they clearly are. A rig cannot have form errors, which its field would lack;
+    what they are like of modulus and loss factor comes back, as a side is like another modulus.
+    """
+    space, z = problem.plate.model.space, fit.z.copy()
+    mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
+    form = space.of(*FORM, "mode_shifts") & ~mine
+    place = space.of("place") & (np.abs(z) <= CLEAR * fit.error)
+    z[form | place] = 0.0
+    part = replace(problem, searched=problem.searched & mine)
+    return _search(part, z, fit.used / fit.noise[:, :, None]).x
 
 
 def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:

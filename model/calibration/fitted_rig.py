@@ -10,16 +10,15 @@ from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOutSensors, MovedEra
-from model.calibration.fit import CalibrationProblem, Fit
+from model.calibration.fit import CLEAR, CalibrationProblem, Fit, without_form
 from model.calibration.sensed_plate import Parameter, sensed_plate
-from model.calibration.variable_projection import project_gains
+from model.calibration.variable_projection import project_gains, row_rms
 from model.identification.form_errors import MASS_CELLS
 from model.identification.parameters import KINDS
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Gain
 
-_CLEAR = 3.0  # standard errors of a place
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
 _HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard errors either side
 
@@ -31,8 +30,8 @@ _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # 
 
 
 def rig_of_fit(problem: CalibrationProblem, fit: Fit) -> Rig:
-    """Rig with fitted values, and ERAs at the places where they clearly are; gains unchanged."""
-    rig = problem.plate.rig_at(fit.z)
+    """Rig that explains the responses best, ERAs where they clearly are; gains unchanged."""
+    rig = problem.plate.rig_at(without_form(problem, fit))
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
@@ -47,7 +46,7 @@ def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
     sides = np.array([rig.plate.length, rig.plate.width])
     places, errors = (space.values(x, "place").reshape(-1, 2) for x in (fit.z, fit.error))
     for era, place, error in zip(rig.eras, places, errors, strict=True):
-        clear = np.abs(place) > _CLEAR * error
+        clear = np.abs(place) > CLEAR * error
         at = np.clip(np.array([era.x, era.y]) + np.where(clear, place, 0), 0, sides)
         if np.abs(at - [era.x, era.y]).max() > 0:
             found.append(
@@ -70,6 +69,15 @@ def predicted_by(
     weight = fit.used / fit.noise[:, :, None]
     gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
     return model, gains
+
+
+def lacking_of(fit: Fit, predicted: ComplexArray) -> FloatArray:
+    """What responses predicted by a rig (f, e, s) lack of a fit's, relative, (f, e)."""
+    squares = np.where(fit.used, np.abs(predicted - fit.predicted) ** 2, np.nan)
+    size = row_rms(fit.predicted, fit.used)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.nansum(squares, axis=2) / fit.used.sum(axis=2)
+    return np.asarray(np.sqrt(shares) / size)
 
 
 def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
@@ -107,17 +115,20 @@ def uncertainty_of(
     fit: Fit,
     parameters: Sequence[FittedParameter],
     held_out: HeldOutSensors | None,
-    gains: ComplexArray,
+    lacking: FloatArray,
 ) -> Uncertainty:
     """How well a calibrated rig is known, for its file.
 
     Without the error of the whole mass, by which all scales and which no pattern feels. Thickness
     stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness does. Gain
-    and phase are those of the rig's gains (f, e) against the fit's, whose form errors a rig cannot
-    express, and at least the median error at held-out sensors, which is that of the field. What is
-    not identified keeps the value of the rig before.
+    and phase are those of the fit's gains, with what its fields have that the rig's are lacking (f,
+    e), as it cannot express form errors, and at least the median error at held-out sensors, which
+    is that of the field. What is not identified keeps the value of the rig before.
     """
     errors = problem.plate.errors(fit.z, fit.error)
+    # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+    by_coils = [each for each in problem.plate.of_exciters if each.kind == "damping"]
+    told = [one for one in parameters if one.parameter not in by_coils]
     relative = {
         kind: [
             math.hypot(
@@ -127,28 +138,28 @@ def uncertainty_of(
                 else _MODEL_ERROR,
             )
             for one, error in zip(parameters, errors, strict=True)
-            if one.parameter.kind == kind and one.is_identified and one.value > 0
+            if one in told and one.parameter.kind == kind and one.is_identified and one.value > 0
         ]
         for kind in ("modulus", "loss_factor", "stiffness", "damping")
     }
     known = {
-        kind: len(values) == sum(one.parameter.kind == kind for one in parameters)
+        kind: len(values) == sum(one.parameter.kind == kind for one in told)
         for kind, values in relative.items()
     }
 
     def rms(kind: str) -> float:
-        return float(np.sqrt(np.mean(np.square(relative[kind]))))
+        return float(np.sqrt(np.mean(np.square(relative[kind] or [0.0]))))
 
     gain, phase_deg = before.gain, before.phase_deg
-    known_gains = np.isfinite(fit.phases_error) & np.isfinite(gains)
+    known_gains = np.isfinite(fit.phases_error) & np.isfinite(lacking)
     if known_gains.any(axis=0).all():
         # The median of |z| of complex errors with standard deviation 1 of each part is 1.18.
         field = 0.0 if held_out is None else held_out.median / math.sqrt(2 * math.log(2))
-        off = np.log(gains[known_gains] / fit.gains[known_gains])
+        off = lacking[known_gains] / math.sqrt(2)
         share = (fit.gains_error / np.abs(fit.gains))[known_gains]
-        gain = max(pooled_error(off.real, share), field, _LEAST)
+        gain = max(pooled_error(off, share), field, _LEAST)
         phase_deg = math.degrees(
-            max(pooled_error(off.imag, fit.phases_error[known_gains]), field, _LEAST)
+            max(pooled_error(off, fit.phases_error[known_gains]), field, _LEAST)
         )
     losses = (
         max(rms("loss_factor"), rms("damping"))

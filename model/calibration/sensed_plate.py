@@ -90,11 +90,15 @@ class SensedPlate:
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
-        """Which fitted values (n,) a prior holds, as a data sheet's coil and magnet of an exciter."""
+        """Which fitted values (n,) a prior holds: an exciter's coil and magnet, by its sheet."""
+        by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
+        return np.array([row in by_sheet for row in self.rows])
+
+    @cached_property
+    def of_exciters(self) -> tuple[Parameter, ...]:
+        """The fitted values of exciters."""
         exciters = {era.name for era in self.rig.eras if "force_factor" in era.fields}
-        return np.array(
-            [row.kind in ("bolt_mass", "magnet_mass") and row.era in exciters for row in self.rows]
-        )
+        return tuple(row for row in self.rows if row.era in exciters)
 
     @property
     def masses(self) -> FloatArray:

@@ -383,8 +383,8 @@ def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) ->
     coils = np.flatnonzero(weighs) + space.groups["bolt_mass"].start
     columns[:, coils] = _known(COIL_DEVIATES * bolt[weighs], -bolt[weighs], bolt[weighs])
     feet, bound = space.groups["supports"], KINDS["supports"].bound
-    if known := rig.uncertainty.supports:
-        columns[:, feet] = _known(np.full(len(rig.feet), known), -bound, bound)
+    stated = rig.uncertainty.supports
+    columns[:, feet] = _known(np.full(len(rig.feet), stated), -bound, bound) if stated else 0.0
     return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 
 

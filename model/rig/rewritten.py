@@ -37,7 +37,7 @@ def rewritten_text(
 ) -> str:
     """Return a rig file's text with the values of another rig of the same ERAs, after a comment.
 
-    Written are plate, ERAs, feet and uncertainty where they differ, and further masses after its own.
+    Written are plate, ERAs, feet and uncertainty where they differ, further masses after its own.
     mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
     InputError where the text, read as a rig, has other values.
     """

@@ -1,0 +1,123 @@
+"""How far the magnets of exciters move in time, and what keeps them within their excursion.
+
+An onset moves a magnet further than the settled vibration: the free vibration near its own
+resonance beats with the drive. A drive that rises or falls steadily, along whichever ramp, is a
+mean of drives that jump at different times; so it moves a magnet no further than the drive that
+jumps, with which shares of full level are counted. Shaped envelopes rise above their last
+amplitude: of their difference to a plain ramp as much is kept as magnets allow.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from model.arrays import ComplexArray, FloatArray
+from model.transients.base_motion import KNOT_STEP, rise
+from model.transients.knots import RISE, SAMPLES
+from model.transients.time_response import PlateInTime
+
+_STEP, _FOLLOWED = 0.0005, 0.25  # s; a beat is over by then, or slower than the magnets' decay
+_AFTER = 20  # steps after the last knot
+_KEPT = 16
+
+
+@dataclass(frozen=True, eq=False)
+class MagnetMotions:
+    """Motions of the m magnets that are limited, against their coils, by drives in full levels.
+
+    rows (m, 2 r): displacement of the coil in the magnet in each eigenvector; excursions (m,) [m].
+    """
+
+    plate: PlateInTime
+    rows: ComplexArray
+    excursions: FloatArray
+
+    @classmethod
+    def of(cls, plate: PlateInTime) -> "MagnetMotions":
+        """Those of a plate; none where no source is limited."""
+        limits = np.array([each.excursion for each in plate.eras])
+        some = np.isfinite(limits)
+        return cls(plate, plate.stretches[some] @ plate.displacement, limits[some])
+
+    def shares(self, frequencies: FloatArray) -> FloatArray:
+        """Share of full level (f,), 1 at most, with which all may jump at frequencies [Hz].
+
+        In those phases in which motions by all drives add. Without fingers.
+        """
+        found = np.ones(len(frequencies))
+        if not len(self.rows):
+            return found
+        times = np.arange(0, _FOLLOWED, _STEP)
+        decays = np.exp(np.outer(times, self.plate.eigenvalues))
+        for number, frequency in enumerate(frequencies.tolist()):
+            s = 2j * math.pi * frequency
+            by_mode, settled = self._settled(s)
+            free = np.exp(-s * times)[:, None] * (decays @ by_mode)
+            moved = np.abs(settled - free).reshape(len(times), -1, len(self.rows))
+            largest = np.maximum(moved.sum(axis=1).max(axis=0), self._summed(settled))
+            found[number] = min((self.excursions / largest).min(), 1.0)
+        return found
+
+    def within(self, frequency: float, knots: ComplexArray, *, full: float) -> ComplexArray:
+        """As much of a shape (n, eras) in full levels, first and last included, as magnets allow.
+
+        full: the share of full level that may jump. Each magnet may move by the part of its
+        excursion that the drives' steady amplitudes have of that share, so that those of several
+        contents may add.
+        """
+        if not len(self.rows):
+            return knots
+        first, last = knots[0], knots[-1]
+        part = max(np.abs(first).max(), np.abs(last).max()) / full
+        times = KNOT_STEP * np.arange(len(knots))
+        plain = first + rise(times, min(RISE, times[-1]))[:, None] * (last - first)
+        allowed = part * self.excursions
+        moved, least = (self.largest(frequency, each) for each in (knots, plain))
+        if (moved <= allowed).all():
+            return knots
+        spare = np.maximum(allowed - least, 0) / np.maximum(moved - least, 1e-30)
+        kept = float(np.where(moved > allowed, spare, 1.0).min())
+        return np.asarray(plain + kept * (knots - plain))
+
+    def largest(self, frequency: float, knots: ComplexArray) -> FloatArray:
+        """Largest motions (m,) [m] along an envelope (n, eras), steady at its first until time 0.
+
+        At a frequency [Hz], in whichever phase of it.
+        """
+        ramps, settled = self._ramps(frequency)
+        count = (len(knots) + _AFTER) * SAMPLES
+        moved = np.repeat((knots[0] @ settled)[None], count, axis=0)
+        slopes = np.diff(knots, axis=0, prepend=knots[:1], append=knots[-1:])
+        for number, change in enumerate(np.diff(slopes, axis=0)):
+            since = number * SAMPLES
+            moved[since:] += np.tensordot(ramps[: count - since], change, axes=(1, 0))
+        return np.asarray(np.abs(moved).max(axis=0))
+
+    def _ramps(self, frequency: float) -> tuple[ComplexArray, ComplexArray]:
+        """Motions by each at full level per step since time 0, (t, eras, m), and settled ones."""
+        return _ramps_of(self, frequency)
+
+    def _settled(self, s: complex) -> tuple[ComplexArray, ComplexArray]:
+        """Settled motions by each source, by eigenvector (2 r, eras m), and all in all."""
+        z = self.plate.following(np.array([s]))[0][0]
+        by_mode = z.T[:, :, None] * self.rows.T[:, None, :]
+        flat = by_mode.reshape(len(by_mode), -1)
+        return flat, flat.sum(axis=0)
+
+    def _summed(self, settled: ComplexArray) -> FloatArray:
+        return np.asarray(np.abs(settled).reshape(-1, len(self.rows)).sum(axis=0))
+
+
+@lru_cache(_KEPT)
+def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, ComplexArray]:
+    """As `MagnetMotions._ramps`, long enough for every onset."""
+    plate, s = magnets.plate, 2j * math.pi * frequency
+    steady, slope = (each[0] for each in plate.following(np.array([s])))
+    a0, a1 = slope / KNOT_STEP, steady / KNOT_STEP
+    times = KNOT_STEP / SAMPLES * np.arange(64 * SAMPLES)
+    decay = np.exp(np.outer(times, plate.eigenvalues - s))
+    free = np.stack([(decay * row) @ magnets.rows.T for row in a0], axis=1)
+    ramps = a0 @ magnets.rows.T + times[:, None, None] * (a1 @ magnets.rows.T) - free
+    return np.asarray(ramps), np.asarray(steady @ magnets.rows.T)

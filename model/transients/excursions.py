@@ -14,13 +14,19 @@ from functools import lru_cache
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import reduce_free_plate
+from model.rig.exciter_checks import Excursions, exciters_of
+from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
-from model.transients.time_response import PlateInTime
+from model.transients.time_response import PlateInTime, plate_in_time
 
 _STEP, _FOLLOWED = 0.0005, 0.25  # s; a beat is over by then, or slower than the magnets' decay
 _AFTER = 20  # steps after the last knot
 _KEPT = 16
+_CHECKED = 1.0  # Hz between frequencies of a rig that are checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,23 +48,27 @@ class MagnetMotions:
         return cls(plate, plate.stretches[some] @ plate.displacement, limits[some])
 
     def shares(self, frequencies: FloatArray) -> FloatArray:
-        """Share of full level (f,), 1 at most, with which all may jump at frequencies [Hz].
-
-        In those phases in which motions by all drives add. Without fingers.
-        """
-        found = np.ones(len(frequencies))
+        """Share of full level (f,), 1 at most, with which all may jump at frequencies [Hz]."""
         if not len(self.rows):
-            return found
+            return np.ones(len(frequencies))
+        return np.minimum((self.excursions / self.by_jumps(frequencies)).min(axis=1), 1.0)
+
+    def by_jumps(self, frequencies: FloatArray) -> FloatArray:
+        """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].
+
+        Of all together, in those phases in which the motions by each add; without fingers.
+        """
         times = np.arange(0, _FOLLOWED, _STEP)
         decays = np.exp(np.outer(times, self.plate.eigenvalues))
-        for number, frequency in enumerate(frequencies.tolist()):
+        found = []
+        for frequency in frequencies.tolist():
             s = 2j * math.pi * frequency
             by_mode, settled = self._settled(s)
             free = np.exp(-s * times)[:, None] * (decays @ by_mode)
             moved = np.abs(settled - free).reshape(len(times), -1, len(self.rows))
-            largest = np.maximum(moved.sum(axis=1).max(axis=0), self._summed(settled))
-            found[number] = min((self.excursions / largest).min(), 1.0)
-        return found
+            steady = np.abs(settled).reshape(-1, len(self.rows)).sum(axis=0)
+            found.append(np.maximum(moved.sum(axis=1).max(axis=0), steady))
+        return np.array(found)
 
     def within(self, frequency: float, knots: ComplexArray, *, full: float) -> ComplexArray:
         """As much of a shape (n, eras) in full levels, first and last included, as magnets allow.
@@ -86,7 +96,7 @@ class MagnetMotions:
 
         At a frequency [Hz], in whichever phase of it.
         """
-        ramps, settled = self._ramps(frequency)
+        ramps, settled = _ramps_of(self, frequency)
         count = (len(knots) + _AFTER) * SAMPLES
         moved = np.repeat((knots[0] @ settled)[None], count, axis=0)
         slopes = np.diff(knots, axis=0, prepend=knots[:1], append=knots[-1:])
@@ -95,10 +105,6 @@ class MagnetMotions:
             moved[since:] += np.tensordot(ramps[: count - since], change, axes=(1, 0))
         return np.asarray(np.abs(moved).max(axis=0))
 
-    def _ramps(self, frequency: float) -> tuple[ComplexArray, ComplexArray]:
-        """Motions by each at full level per step since time 0, (t, eras, m), and settled ones."""
-        return _ramps_of(self, frequency)
-
     def _settled(self, s: complex) -> tuple[ComplexArray, ComplexArray]:
         """Settled motions by each source, by eigenvector (2 r, eras m), and all in all."""
         z = self.plate.following(np.array([s]))[0][0]
@@ -106,13 +112,13 @@ class MagnetMotions:
         flat = by_mode.reshape(len(by_mode), -1)
         return flat, flat.sum(axis=0)
 
-    def _summed(self, settled: ComplexArray) -> FloatArray:
-        return np.asarray(np.abs(settled).reshape(-1, len(self.rows)).sum(axis=0))
-
 
 @lru_cache(_KEPT)
 def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, ComplexArray]:
-    """As `MagnetMotions._ramps`, long enough for every onset."""
+    """Motions by each at full level per step since time 0, (t, eras, m), and settled ones.
+
+    Long enough for every onset.
+    """
     plate, s = magnets.plate, 2j * math.pi * frequency
     steady, slope = (each[0] for each in plate.following(np.array([s])))
     a0, a1 = slope / KNOT_STEP, steady / KNOT_STEP
@@ -121,3 +127,46 @@ def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, C
     free = np.stack([(decay * row) @ magnets.rows.T for row in a0], axis=1)
     ramps = a0 @ magnets.rows.T + times[:, None, None] * (a1 @ magnets.rows.T) - free
     return np.asarray(ramps), np.asarray(steady @ magnets.rows.T)
+
+
+def magnets_of(rig: Rig, free: FreePlate) -> MagnetMotions:
+    """Those of a rig; free: its plate."""
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
+    return MagnetMotions.of(plate_in_time(reduced, rig.eras, loads=rig.masses))
+
+
+def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> ComplexArray:
+    """Settled motion of each exciter's coil in its magnet by each actuator, (f, eras, m) [m].
+
+    At full level: T (w - y), of the plate's motion w and the base y that stands for the current
+    (`Exciter.base`). free: the rig's plate. Without fingers, under which it moves less.
+    """
+    exciters, omega = exciters_of(rig), 2 * np.pi * frequencies
+    places = np.array([[one.x, one.y] for one in exciters])
+    fields = free.acceleration(rig.eras, frequencies, places, loads=rig.masses)
+    moved = fields / -(omega**2)[:, None, None]
+    for number, one in enumerate(exciters):
+        moved[:, rig.eras.index(one), number] -= one.base(omega)
+        moved[:, :, number] = one.excursion_by(omega, moved[:, :, number])
+    return moved
+
+
+def excursions_of(rig: Rig) -> Excursions:
+    """The excursions within the rig's frequencies and by its level."""
+    limits, exciters = rig.limits, exciters_of(rig)
+    low, high = limits.frequency_min, limits.frequency_max
+    frequencies = np.append(np.arange(low, high, _CHECKED), high)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=high)
+    settled = np.abs(relative_motions(rig, free, frequencies[:1])).sum(axis=1)[0]
+    largest = np.zeros((len(frequencies), len(exciters)))
+    some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
+    if some:
+        largest[:, some] = limits.level * magnets_of(rig, free).by_jumps(frequencies)
+    passed = largest > [one.excursion for one in exciters]
+    rows = np.flatnonzero(passed.any(axis=1))
+    allowed = low
+    if len(rows):
+        allowed = float(frequencies[rows[-1] + 1]) if rows[-1] + 1 < len(passed) else math.inf
+    return Excursions(
+        limits.level * settled, largest.max(axis=0), passed.any(axis=0), allowed
+    )

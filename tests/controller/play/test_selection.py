@@ -33,7 +33,7 @@ class Table:
 
     plate = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
     frequencies = np.array([100.0])
-    strokes: Mapping[str, float] = MappingProxyType({"SW": 1e-4})
+    full_levels: Mapping[str, float] = MappingProxyType({"SW": 1e-4})
 
     def __init__(self) -> None:
         self.asked: list[list[Finger]] = []
@@ -41,6 +41,10 @@ class Table:
         self.refuse_below = 0.0
         self.most: float | None = None
         self.error: Exception | None = None
+
+    def excursion_of(self, excitations: Sequence[Excitation]) -> float:
+        """An ERA has no magnet."""
+        return 0.0
 
     def prepare(self, mode: str) -> None:
         """Do nothing."""

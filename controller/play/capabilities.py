@@ -7,7 +7,7 @@ amplifiers are open.
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -15,12 +15,14 @@ from controller.play.pieces import MAX_STEP
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
-from model.answer.answer import Limits
+from model.answer.answer import Limits, amplitudes_of
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
+from model.vibration.excitation import Excitation
 
 MAX_SET_TIME, MAX_PIECE_TIME = 0.010, 0.020
 """How long [s] a set may take on its wire, so that its onset does not delay a touch, and one that
@@ -62,15 +64,21 @@ class PlaybackCapabilities:
     layers: int = 1
     course_knots: int = 0
 
-    def left_by(self, taken: Mapping[str, float], strokes: Mapping[str, float]) -> Self:
-        """Return what amplitudes [m] leave of these and of the power, their peaks together."""
+    def left_by(self, excitations: Sequence[Excitation], table: LocalizationTable) -> Self:
+        """Return what excitations leave of the limits, their peaks together."""
+        taken, strokes = amplitudes_of(excitations), table.full_levels
         levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
-        left = {
-            name: max(highest - taken.get(name, 0.0), 1e-12)
-            for name, highest in (self.limits.amplitudes or strokes).items()
-        }
-        power = max(math.sqrt(self.limits.power) - math.hypot(*levels), 1e-9) ** 2
-        return replace(self, limits=replace(self.limits, amplitudes=left, power=power))
+        limits = self.limits
+        left = replace(
+            limits,
+            amplitudes={
+                name: max(highest - taken.get(name, 0.0), 1e-12)
+                for name, highest in (limits.amplitudes or strokes).items()
+            },
+            power=max(math.sqrt(limits.power) - math.hypot(*levels), 1e-9) ** 2,
+            excursion=max(limits.excursion - table.excursion_of(excitations), 1e-9),
+        )
+        return replace(self, limits=left)
 
 
 def playback_capabilities(

@@ -22,7 +22,7 @@ from controller.play.joint_answer import (
     selection_of,
 )
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import Answer, amplitudes_of
+from model.answer.answer import Answer
 from model.answer.search import APART_HZ
 from model.answer.strength import scaled
 from model.choice import NEARLY
@@ -132,8 +132,8 @@ class Chooser:
             if finger in free.target_keys and one not in pulses
         ]
         left = self._left_by([*pulses, *fading], capabilities)
-        total = amplitudes_of([each.layer.excitation for each in free.contents])
-        if left.limits.factor_within(total, self.table.full_levels) >= 1 - NEARLY:
+        total = [each.layer.excitation for each in free.contents]
+        if left.limits.factor_within(total, self.table) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
         if not limited.contents:
@@ -159,8 +159,8 @@ class Chooser:
         """Return what contents leave of the amplifiers' limits."""
         if not contents:
             return capabilities
-        taken = amplitudes_of([each.layer.excitation for each in contents])
-        return capabilities.left_by(taken, self.table.full_levels)
+        taken = [each.layer.excitation for each in contents]
+        return capabilities.left_by(taken, self.table)
 
     def _chosen(
         self,

@@ -17,7 +17,7 @@ from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Selection, Targets
 from controller.play.joint_answer import Shape, answered, selection_of
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.answer import SAME_LEVEL, Answer, amplitudes_of
+from model.answer.answer import SAME_LEVEL, Answer
 from model.answer.plan import worst_of
 from model.answer.promised import with_tones
 from model.answer.search import APART_HZ
@@ -134,8 +134,8 @@ class Crossfades:
             for each in playing.values()
         ):
             return False
-        total = amplitudes_of([one.layer.excitation for one in (*beside, *voices)])
-        return self.capabilities.limits.factor_within(total, self.table.full_levels) >= 1 - NEARLY
+        total = [one.layer.excitation for one in (*beside, *voices)]
+        return self.capabilities.limits.factor_within(total, self.table) >= 1 - NEARLY
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
         """The answer with the tones of contents that are felt together, and what these promise."""

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,6 +17,7 @@ from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
 from model.finger.perception import decibels
 from model.structure.attachments import Source
+from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes
 from model.vibration.excitation import Excitation
 
@@ -140,22 +141,25 @@ class Limits:
     """Limits of the amplifiers.
 
     frequencies: lowest and highest [Hz]; amplitudes: largest ones [m], by ERA, None for the
-    strokes; power: sum of squared levels of all ERAs; slew [1/s]: highest rise of one.
+    strokes; power: sum of squared levels of all ERAs; slew [1/s]: highest rise of one; excursion:
+    part of the magnets' that may be used.
     """
 
     frequencies: tuple[float, float] = ANY_BAND
     amplitudes: Mapping[str, float] | None = None
     power: float = math.inf
     slew: float = math.inf
+    excursion: float = 1.0
 
-    def factor_within(self, total: Mapping[str, float], strokes: Mapping[str, float]) -> float:
-        """Return the factor, 1 at most, by which amplitudes [m] are within; strokes [m]: by ERA."""
-        share, power = 1.0, 0.0
+    def factor_within(self, excitations: Sequence[Excitation], table: LocalizationTable) -> float:
+        """Return the factor, 1 at most, by which excitations of a table are within together."""
+        share, power = table.excursion_of(excitations) / self.excursion, 0.0
+        strokes = table.full_levels
         highest = self.amplitudes or strokes
-        for name, amplitude in total.items():
+        for name, amplitude in amplitudes_of(excitations).items():
             share = max(share, amplitude / highest[name])
             power += (amplitude / strokes[name]) ** 2
-        return 1.0 / max(share, math.sqrt(power / self.power))
+        return 1.0 / max(1.0, share, math.sqrt(power / self.power))
 
 
 NO_LIMITS = Limits()
@@ -314,10 +318,14 @@ class Answer:
         )
 
     @property
+    def excitations(self) -> list[Excitation]:
+        """All that plays together."""
+        return [each for layer in self.layers for each in layer.excitations]
+
+    @property
     def amplitudes(self) -> dict[str, float]:
         """Amplitude of each ERA [m], of all that plays together."""
-        every = [each for layer in self.layers for each in (layer.excitation, *layer.side_bands)]
-        return amplitudes_of(every)
+        return amplitudes_of(self.excitations)
 
     @property
     def promised_worst_db(self) -> float | None:

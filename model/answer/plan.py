@@ -206,15 +206,14 @@ class _Answering:
 
         Where a finger would not be served any more, by the rule again at the lower levels.
         """
-        strokes = self.table.full_levels
         for stream in found.contents.streams:
             if stream.duration is not None:
                 found = as_ramps_allow(self.table, found, self.limits)
                 break
-        if (factor := self.limits.factor_within(found.amplitudes, strokes)) >= 1 - NEARLY:
+        if (factor := self.limits.factor_within(found.excitations, self.table)) >= 1 - NEARLY:
             return found
         if len(found.contents.streams) > 1:
-            gains = gains_within(found, self.limits, strokes)
+            gains = gains_within(self.table, found, self.limits)
             lowered = with_gains(self.table, found, gains)
             if not is_served(lowered, found):
                 lowered = replace(self, fingers=_softer(found, gains.tolist())).solve(
@@ -222,7 +221,7 @@ class _Answering:
                 )
                 lowered = replace(lowered, asked=self.fingers)
             found = lowered
-            factor = self.limits.factor_within(found.amplitudes, strokes)
+            factor = self.limits.factor_within(found.excitations, self.table)
         return scaled(found, float(decibels(factor))) if factor < 1 else found
 
     @cached_property

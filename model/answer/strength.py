@@ -65,12 +65,13 @@ def with_gains(table: LocalizationTable, found: Answer, gains_db: FloatArray) ->
     return with_tones(table, found, *every)
 
 
-def gains_within(found: Answer, limits: Limits, strokes: Mapping[str, float]) -> FloatArray:
+def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> FloatArray:
     """Gains [dB] on the layers of an answer by which they are within the amplifiers' limits.
 
     As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
     Power counts in shares of what all together would have.
     """
+    strokes = table.full_levels
     each_layer = [amplitudes_of(layer.excitations) for layer in found.layers]
     amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
     levels = amplitudes / [*strokes.values()]
@@ -78,7 +79,10 @@ def gains_within(found: Answer, limits: Limits, strokes: Mapping[str, float]) ->
     power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
     highest = limits.amplitudes or strokes
     full = amplitudes / [highest[name] for name in strokes]
-    limited = np.column_stack([full, power / math.sqrt(limits.power)])
+    ways = np.array([table.excursion_of(layer.excitations) for layer in found.layers])
+    limited = np.column_stack(
+        [full, power / math.sqrt(limits.power), ways / limits.excursion]
+    )
     streams = found.contents.streams
     promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])
     factors, _ = share_stroke(

@@ -301,8 +301,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     rig = load_rig(rig_file)
     summary = plate_summary(rig)
     if summary["exciters"]:
-        from model.vibration.excursion import excursions_of
-        from model.vibration.reach import reach_of
+        from model.transients.excursions import excursions_of
+        from model.transients.reach import reach_of
 
         summary["reach"] = reach_of(rig).as_json()
         moved = excursions_of(rig)

@@ -197,24 +197,6 @@ def attach(
     )
 
 
-def allowed_shares(plate: AttachedPlate, sources: Sequence[Source]) -> FloatArray:
-    """Share of full level (f,) at which all sources together stay within their excursion.
-
-    plate: at full level, without fingers, and as modelled. In those phases in which the motions of
-    one by all drives add.
-    """
-    found = np.ones(len(plate.omega))
-    limited = [number for number, each in enumerate(sources) if math.isfinite(each.excursion)]
-    if limited:
-        moved = PlateOnEras.of(plate).moved[:, MODELLED]
-        for number in limited:
-            relative = moved[:, number].astype(complex)
-            relative[:, number] -= plate.strokes[:, number]
-            by_each = np.abs(sources[number].excursion_by(plate.omega, relative))
-            found = np.minimum(found, sources[number].excursion / by_each.sum(axis=1))
-    return found
-
-
 def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:
     """A plate at twice the frequencies, whose sources are driven by the gains of once these."""
     gains, own = (

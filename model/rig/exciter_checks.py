@@ -1,6 +1,7 @@
 """What the exciters of a rig can follow: from which frequency on, and what its file may mean."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pkgutil import resolve_name
 
@@ -8,13 +9,16 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.config.document import Document
-from model.rig.exciter_section import ExciterSection, misread_resonance
+from model.rig.exciter_section import ExciterSection, misread_resonance, rated_power
 from model.rig.rig import Rig
 from model.structure.exciter import Exciter
 
-_EXCURSIONS = "model.vibration.excursion:excursions_of"
+_EXCURSIONS = "model.transients.excursions:excursions_of"
 """By name: it solves plates, which the packages above this one do."""
 
+_GRAVITY = 9.81  # m/s²
+_NEARLY = 1.001
+_LAG = 0.01  # (omega L / R)² from which time and frequency differ visibly
 _ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
 
 
@@ -22,8 +26,8 @@ _ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
 class Excursions:
     """Excursions [m] of each exciter at the rig's level, (n,).
 
-    at_lowest, largest: at its lowest frequency, and within all that it allows; passed (n,): whether
-    they are more than they may be; allowed: the lowest frequency [Hz] from which all stay within up
+    at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
+    those that are limited; passed (n,): whether these are more than they may be; allowed: the lowest frequency [Hz] from which all stay within up
     to the highest, infinite where they do not there.
     """
 
@@ -81,4 +85,38 @@ def exciter_notes(document: Document, rig: Rig) -> list[str]:
         section = ExciterSection.model_validate(document.value(("eras", one.name)))
         if said := misread_resonance(section):
             notes.append(f"eras.{one.name}.resonance_is: {said}")
+        notes += [f"eras.{one.name}.{said}" for said in _hazards(one, section, rig)]
     return notes
+
+
+def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
+    """What may harm an exciter, and what the model then misses, by key."""
+    volts = rig.limits.level * one.largest_gain * one.voltage
+    heat, rated = one.heat_by(volts), rated_power(section)
+    if heat > _NEARLY * rated:
+        yield (
+            f"gains: of up to {one.largest_gain:.3g} put {heat:.3g} W into the coil at full level, "
+            f"which bears {rated:.3g} W; lower power, or limits.level"
+        )
+    if section.clip is not None and volts > _NEARLY * section.clip:
+        yield (
+            f"gains: of up to {one.largest_gain:.3g} ask for {volts:.3g} V at full level, and the "
+            f"amplifier clips at {section.clip:.3g} V; lower power, or limits.level"
+        )
+    if not math.isfinite(one.excursion):
+        yield "excursion: missing, so that nothing limits how far its magnet moves; add it"
+    sag = 0.0 if one.held else _GRAVITY * one.magnet_mass / one.stiffness
+    if math.isfinite(one.excursion) and sag > one.excursion:
+        yield (
+            f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet hangs "
+            f"{1e3 * sag:.2g} mm from its middle by its weight, of an excursion of "
+            f"{1e3 * one.excursion:.2g} mm; check resonance, resonance_is and weight, or hold it"
+        )
+    total, highest = one.resistance + one.source_resistance, rig.limits.frequency_max
+    lag = (2 * math.pi * highest * one.inductance / total) ** 2
+    if lag > _LAG:
+        yield (
+            f"inductance: (omega L / R)² is {lag:.2g} at {highest:g} Hz, by which onsets, "
+            "endings and courses are computed too strong or too weak; check it, or end "
+            f"limits.frequency at {math.floor(highest * math.sqrt(_LAG / lag))} Hz"
+        )

@@ -193,6 +193,12 @@ def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tu
             yield instead, "missing; add it, or a type that has it"
     if "resonance" in given and "resonance_is" not in given:
         yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
+    rated, power = of_type.get("power"), read("power")
+    if rated is not None and isinstance(power, float) and power > rated.value:
+        yield "power", (
+            f"must be at most {rated.value:g} W, which a {read('type')} bears, got {power:g} W; "
+            "lower it"
+        )
     if {"stiffness", "resonance_is"} <= given:
         yield "resonance_is", "is of a resonance, got it with stiffness; remove it"
 
@@ -213,6 +219,12 @@ def misread_resonance(section: ExciterSection) -> str | None:
         f"{1e3 * coil:.3g} g on a data sheet; with resonance_is: free the glued magnet resonates "
         f"at {f * math.sqrt(coil / weight):.0f} Hz"
     )
+
+
+def rated_power(section: ExciterSection) -> float:
+    """What the coil bears [W]: as its type says, or else the file."""
+    rated = _of_type(section.type).get("power")
+    return float(_values(section)["power"] if rated is None else rated.value)
 
 
 def _of_type(name: str | None) -> dict[str, SheetValue]:

@@ -19,7 +19,7 @@ def summary_of(one: Exciter) -> dict[str, Any]:
         "magnet_resonance_hz": one.magnet_frequency,
         "q": one.quality,
         "force_at_1_w_n": one.force_factor * math.sqrt(2 / one.resistance),
-        "full_level_v": one.voltage,
+        "full_level_v": one.voltage * one.largest_gain,
         "full_level_force_n": one.largest_force,
         "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
     }

@@ -102,9 +102,6 @@ class Source(Support, Protocol):
     def excursion(self) -> float:
         """Largest motion between its ends [m], infinite where nothing limits it."""
 
-    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
-        """Motion between its ends [m] by that of the plate less its base (f, ...) at omega (f,)."""
-
     def gain(self, frequencies: FloatArray) -> ComplexArray:
         """Complex gain of its drive at frequencies [Hz], of their shape."""
 
@@ -212,10 +209,6 @@ class Era(MeasuredGains):
     def excursion(self) -> float:
         """Infinite: the stroke limits its base alone."""
         return math.inf
-
-    def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
-        """How far its spring is stretched [m], by the plate's motion less the base's."""
-        return moved
 
     @property
     def support(self) -> "PointLoad":

@@ -26,7 +26,10 @@ import numpy as np
 
 from model.arguments import expect_values
 from model.arrays import ComplexArray, FloatArray
+from model.errors import InputError
 from model.structure.attachments import Factor, InTime, MeasuredGains, PointLoad
+
+_MOST_LAG = 0.1
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,13 @@ class Exciter(MeasuredGains):
             finite="x y",
         )
         self._tuples_of_gains()
+        lag, most = -self.in_time.inertance, _MOST_LAG * self.magnet_mass
+        if lag > most:
+            raise InputError(
+                f"inductance of exciter {self.name} must let the current follow its back EMF, "
+                f"Bl² L / R² at most {_MOST_LAG:g} of the magnet's mass, {1e3 * most:.3g} g, got "
+                f"{1e3 * lag:.3g} g; check inductance and force_factor"
+            )
 
     @property
     def full_level(self) -> float:
@@ -155,9 +165,19 @@ class Exciter(MeasuredGains):
         return math.sqrt(self.stiffness * self.magnet_mass) / self.in_time.damping
 
     @property
+    def largest_gain(self) -> float:
+        """The largest magnitude of its gain."""
+        return max((size for _, size, _ in self.gains), default=1.0)
+
+    @property
     def largest_force(self) -> float:
-        """Force Bl V / R [N] at full level well above the resonance of the magnet, without L."""
-        return self.in_time.by_drive * self.voltage
+        """Force Bl V / R [N] at full level and gain well above the magnet's resonance, without L."""
+        return self.in_time.by_drive * self.voltage * self.largest_gain
+
+    def heat_by(self, volts: float) -> float:
+        """Mean power [W] in the coil by an amplitude of the voltage [V], held still."""
+        total = self.resistance + self.source_resistance
+        return (volts / total) ** 2 * self.resistance / 2
 
     def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
         """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""

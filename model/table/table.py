@@ -7,7 +7,7 @@ that any fingertips can be queried in any drive mode.
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from ctypes import c_void_p
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +24,6 @@ from model.drive_modes.switched import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,
     PlateOnEras,
-    allowed_shares,
     at_harmonics,
     attach,
 )
@@ -63,6 +62,7 @@ from model.structure.exciter import Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
+from model.transients.excursions import MagnetMotions
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
@@ -345,7 +345,24 @@ class LocalizationTable:
     @cached_property
     def allowed_shares(self) -> FloatArray:
         """Share of full level that all actuators may play together in any phases, (f,)."""
-        return allowed_shares(self._attached(self.frequencies), self.eras)
+        return MagnetMotions.of(self.in_time).shares(self.frequencies)
+
+    def excursion_of(self, excitations: Iterable[Excitation]) -> float:
+        """Part of the magnets' excursion that is kept for excitations, whose parts add.
+
+        Of full level the share of each that is strongest in `allowed_shares`; 0 without a limit.
+        """
+        if not any(math.isfinite(era.excursion) for era in self.eras):
+            return 0.0
+        parts = dict[tuple[int, float], float]()
+        for number, each in enumerate(excitations):
+            for name, tone in each.items():
+                share = float(np.interp(tone.frequency, self.frequencies, self.allowed_shares))
+                part = tone.amplitude / self.full_levels[name] / share
+                parts[number, tone.frequency] = max(
+                    part, parts.get((number, tone.frequency), 0.0)
+                )
+        return sum(parts.values())
 
     @cached_property
     def highest_drives(self) -> FloatArray:

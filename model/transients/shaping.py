@@ -10,7 +10,8 @@ carrier's phase at that moment. Known quiet fingers are kept quiet during the en
 the plate takes other vibrations than the pattern's.
 
 Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the
-stroke (`model.transients.knots`).
+stroke (`model.transients.knots`), nor moves a magnet further than it may
+(`model.transients.excursions`).
 """
 
 import math
@@ -26,6 +27,7 @@ from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.grid import Grid
 from model.finger.perception import is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
+from model.transients.excursions import MagnetMotions
 from model.transients.knots import Carrier, FingerResponses, mean_square, solve_carrier
 from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import ENDING_WINDOW
@@ -65,6 +67,8 @@ class Shaper:
         self._gain_variance = gain_variance
         self._names = [era.name for era in plate.eras]
         self._strokes = np.array([era.full_level for era in plate.eras])
+        self._magnets = MagnetMotions.of(plate)
+        self._full = lru_cache(_KEPT)(self._full_share)
         self._residual_form = mean_square(plate, ENDING_WINDOW)
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
@@ -127,12 +131,18 @@ class Shaper:
         return envelopes
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
-        """From start and knots (n, active) in strokes."""
+        """From start and knots (n, active) in strokes, as far as magnets allow."""
+        every = np.zeros((len(knots), len(self._strokes)), dtype=complex)
+        every[:, active] = knots
+        knots = self._magnets.within(frequency, every, full=self._full(frequency))[:, active]
         by_era = zip(active.tolist(), (knots * self._strokes[active]).T.tolist(), strict=True)
         return {
             self._names[era]: BaseEnvelope(frequency, start, tuple(rest))
             for era, (start, *rest) in by_era
         }
+
+    def _full_share(self, frequency: float) -> float:
+        return float(self._magnets.shares(np.array([frequency]))[0])
 
     def _groups(
         self, excitation: Excitation, *, helped: bool

@@ -90,7 +90,7 @@ class PlateInTime:
     eigenvalues (2 r,) [1/s], in conjugate pairs; vectors (2 r, 2 r): displacement and velocity of
     the r coordinates, the reduced plate's and one for each free magnet and each phalanx, are
     vectors @ z; inverse: of the vectors; participation (2 r, eras); forced (2 r, r): z' by a force
-    on each coordinate.
+    on each coordinate; stretches (eras, r): displacement at each ERA less that of its free magnet.
     """
 
     reduced: ReducedPlate
@@ -100,6 +100,7 @@ class PlateInTime:
     inverse: ComplexArray
     participation: ComplexArray
     forced: ComplexArray
+    stretches: FloatArray
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
         """Shapes of all coordinates at points (p, 2) [m], (p, r)."""
@@ -285,7 +286,7 @@ def plate_in_time(
         )
     parts = [era.in_time for era in eras]
     pushed = stretches(parts, attachment_shapes[: len(eras)])
-    input_shapes = np.pad(pushed, ((0, 0), (0, r - pushed.shape[1]))).T
+    input_shapes = np.pad(pushed, ((0, 0), (0, r - pushed.shape[1])))
     forced: ComplexArray = inverse_vectors[:, r:] @ inverse
     return PlateInTime(
         reduced,
@@ -293,8 +294,9 @@ def plate_in_time(
         eigenvalues,
         vectors,
         inverse_vectors,
-        np.asarray(forced @ input_shapes, dtype=complex),
+        np.asarray(forced @ input_shapes.T, dtype=complex),
         forced,
+        input_shapes,
     )
 
 

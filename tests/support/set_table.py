@@ -47,7 +47,18 @@ def make_rig(amplifiers: Sequence[str], limits: GuardLimits, *, eras: int = 3) -
     )
 
 
-class SetTable:
+class SetDrives:
+    """Drives of ERAs of one stroke, which have no magnets."""
+
+    def __init__(self) -> None:
+        self.full_levels = defaultdict[str, float](lambda: STROKE)
+
+    def excursion_of(self, excitations: Sequence[Excitation]) -> float:
+        """None."""
+        return 0.0
+
+
+class SetTable(SetDrives):
     """A table with one answer, or an exception to raise; shared: the answer beside quiet fingers.
 
     prepared, asked: what was asked of it.
@@ -56,11 +67,11 @@ class SetTable:
     def __init__(
         self, excitation: Excitation | Exception, plate: Plate, shared: Excitation | None = None
     ) -> None:
+        super().__init__()
         self.excitation = excitation
         self.plate = plate
         self.eras: tuple[Era, ...] = ()  # whose clocks change nothing
         self.shared = shared
-        self.full_levels = defaultdict[str, float](lambda: STROKE)
         self.frequencies = np.array([90.0, 110.0, 150.0, 250.0])  # Hz
         self.prepared: list[str] = []
         self.asked: list[list[Finger]] = []
@@ -169,7 +180,8 @@ def set_answer(
         np.ones((1, 0)),
         np.ones(1, np.float32),
     )
-    factor = limits.factor_within(found.amplitudes, defaultdict[str, float](lambda: STROKE))
+    table: Any = SetDrives()
+    factor = limits.factor_within(found.excitations, table)
     return scaled(found, 20 * np.log10(factor)) if factor < 1 else found
 
 

@@ -42,6 +42,10 @@ class Table:
         self.most: float | None = None
         self.error: Exception | None = None
 
+    def excursion_of(self, excitations: Sequence[Excitation]) -> float:
+        """An ERA has no magnet."""
+        return 0.0
+
     def prepare(self, mode: str) -> None:
         """Do nothing."""
 

@@ -14,9 +14,8 @@ from model.arrays import FloatArray, lattice
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.exciter_checks import exciters_of
 from model.rig.rig import Rig
-from model.vibration.excursion import relative_motions
+from model.transients.excursions import magnets_of
 
 MARGIN = 0.02
 """Strip along the edges [m] that is left out."""
@@ -76,9 +75,7 @@ def reach_of(rig: Rig) -> Reach:
             for side, edge in margins
         )
     )
-    moved = np.abs(relative_motions(rig, free, frequencies)).sum(axis=1)
-    allowed = np.array([one.excursion for one in exciters_of(rig)])
-    level = np.minimum((allowed / moved).min(axis=1), limits.level)[:, None]
+    level = np.minimum(magnets_of(rig, free).shares(frequencies), limits.level)[:, None]
     threshold = detection_threshold(frequencies, rig.threshold)[:, None]
     found = []
     for few in np.array_split(places, math.ceil(len(places) / _AT_ONCE)):

@@ -9,7 +9,7 @@ import pytest
 from exciter_rig import exciter_rig
 from model.reduction.free_plate import solve_free_plate
 from model.structure.exciter import Exciter
-from model.vibration.excursion import excursions_of, relative_motions
+from model.transients.excursions import excursions_of, relative_motions
 
 
 def test_magnets_on_a_board_as_light_as_they_are() -> None:

@@ -198,12 +198,14 @@ def _errors_at(source: str, text: str) -> Iterator[None]:
         line = None if mark is None else mark.line + 1
         said = " ".join(part for part in (error.context, error.problem) if part)
         remedy = "" if line is None else _remedy(text, line)
+        if not remedy and "expected ','" in said:
+            line, remedy = _missing_comma(text, mark)
         problem = ConfigProblem(line, "", f"is not valid YAML: {said}{remedy}")
         raise ConfigError(source, [problem]) from error
 
 
 _BLANKS = re.compile(r"(?<!^)\ufeff|[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000]")
-_NO_KEY = re.compile(r"\s*[\w.-]+(:(?![\s/])|\N{FULLWIDTH COLON})")  # `key:value`, but no URL
+_NO_KEY = re.compile(r"\s*[\w.-]+(:(?![\s/]|$)|\N{FULLWIDTH COLON})")  # `key:value`, but no URL
 
 
 def _remedy(text: str, line: int) -> str:
@@ -225,6 +227,26 @@ def _remedy(text: str, line: int) -> str:
         if wrong.strip() and number < line:
             break
     return ""
+
+
+_COMMENT = re.compile(r"(^|\s)#.*")
+
+
+def _missing_comma(text: str, mark: Any) -> tuple[int, str]:
+    """Where a comma lacks in braces or brackets, its line and what to do; mark: of what follows.
+
+    At a colon that is the key before it, which was read as more of the value.
+    """
+    lines = [*text.splitlines()[: mark.line + 1], ""]
+    before, after = lines[mark.line][: mark.column], lines[mark.line][mark.column :]
+    lines[mark.line :] = [re.sub(r"\S+\s*$", "", before) if after.startswith(":") else before]
+    kept = [_COMMENT.sub("", each).rstrip() for each in lines]
+    number = max((n for n, each in enumerate(kept) if each), default=0)
+    words = kept[number].split() or [""]
+    return number + 1, (
+        f"; write a comma, or the bracket that closes, after {words[-1]} in column "
+        f"{len(kept[number])}"
+    )
 
 
 class _Refusal(Exception):

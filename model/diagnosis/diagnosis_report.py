@@ -1,5 +1,6 @@
 """Report of a diagnosis, as text and as JSON."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from model.choice import best_of
@@ -44,8 +45,11 @@ def verdict_rows(verdict: Verdict) -> list[str]:
                 f"one's ERA {confidence}: correct the plugs"
             )
     swapped = {era for cycle in verdict.swapped for era in cycle}
+    common = verdict.common_state
+    if common is not None:
+        rows.append(_common_row(verdict.channels, common))
     for channel in verdict.channels:
-        reported = {*channel.states} - {"well", "not driven"}
+        reported = {*channel.states} - {"well", "not driven", common}
         if channel.era in swapped:
             reported.discard("other ERA")
         rows += [_row(channel, state) for state in channel.states if state in reported]
@@ -284,6 +288,16 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
         case _:
             share = f"{channel.gain:.2f} of the commanded amplitude"
             return f"{state.upper()}: {wiring} plays {share}: {remedy}"
+
+
+def _common_row(channels: Sequence[ChannelVerdict], state: ChannelState) -> str:
+    """Line on what is too strong or too weak at nearly all channels, as a sensor makes it."""
+    found = {each.era: each.gain for each in channels if state in each.states and each.gain}
+    return (
+        f"{state.upper()}: the channels of {', '.join(found)} play {min(found.values()):.2f} to "
+        f"{max(found.values()):.2f} of the commanded amplitude: check the sensors' sensitivity "
+        "first, which makes all of them so together; then the amplifier's volume"
+    )
 
 
 def _wiring(channel: ChannelVerdict) -> str:

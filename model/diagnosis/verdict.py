@@ -49,6 +49,7 @@ _GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
 LOOSE = 0.7
 """Share of its own stiffness below which an exciter that explains a plate is loose."""
 
+_NEARLY_ALL = 0.75  # of the channels
 _LEAST_FREQUENCIES = 4
 _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
@@ -120,6 +121,17 @@ class Verdict:
     def wiring_matches(self) -> bool:
         """Whether every driven channel drives its ERA as the rig says."""
         return all(set(channel.states) <= {"well", "not driven"} for channel in self.channels)
+
+    @property
+    def common_state(self) -> ChannelState | None:
+        """Strong or weak where nearly all channels are, of which a sensor is the likelier cause."""
+        driven = [channel.states for channel in self.channels if channel.gain]
+        states: tuple[ChannelState, ...] = ("strong", "weak")
+        for state in states:
+            count = sum(state in each for each in driven)
+            if count > 1 and count >= _NEARLY_ALL * len(driven):
+                return state
+        return None
 
     @property
     def is_well(self) -> bool:

@@ -24,7 +24,8 @@ class ActuatorKind:
     section: its keys; make: an actuator of its name, its section, the plate and the number of
     actuators; problems: by key, of the keys given and the value of a key that is valid; keys: by
     field of the actuator that a fit changes; restated: those of them that depend on the rest of
-    the rig, and are always written; instead: keys that each replaces.
+    the rig, and are always written; instead: keys that each replaces; is_electrical: whether its
+    full level is a voltage, so that an amplifier which drives it is an output.
     """
 
     section: type[ActuatorSection]
@@ -33,6 +34,7 @@ class ActuatorKind:
     keys: Mapping[str, str]
     restated: tuple[str, ...]
     instead: Mapping[str, tuple[str, ...]]
+    is_electrical: bool = False
 
 
 _GAINS = {"gains": "gains"}
@@ -56,6 +58,7 @@ KINDS: Mapping[type[Actuator], ActuatorKind] = {
         | _GAINS,
         restated=("stiffness", "damping"),
         instead={"stiffness": ("resonance", "resonance_is"), "damping": ("q",)},
+        is_electrical=True,
     ),
 }
 """By class of the actuator."""

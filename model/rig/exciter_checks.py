@@ -68,24 +68,32 @@ def excursion_notes(rig: Rig) -> list[str]:
 
 
 def exciter_notes(document: Document, rig: Rig) -> list[str]:
-    """Warnings: magnets that move too far or resonate, and resonances that may be misread."""
-    low = rig.limits.frequency_min
-    free = [one for one in exciters_of(rig) if not one.held]
-    near = [one for one in free if low < _ABOVE * one.magnet_frequency]
-    notes = excursion_notes(rig)
-    if near:
-        highest = max(one.magnet_frequency for one in near)
-        notes.append(
-            f"limits.frequency: starts at {low:g} Hz, below {_ABOVE:g} times the resonance of the "
-            f"magnets of {', '.join(one.name for one in near)} at up to {highest:.1f} Hz, where "
-            "the field depends on suspension and weight as much as on the plate; start at "
-            f"{math.ceil(_ABOVE * highest)} Hz, or identify the rig"
-        )
+    """Warnings: resonances that may be misread, and magnets that move too far or resonate.
+
+    Of a resonance that may be misread it is not said from where on to play.
+    """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    misread: dict[str, list[str]] = {}
+    hazards: list[str] = []
     for one in exciters_of(rig):
         section = ExciterSection.model_validate(document.value(("eras", one.name)))
         if said := misread_resonance(section):
-            notes.append(f"eras.{one.name}.resonance_is: {said}")
-        notes += [f"eras.{one.name}.{said}" for said in _hazards(one, section, rig)]
+            misread.setdefault(said, []).append(one.name)
+        hazards += [f"eras.{one.name}.{each}" for each in _hazards(one, section, rig)]
+    notes = [f"resonance_is of {', '.join(names)}: {said}" for said, names in misread.items()]
+    notes += [*hazards, *excursion_notes(rig)]
+    doubted = {name for names in misread.values() for name in names}
+    free = [one for one in exciters_of(rig) if not one.held and one.name not in doubted]
+    near = [one for one in free if low < _ABOVE * one.magnet_frequency]
+    if near:
+        highest = max(one.magnet_frequency for one in near)
+        start = math.ceil(_ABOVE * highest)
+        advice = f"start at {start} Hz, or identify the rig" if start < high else "identify the rig"
+        notes.append(
+            f"limits.frequency: starts at {low:g} Hz, below {_ABOVE:g} times the resonance of the "
+            f"magnets of {', '.join(one.name for one in near)} at up to {highest:.1f} Hz, where "
+            f"the field depends on suspension and weight as much as on the plate; {advice}"
+        )
     return notes
 
 

@@ -179,7 +179,10 @@ def exciter_of(name: str, section: ExciterSection, plate: Plate, era_count: int)
 
 def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
     """What keys of an exciter require of each other: problems by key."""
-    of_type = _of_type(read("type"))
+    name = read("type")
+    # Of a type that is misspelt, nothing is known to be missing.
+    unknown = "type" in given and name is None
+    of_type = ExciterSection.model_fields.keys() if unknown else _of_type(name).keys()
     for key in ("amplifier", "channel"):
         if key not in given:
             yield key, "missing; add it: an exciter is driven, and supports nothing by itself"

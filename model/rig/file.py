@@ -60,6 +60,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         for name, era in section.eras.items()
         if era.amplifier is not None and era.channel is not None
     }
+    electrical = {era.amplifier for era in section.eras.values() if kind_of(era).is_electrical}
     supports = {name: era for name, era in everything.items() if name not in wiring}
     return Rig(
         plate=plate,
@@ -88,7 +89,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         outputs=frozenset(
             name
             for name, amplifier in section.amplifiers.items()
-            if amplifier.full_level == "output"
+            if (amplifier.full_level or ("motion", "output")[name in electrical]) == "output"
         ),
         clock_errors={
             name: math.inf if amplifier.clock_error == "unknown" else amplifier.clock_error

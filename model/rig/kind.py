@@ -53,7 +53,8 @@ def _check(document: Document) -> CheckedFile:
         raise ConfigError(document.source, problems)
     note = rig.uncertainty.note
     line, lost, more = clock_costs(rig, _urls(document))
-    costs = [*lost, *gain_notes(rig), *exciter_notes(document, rig), *_air_costs(rig)]
+    warnings = [*exciter_notes(document, rig), *_thick_notes(rig), *warnings]
+    costs = [*lost, *gain_notes(rig), *_air_costs(rig)]
     costs += [*_layer_costs(rig), *_point_costs(rig), *_edge_costs(rig)]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
@@ -65,6 +66,20 @@ RIG = ConfigKind(
     example_file=example_rig_path(),
     keys=RigSection.model_json_schema,
 )
+
+
+_THICK = 0.02  # m; of one material
+
+
+def _thick_notes(rig: Rig) -> list[str]:
+    """A warning of a plate of one material that is too thick to vibrate as they mostly do."""
+    thickness = rig.plate.thickness
+    if rig.laminate is not None or thickness <= _THICK:
+        return []
+    return [
+        f"plate.thickness: {1e3 * thickness:g} mm is thick for a plate that is to be felt; check "
+        "its unit, mm or cm"
+    ]
 
 
 def _air_costs(rig: Rig) -> list[str]:
@@ -161,21 +176,24 @@ _MAX_ANGLE = math.radians(20.5)  # between two rows
 
 
 def gain_notes(rig: Rig) -> list[str]:
-    """One warning for each ERA behind an output whose gains are missing, or rows too far apart."""
+    """Warnings: ERAs behind an output whose gains are missing, and each with rows too far apart.
+
+    What an exciter does behind an output is known without gains.
+    """
     behind = [era for era in rig.eras if rig.wiring[era.name].amplifier in rig.outputs]
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    return [text for era in behind for text in _notes(era, low, high)]
+    names = [era.name for era in behind if not (era.gains or isinstance(era, Exciter))]
+    notes = []
+    if names:
+        notes.append(
+            f"gains of {', '.join(names)}: missing behind an output, so that their motion is a "
+            "guess, a stroke by full level at every frequency; measure the plate and calibrate the "
+            "rig"
+        )
+    return [*notes, *(text for era in behind for text in _notes(era, low, high))]
 
 
 def _notes(era: Source, low: float, high: float) -> list[str]:
-    if not era.gains:
-        guessed = "motion is a guess, a stroke"
-        if isinstance(era, Exciter):
-            guessed = f"voltage is a guess, {era.voltage:.3g} V"
-        return [
-            f"eras.{era.name}.gains: missing behind an output, so that its {guessed} by full level "
-            "at every frequency; measure the plate and calibrate the rig"
-        ]
     played = [each for each in pairwise(era.gains) if each[0][0] < high and each[1][0] > low]
     turns = {
         abs(cmath.phase(cmath.rect(1, other[2] - one[2]))): (one[0], other[0])

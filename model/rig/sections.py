@@ -362,8 +362,11 @@ class AmplifierSection(Section):
     Limits: [`SCHEME://...`](urls.md)
     """
 
-    full_level: Literal["motion", "output"] = "motion"
-    """What it plays at level 1."""
+    full_level: Literal["motion", "output"] | None = None
+    """What it plays at level 1.
+
+    Default: `output` where it drives an exciter, else `motion`
+    """
 
     clock_error: Annotated[
         float | Literal["unknown"], Quantity(TIME, at_least=0, at_most=0.001, word="unknown")

@@ -1,15 +1,27 @@
 """How a rig is wired to a sound card, and what its limits allow of that."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.errors import InputError
+from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
+from model.transients.time_response import plate_in_time
 from sim.desk.measuring.loopback import converters
+from sim.desk.measuring.multisine import PERIOD
 from sim.sensors.sensor_file import WiredSensor
+
+MIN_SETTLING = 1.0
+"""Time [s] of a run before what counts, at least: a plate with a usual loss factor has settled."""
+
+_MAX_SETTLING = 5.0  # s
+_LEFT = 0.01  # of a free vibration
 
 
 @dataclass(frozen=True)
@@ -83,6 +95,24 @@ class Desk:
         found = np.zeros((len(sources), self.output))
         found[:, [at - 1 for at in self.sources]] = sources
         return found
+
+    @cached_property
+    def settling(self) -> float:
+        """Time [s] of a run until free vibrations are at most 1 %, whole periods within 1 to 5 s.
+
+        By the mode within the rig's limits that decays slowest; those below them hardly move.
+        Raises InputError for a plate that is not supported.
+        """
+        rig = self.rig
+        points = footprints_of(rig.eras, rig.masses)
+        high = rig.limits.frequency_max
+        reduced = reduce_plate(rig.plate, rig.mesh, points, frequency_max=high)
+        modes = plate_in_time(reduced, rig.eras, loads=rig.masses).eigenvalues
+        played = np.abs(modes.imag) / (2 * np.pi)
+        within = (played >= rig.limits.frequency_min) & (played <= high)
+        slowest = -float(modes.real[within].max(initial=-math.inf))
+        least = max(slowest, -math.log(_LEFT) / _MAX_SETTLING)
+        return max(MIN_SETTLING, PERIOD * math.ceil(-math.log(_LEFT) / least / PERIOD))
 
     @property
     def highest(self) -> float:

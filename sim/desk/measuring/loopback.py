@@ -222,10 +222,13 @@ def check_coherence(
     recorded: Sequence[FloatArray],
     sensors: Sequence[WiredSensor],
     eras: Sequence[tuple[str, int]],
+    *,
+    is_heard: bool = False,
 ) -> None:
     """Raise LinkError for sensors that hear something else, and for ERAs that move nothing.
 
-    found: of what was recorded, runs (n, inputs) each.
+    found: of what was recorded, runs (n, inputs) each; is_heard: whether every ERA was heard at
+    another place.
     """
     columns = [sensor.input - 1 for sensor in sensors]
     coherence = np.median(found.coherence[:, columns], axis=0)
@@ -248,5 +251,10 @@ def check_coherence(
     for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):
         if each < _MOVED:
             raise LinkError(
-                f"output {at} moves nothing: check ERA {name}, its amplifier and its cable"
+                f"output {at} is not heard here, but was at another place: this one is near a "
+                f"nodal line for ERA {name}; s skips it, or move it by a few cm, in its line of "
+                "--sensors too (q, then --resume); if the next place does not hear it either, "
+                "check its cable"
+                if is_heard
+                else f"output {at} moves nothing: check ERA {name}, its amplifier and its cable"
             )

@@ -10,7 +10,7 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.progress import Progress, unseen
-from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.desk import MIN_SETTLING, Desk
 from sim.desk.measuring.loopback import (
     check_clocks,
     check_coherence,
@@ -23,7 +23,6 @@ from sim.desk.measuring.loopback import (
 from sim.desk.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
 from sim.desk.measuring.sound_card import SoundCard, open_card
 
-_SETTLING = 1.0  # s; T60 of the paper's plate
 _TAIL = 0.05  # s; longer than the ramp
 
 TRIES = 3
@@ -44,9 +43,9 @@ class Run:
     repeated: int
 
 
-def run_time(periods: int) -> float:
-    """Time [s] of a run of which so many periods are analysed."""
-    return _SETTLING + PERIOD * periods + _TAIL
+def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
+    """Time [s] of a run of which so many periods are analysed, after it has settled."""
+    return settling + PERIOD * periods + _TAIL
 
 
 def play_run(
@@ -64,8 +63,9 @@ def play_run(
     before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
     for inputs that are clipped or silent.
     """
-    signal = desk.on_outputs(multisine.signal(number, periods=run_time(periods) / PERIOD))
-    start = round(_SETTLING * multisine.rate)
+    seconds = run_time(periods, settling=desk.settling)
+    signal = desk.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
+    start = round(desk.settling * multisine.rate)
     repeated = 0
     while True:
         kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
@@ -156,14 +156,17 @@ def measure(
     *,
     periods: int = 2,
     show: Show = lambda recorded: None,
+    is_heard: bool = False,
 ) -> Measured:
     """Play all runs of a multisine and estimate the responses.
 
     periods: of each run that are analysed. show: called with the runs recorded so far, after each.
+    is_heard: whether every ERA was heard before, at another place of a sensor that is moved.
     Raises InputError, LinkError for what is clipped, silent, swapped, incoherent, or lost three
     times.
     """
-    desk.check_times(seconds=run_time(periods), slew=multisine.slew)
+    seconds = run_time(periods, settling=desk.settling)
+    desk.check_times(seconds=seconds, slew=multisine.slew)
     recorded: list[FloatArray] = []
     first: ComplexArray | None = None
     repeated, is_lost = 0, False
@@ -182,7 +185,7 @@ def measure(
     check_clocks(multisine, recorded, desk.sensors, loopback=desk.input)
     if is_lost:
         raise blocks_lost()
-    check_coherence(found, recorded, desk.sensors, desk.eras)
+    check_coherence(found, recorded, desk.sensors, desk.eras, is_heard=is_heard)
     looped, columns = found.values[:, desk.input - 1, desk.sources.index(desk.output)], desk.columns
     of_eras = found.values[:, columns, : len(desk.eras)]
     rms = np.sqrt((np.abs(of_eras) ** 2).mean(axis=(0, 2)))
@@ -248,11 +251,12 @@ def check_by_steps(
 def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
     """Amplitudes (inputs,) by full scale of one ERA; the loop-back shows lost blocks."""
     tone = Multisine(np.array([frequency]), 1, card.rate, level)
-    signal = tone.signal(0, periods=run_time(_PERIODS))
+    signal = tone.signal(0, periods=run_time(_PERIODS, settling=desk.settling) / PERIOD)
     sources = np.zeros((len(signal), len(desk.eras) + 1))
     sources[:, [era, -1]] = signal
     heard = card.run(desk.on_outputs(sources)).astype(float)
-    kept = heard[tone.samples : (1 + _PERIODS) * tone.samples]  # once settled
+    start = round(desk.settling * card.rate)
+    kept = heard[start : start + _PERIODS * tone.samples]
     if card.gaps or not is_whole(kept[:, desk.input - 1], samples=tone.samples):
         raise LinkError("blocks of sound were lost between stepped tones; measure again")
     return np.asarray(tone.found(kept)[0] / tone.played(0)[0])

@@ -154,7 +154,11 @@ def measure_places(
             case "":
                 try:
                     measured = measure(
-                        replace(file.desk, sensors=(place,)), card, multisine, periods=periods
+                        replace(file.desk, sensors=(place,)),
+                        card,
+                        multisine,
+                        periods=periods,
+                        is_heard=bool(file.values),
                     )
                     _check_moved(file, place, measured)
                 except DeviceLost:

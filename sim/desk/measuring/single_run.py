@@ -3,11 +3,10 @@
 import numpy as np
 
 from model.arrays import FloatArray
+from sim.desk.measuring.desk import MIN_SETTLING
 from sim.desk.measuring.measure import TRIES, blocks_lost, run_time
 from sim.desk.measuring.multisine import PERIOD, Multisine
 from sim.desk.measuring.sound_card import SoundCard
-
-_SETTLING = 1.0  # s, of the time of a run
 
 
 def settled(
@@ -20,7 +19,7 @@ def settled(
     signal = sines.signal(0, periods=run_time(periods) / PERIOD)
     played = np.zeros((len(signal), outputs))
     played[:, output - 1] = signal[:, 0]
-    start = round(_SETTLING * sines.rate)
+    start = round(MIN_SETTLING * sines.rate)
     for _ in range(TRIES):
         recorded = card.run(played)[start : start + periods * sines.samples]
         if not card.gaps:

@@ -26,7 +26,7 @@ STALL = 0.1
 
 _POLL = 0.01  # s
 _HELD_UP = 0.05  # s; so late, this process learns nothing of the other
-_REPORT = 1.0  # s between lines on underruns
+_REPORT = 10.0  # s between lines on underruns
 _START = 20.0  # s; the first start compiles elsewhere, and a busy machine is slow
 _END = 2.0  # s
 _PAUSE = 0.5  # s between starts

@@ -73,6 +73,29 @@ def test_blanks_that_look_right_are_read_or_named(tmp_path: Path) -> None:
             read_document(write(tmp_path, wrong))
 
 
+@pytest.mark.parametrize("loader", [yaml.SafeLoader, yaml.CSafeLoader])
+def test_missing_comma_is_named_where_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loader: object
+) -> None:
+    """In the first mapping below a key too, before quotes, and at the end of the line before."""
+    monkeypatch.setattr(reading, "_LOADER", loader)
+    for wrong, line, after in (
+        ("s:\n  A: {x: 12 mm y: 1}\n", 2, "mm in column 14"),
+        (
+            "s:\n  A: {x: 1, y: 2}\n  B: {x: 1,\n      y: 2 # two\n      z: 3}\n",
+            4,
+            "2 in column 10",
+        ),
+        ("s:\n  A: {x: 'a' 'b': 1}\n", 2, "'a' in column 12"),
+        ("s:\n  A: {x: 1\n  B: {x: 1}\n", 2, "1 in column 10"),
+        ("s: [1, 2\n", 1, "2 in column 8"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            read_document(write(tmp_path, wrong))
+        (problem,) = caught.value.problems
+        assert (problem.line, problem.message.partition("closes, after ")[2]) == (line, after)
+
+
 def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     """Files saved by Windows editors read like others."""
     assert read_document(write(tmp_path, b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")).data == {"a": 1, "b": 2}
@@ -85,7 +108,7 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         (b"# only a comment\n", None, ""),
         (b"a: 1\nb: \xff\n", 2, ""),
         (b"a: \x00\n", 1, ""),
-        (b"a: 1\nb: [1\nc: 2\n", 3, ""),
+        (b"a: 1\nb: [1\nc: 2\n", 2, ""),
         (b"a: 1\n\tb: 2\n", 2, ""),
         (b"- 1\n- 2\n", 1, ""),
         (b"word\n", 1, ""),

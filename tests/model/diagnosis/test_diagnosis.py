@@ -70,7 +70,7 @@ def solved_once():
     """Free plates of the causes that are tried are those of one rig in all tests."""
     solved = {}
 
-    def solve(rig, points, frequencies, masses=None):
+    def solve(rig, points, frequencies, *, masses):
         key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
         if key not in solved:
             solved[key] = sensed_plate(rig, points, frequencies, masses=masses)
@@ -155,6 +155,15 @@ def test_diagnose_finds_dead_weak_and_inverted_channels(coarse_rig, built):
     broken = values.copy()
     broken[:, 2] = noise_like(values, 0.1, rng)[:, 2]
     assert states(diagnose(coarse_rig, replace(built, values=broken))) == {"NE": ("dead",)}
+
+
+def test_verdict_asks_for_the_sensitivity_where_all_channels_are_strong(coarse_rig, built):
+    """Three times what was commanded at every channel is one line, of the sensors."""
+    verdict = diagnose(coarse_rig, replace(built, values=3 * built.values))
+    assert set(states(verdict).values()) == {("strong",)}
+    (row,) = verdict_rows(verdict)
+    assert row.startswith("STRONG: the channels of SW, SE, NE, NW play")
+    assert "check the sensors' sensitivity first" in row
 
 
 def test_diagnose_finds_a_channel_on_another_era(coarse_rig, built):

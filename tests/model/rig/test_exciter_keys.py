@@ -79,7 +79,10 @@ def test_what_is_wrong_is_found_at_its_key() -> None:
     assert "free, of the light coil" in refused(f"{OWN}, resonance: 224 Hz")["resonance_is"]
     assert refused("type: DAEX25CT-4, resonance: 60").keys() >= {"resonance_is"}
     assert refused(OWN)["resonance"] == "missing; add it, or a type that has it"
-    assert "did you mean DAEX25CT-4" in refused("type: DAEX25CT-5")["type"]
+    misspelt = refused("type: DAEX25CT-5")
+    assert "did you mean DAEX25CT-4" in misspelt.pop("type")
+    assert all(key.startswith("eras.") for key in misspelt)  # each of the others once
+    assert len(misspelt) == 3
     assert "known are at" in refused("type: DAEX25CT-4, stroke: 1 mm")["stroke"]
     assert "DAEX25CT-4" not in str(refused("type: DAEX25CT-4, q: -1"))
     text = exciter_rig_text("type: DAEX25CT-4")
@@ -108,9 +111,12 @@ def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misrea
     assert near.startswith("limits.frequency: starts at 50 Hz")
     assert "start at 58 Hz" in near
     assert warned("type: DAEX13-4SM, power: 1 mW", "[58, 300]") == []
-    *_, misread = warned("type: DAEX13-4SM, resonance_is: mounted", "[300, 400]")
-    assert misread.startswith("eras.NW.resonance_is: 200 Hz is high")
+    misread, *others = warned("type: DAEX13-4SM, resonance_is: mounted", "[240, 400]")
+    assert misread.startswith("resonance_is of SW, SE, NE, NW: 200 Hz is high")
     assert "at 44 Hz" in misread
+    assert not [each for each in others if "start at" in each]
+    (narrow,) = warned("type: DAEX13-4SM, power: 1 mW", "[50, 57]")
+    assert narrow.endswith("plate; identify the rig")
     assert not [each for each in warned(f"{OWN}, stiffness: 3190", "[100, 300]") if "high" in each]
 
 

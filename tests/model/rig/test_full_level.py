@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from exciter_rig import exciter_rig, exciter_rig_text
 from model.answer.fingers import Placement
 from model.config.document import ConfigError
 from model.errors import InputError
@@ -57,18 +58,27 @@ def problems(source: str) -> list[str]:
 
 
 def test_full_level_is_a_motion_or_an_output() -> None:
-    """A motion unless the file says that it is an output, as that of the desk does."""
+    """A motion unless the file says that it is an output, as that of the desk does.
+
+    What drives exciters is one without a word.
+    """
     assert parse_rig("rig.yaml", text().replace(", full_level: output", "")).outputs == set()
     assert parse_rig("rig.yaml", text(full_level="motion")).outputs == set()
     assert parse_rig("rig.yaml", text()).outputs == {"main"}
     assert load_rig(DESK).outputs == {"main"}
+    board = exciter_rig_text().replace(", full_level: output", "")
+    assert "full_level" not in board
+    assert parse_rig("board.yaml", board).outputs == {"card"}
     assert problems(text(full_level="voltage")) == ["amplifiers.main.full_level"]
 
 
 def test_check_says_which_motion_by_an_output_is_a_guess() -> None:
-    """Of the ERA without gains; of a motion nothing is to be measured."""
+    """Of the ERAs without gains at once; of motions and exciters nothing is to be measured."""
     (guess,) = gain_notes(parse_rig("rig.yaml", text()))
-    assert guess.startswith("eras.SW.gains: missing")
+    assert guess.startswith("gains of SW: missing")
+    both = text().replace(", gains: [[40, 6, 0], [300, 2, -20]]", "")
+    assert gain_notes(parse_rig("rig.yaml", both)) == [guess.replace("SW", "SW, SE")]
+    assert gain_notes(exciter_rig()) == []
     assert gain_notes(parse_rig("rig.yaml", text(full_level="motion"))) == []
 
 

@@ -297,6 +297,16 @@ def test_check_warns_of_an_air_gap_whose_friction_couples_modes(
     assert all(f"off by {warned}" in each for each in found)
 
 
+def test_check_warns_of_a_plate_as_thick_as_one_in_another_unit(tmp_path: Path) -> None:
+    """6.4 cm in place of 6.4 mm of plywood, and no board of a shop."""
+    text = GOOD.replace("48x36", "auto").replace("aluminium", "plywood")
+    text = text.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
+    for thickness, count in (("6.4 cm", 1), ("18 mm", 0)):
+        path = write(tmp_path, text.replace("1.5 mm", thickness))
+        warnings = RIG.check(read_document(path)).warnings
+        assert sum(each.startswith("plate.thickness: 64 mm") for each in warnings) == count
+
+
 def test_check_warns_of_layers_that_slide_within_the_frequencies(tmp_path: Path) -> None:
     """Aluminium 0.5 mm on both sides of 50 mm of foam of G 40 kPa: by hand 151 Hz.
 

@@ -102,14 +102,17 @@ class Bench:
 
 
 class PulledCard(DeskCard):
-    """Its plug is pulled in the run of that number, if any."""
+    """Its plug is pulled in the run of that number, if any; muted: output 1 is, from that run."""
 
     pulled: int | None = None
+    muted: int | None = None
 
     def run(self, played: FloatArray) -> Float32Array:
         """Advance the plate, or be gone."""
         if self.runs == self.pulled:
             raise DeviceLost("memory: the device was lost, or takes no samples")
+        if self.muted is not None and self.runs >= self.muted:
+            played = played * (np.arange(played.shape[1]) != 0)
         return super().run(played)
 
 
@@ -199,6 +202,21 @@ def test_sensor_that_was_not_moved_is_seen(bench: Bench) -> None:
     assert bench.measure() == ["P1", "P2", "P3"]
     (refusal,) = [text for text in bench.person.said if "not kept" in text]
     assert "the sensor is still there; move it to P2" in refusal
+
+
+@pytest.mark.parametrize(
+    ("muted", "said"),
+    [(5, "P2 is not kept: output 1 is not heard here"), (0, "P1 is not kept: output 1 moves not")],
+)
+def test_output_that_was_heard_elsewhere_is_not_called_dead(
+    bench: Bench, muted: int, said: str
+) -> None:
+    """Silent from the second place on, it may be on a nodal line, which s skips; else dead."""
+    bench.card.muted = muted
+    bench.person.replies = ["", "", "q"] if muted else ["", "q"]
+    assert bench.measure() == ["P1"] * bool(muted)
+    assert bench.person.said[-1].startswith(said)
+    assert ("s skips it" in bench.person.said[-1]) == bool(muted)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
 from model.structure.attachments import Source
-from model.structure.exciter import Exciter
 from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
@@ -169,12 +168,10 @@ def gain_notes(rig: Rig) -> list[str]:
 
 def _notes(era: Source, low: float, high: float) -> list[str]:
     if not era.gains:
-        guessed = "motion is a guess, a stroke"
-        if isinstance(era, Exciter):
-            guessed = f"voltage is a guess, {era.voltage:.3g} V"
         return [
-            f"eras.{era.name}.gains: missing behind an output, so that its {guessed} by full level "
-            "at every frequency; measure the plate and calibrate the rig"
+            f"eras.{era.name}.gains: missing behind an output, so that its drive is a guess, "
+            f"{era.full_level:.3g} {era.UNIT} by full level at every frequency; measure the plate "
+            "and calibrate the rig"
         ]
     played = [each for each in pairwise(era.gains) if each[0][0] < high and each[1][0] > low]
     turns = {

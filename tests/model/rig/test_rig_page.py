@@ -47,3 +47,9 @@ def test_page_lists_the_known_materials():
     """By name, all of them and no other."""
     (names,) = re.findall(r"Materials by name are (.+?);", PAGE, re.DOTALL)
     assert re.findall(r"`([\w-]+)`", names) == [*KNOWN_MATERIALS]
+
+
+def test_choices_of_a_key_that_may_be_left_out() -> None:
+    """They are in its row, as those of a key with a default are."""
+    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
+    assert "| `magnet` | | `free` | `free`, `held` |" in rig_page.PARTS["exciters"]()

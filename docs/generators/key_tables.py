@@ -119,7 +119,7 @@ def _limits(field: FieldInfo) -> str:
     kind, bounds = field.annotation, field.metadata
     parts = get_args(kind)
     if parts and parts[-1] is NoneType:  # of a key that may be left out
-        kind = (get_args(parts[0]) or parts)[0]
+        kind = parts[0] if get_origin(parts[0]) is Literal else (get_args(parts[0]) or parts)[0]
         annotations = getattr(parts[0], "__metadata__", ())
         bounds = [own for each in annotations for own in getattr(each, "metadata", (each,))]
     if get_origin(kind) is Literal:

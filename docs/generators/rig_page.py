@@ -8,6 +8,9 @@ from model.config.sections import Section
 from model.rig import sections
 from model.rig.era_section import EraSection
 from model.rig.exciter_section import ExciterSection
+from model.structure.exciter_types import EXCITER_TYPES
+from model.structure.feet_and_frames import FEET, FOOT_LOSS
+from model.structure.materials import KNOWN_MATERIALS
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,
@@ -25,6 +28,34 @@ SECTIONS: Mapping[str, type[Section]] = {
     "fingertip": sections.FingertipSection,
 }
 
+
+def _own_losses() -> str:
+    """Default loss factors of plates by their material, where it is not that of all plates."""
+    own = {name: each.own_loss for name, each in KNOWN_MATERIALS.items() if each.own_loss}
+    by_loss = [
+        f"{100 * loss:g} % ({', '.join(f'`{name}`' for name in own if own[name] == loss)})"
+        for loss in dict.fromkeys(own.values())
+    ]
+    return f"Wood loses more by itself, so by name the default is {' or '.join(by_loss)}, assumed."
+
+
+def _types() -> str:
+    """Types of exciters, and what to know of each."""
+    return "\n".join(f"- `{each.name}`: {each.note}" for each in EXCITER_TYPES.values())
+
+
+def _feet() -> str:
+    """Stiffness and loss factor of feet by their kind."""
+    feet = ", ".join(f"of `{kind}` {each / 1e3:g} kN/m" for kind, each in FEET.items())
+    return (
+        f"Stiffness of a foot {feet}; a loss factor of {FOOT_LOSS:g}, also along edges: *assumed*, "
+        "of feet of some 2 cm."
+    )
+
+
 PARTS: Mapping[str, Callable[[], str]] = {
-    name: partial(key_table, each) for name, each in SECTIONS.items()
+    **{name: partial(key_table, each) for name, each in SECTIONS.items()},
+    "own_losses": _own_losses,
+    "types": _types,
+    "feet": _feet,
 }

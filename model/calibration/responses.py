@@ -15,7 +15,6 @@ from model.identification.forward import Sensor
 from model.identification.measurement import Measurement
 from model.rig.rig import Rig
 from model.structure.actuators import Actuator
-from model.structure.exciter import Exciter
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.
 _ERA_TOLERANCE = 5e-3
@@ -178,7 +177,7 @@ def _check_point(measured: MeasuredValue, rig: Rig) -> None:
 
 
 def _check_unit(measured: MeasuredValue, actuator: Actuator) -> None:
-    if measured.is_per_volt != isinstance(actuator, Exciter):
+    if measured.is_per_volt != (actuator.UNIT == "V"):
         right, wrong = ("volt at the exciter", "displacement of the base of an ERA")
         if measured.is_per_volt:
             right, wrong = wrong, right

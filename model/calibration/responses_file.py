@@ -34,7 +34,6 @@ from model.files.uff import (
     write_universal,
 )
 from model.rig.rig import Rig
-from model.structure.exciter import Exciter
 
 COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
 _PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
@@ -91,10 +90,10 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
 
     Raises OSError; InputError for ERAs beside exciters, whose units differ.
     """
-    kinds = {isinstance(era, Exciter) for era in rig.eras}
-    if len(kinds) > 1:
+    units = {era.UNIT for era in rig.eras}
+    if len(units) > 1:
         raise InputError(f"{path}: ERAs and exciters need a .uff file, whose functions have units")
-    real, imaginary = _PER_VOLT if True in kinds else COLUMNS[-2:]
+    real, imaginary = _PER_VOLT if "V" in units else COLUMNS[-2:]
     f, e, s = np.nonzero(np.isfinite(responses.values))
     values = responses.values[f, e, s]
     further: dict[str, Column] = {}
@@ -127,7 +126,7 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: 
     numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
     for e, era in enumerate(rig.eras):
-        reference = (_GENERAL, "V") if isinstance(era, Exciter) else (DISPLACEMENT, "m")
+        reference = (DISPLACEMENT if era.UNIT == "m" else _GENERAL, era.UNIT)
         for s, sensor in enumerate(responses.sensors):
             measured = np.isfinite(responses.values[:, e, s])
             if measured.any():
@@ -177,7 +176,7 @@ def _read_csv(path: Path) -> list[MeasuredValue]:
                 frequency,
                 value,
                 line.place,
-                _mass(line.place, mass),
+                sensor_mass(line.place, mass),
                 setting,
                 is_per_volt,
             )
@@ -269,11 +268,14 @@ def _noted(function: Function) -> tuple[float, str]:
         mass = float(found["mass"])
     except ValueError:
         mass = math.nan
-    return _mass(function.place, mass), (found["setting"] or "").strip()
+    return sensor_mass(function.place, mass), (found["setting"] or "").strip()
 
 
-def _mass(place: str, grams: float) -> float:
-    """A sensor's mass [kg] from grams; raises InputError."""
+def sensor_mass(place: str, grams: float, *, column: str = MASS) -> float:
+    """A sensor's mass [kg] from grams in a column; raises InputError."""
     if not 0 <= grams <= MAX_SENSOR_MASS:  # nor for NaN
-        raise InputError(f"{place}: {MASS} must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}")
+        raise InputError(
+            f"{place}: {column} must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}; it is in "
+            "grams"
+        )
     return grams / 1e3

@@ -5,10 +5,10 @@ from copy import deepcopy
 from typing import Any
 
 from model.arrays import FloatArray
+from model.config.sections import section_by_kind
 from model.design.problem import DesignProblem
-from model.rig.actuators import KINDS
+from model.rig.actuators import KINDS, kind_of
 from model.rig.rig import Channel, Rig
-from model.structure.exciter import Exciter
 
 MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
@@ -31,7 +31,7 @@ def layout_keys(
     used = {}
     like = _damped(before[problem.like.name], problem.like.damping)
     if problem.stiffness is not None:
-        for key in KINDS[Exciter].instead["stiffness"] if _excites(like) else ():
+        for key in _instead_of("stiffness", like):
             like.pop(key, None)
         like["stiffness"] = problem.stiffness
     for era in problem.eras(positions):
@@ -56,13 +56,15 @@ def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
 
     And a quality of an exciter to its stiffness.
     """
-    replaced = KINDS[Exciter].instead["damping"] if _excites(section) else ("damping_ratio",)
+    replaced = _instead_of("damping", section)
     keys = {key: value for key, value in deepcopy(section).items() if key not in replaced}
     return keys | {"damping": float(f"{damping:.6g}")}
 
 
-def _excites(section: Mapping[str, Any]) -> bool:
-    return section.get("kind") == "exciter"
+def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
+    """Keys that one replaces in an actuator of the section's kind."""
+    own = section_by_kind([kind.section for kind in KINDS.values()], section)
+    return kind_of(own).instead.get(key, ())
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:

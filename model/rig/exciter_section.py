@@ -54,10 +54,9 @@ class ExciterSection(ActuatorSection):
     """`exciter`."""
 
     type: Annotated[str, AfterValidator(check_type)] | None = None
-    """A type that is sold, whose values are taken where no key gives them, see
-    [exciters](#exciters).
+    """A type that is sold, whose values are taken where no key gives them.
 
-    Limits: `DAEX13-4SM`, `DAEX25CT-4`, `DAEX25FHE-4`, `EX25FHE2-4`
+    Limits: a name [below](#exciters)
     """
 
     coil_mass: Annotated[float, Quantity(MASS, at_least=0, at_most=0.1)] | None = None

@@ -49,7 +49,7 @@ from model.rig.key_types import (
     check_url,
 )
 from model.rig.uncertainty import BOUNDS, Uncertainty
-from model.structure.feet_and_frames import DEFAULT_POINTS
+from model.structure.feet_and_frames import DEFAULT_POINTS, FootKind
 from model.structure.materials import KnownMaterial, known_material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 
@@ -250,7 +250,7 @@ class PlateSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, below=1)] | None = None
     """Structural damping eta of a hysteretic stiffness (1 + i eta) K, of the mounted plate.
 
-    Default: 0.01; of `plywood` and `mdf` 0.02, of `pine` and `spruce` 0.015
+    Default: 0.01, or the greater one of its [material](#material)
     """
 
     loss_exponent: Annotated[
@@ -317,8 +317,8 @@ class SupportSection(Section):
     Default: required, or `along`
     """
 
-    kind: Literal["foam", "rubber"] | None = None
-    """A foot of 2 or 30 kN/m, which `stiffness` replaces."""
+    kind: FootKind | None = None
+    """Of a foot, with the stiffness [below](#supports), which `stiffness` replaces."""
 
     stiffness: Annotated[float, Quantity(STIFFNESS, above=0, at_most=1e12)] | None = None
     """Of its spring.
@@ -329,7 +329,7 @@ class SupportSection(Section):
     loss_factor: Annotated[float, Quantity(RATIO, at_least=0, at_most=2)] | None = None
     """Eta of the spring, k (1 + i eta).
 
-    Default: 0.15, or 0 with `damping`
+    Default: that [below](#supports), or 0 with `damping`
     """
 
     damping: Annotated[float, Quantity(DAMPING, at_least=0, at_most=1e6)] | None = None

@@ -74,9 +74,15 @@ class InTime:
 class Source(Support, Protocol):
     """What drives the plate, and supports it: an actuator.
 
-    Its drive is in a unit of its own, metres of an ERA's base or volts of an exciter. Errors of its
-    spring and damper act on the plate with the change of D times the base less the plate's motion.
+    Errors of its spring and damper act on the plate with the change of D times the base less the
+    plate's motion.
     """
+
+    LEARNED: ClassVar[tuple[str, ...]]
+    """Fields that measurements of a plate change."""
+
+    UNIT: ClassVar[str]
+    """Of its drive: m of an ERA's base, V of an exciter."""
 
     @property
     def name(self) -> str:
@@ -173,10 +179,10 @@ class Era(MeasuredGains):
     gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
     """
 
-    LEARNED: ClassVar = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
+    LEARNED: ClassVar[tuple[str, ...]] = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
     """Fields that measurements of a plate change."""
 
-    UNIT: ClassVar = "m"
+    UNIT: ClassVar[str] = "m"
     """Of its drive."""
 
     name: str

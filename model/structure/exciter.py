@@ -43,12 +43,12 @@ class Exciter(MeasuredGains):
     magnet; gains: measured complex gain of its amplifier and converter.
     """
 
-    LEARNED: ClassVar = (
+    LEARNED: ClassVar[tuple[str, ...]] = (
         *("x", "y", "stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "gains"),
     )
     """Fields that measurements of a plate change."""
 
-    UNIT: ClassVar = "V"
+    UNIT: ClassVar[str] = "V"
     """Of its drive."""
 
     name: str

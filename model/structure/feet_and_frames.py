@@ -7,13 +7,17 @@ is a small disc: a line does not dent the plate without limit, as a point does.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Literal, TypeAlias
 
 from numpy.polynomial.legendre import leggauss
 
 from model.structure.plate import Plate
 
-FEET = {"foam": 2e3, "rubber": 30e3}
+FootKind: TypeAlias = Literal["foam", "rubber"]
+"""Kinds of feet of a rig file."""
+
+FEET: Mapping[FootKind, float] = {"foam": 2e3, "rubber": 30e3}
 """Stiffness [N/m] of a foot by its kind: assumed, of some 2 cm; of one's own weigh and press."""
 
 FEET_DEVIATE = 0.3
@@ -26,7 +30,7 @@ EDGE_FOOT = 1e-3
 """Radius [m] of the discs at these points."""
 
 FOOT_LOSS = 0.15
-"""Loss factor of foam and rubber: assumed."""
+"""Loss factor of feet of every kind: assumed."""
 
 
 def edge_points(plate: Plate, count: int) -> Iterator[tuple[float, float, float]]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from model.calibration.responses_file import MAX_SENSOR_MASS
+from model.calibration.responses_file import sensor_mass
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
 from model.structure.plate import Plate
@@ -78,16 +78,10 @@ def _sensor(
     for column, value in (("gain", gain), ("full_scale_v", full_scale)):
         if value <= 0:
             raise InputError(f"{place}: {column} must be above zero, got {value:g}")
-    grams = own if mass is None else mass
-    if not 0 <= grams <= MAX_SENSOR_MASS:
-        raise InputError(
-            f"{place}: mass_g must be from 0 to {MAX_SENSOR_MASS:g}, got {grams:g}; it is in grams"
-        )
+    weight = sensor_mass(place, own if mass is None else mass, column="mass_g")
     if sensitivity == 0:
         raise InputError(f"{place}: mv_per_m_s2 must not be zero, got 0; negative: upside down")
-    found = WiredSensor(
-        name, x, y, int(channel), 1e-3 * sensitivity * gain / full_scale, grams / 1e3
-    )
+    found = WiredSensor(name, x, y, int(channel), 1e-3 * sensitivity * gain / full_scale, weight)
     if moves and before and replace(before[0], name=name, x=x, y=y) != found:
         raise InputError(
             f"{place}: one sensor that is moved must have one sensitivity, gain, full scale and "

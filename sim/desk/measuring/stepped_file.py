@@ -14,7 +14,6 @@ from pathlib import Path
 from model.calibration.responses import MeasuredValue
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
-from model.structure.exciter import Exciter
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import Tone, tones_of
 from sim.sensors.sensor_file import WiredSensor, are_places
@@ -128,5 +127,5 @@ def _value(
         ratio / actuator.full_level / sensor.sensitivity,
         place,
         sensor.mass,
-        is_per_volt=isinstance(actuator, Exciter),
+        is_per_volt=actuator.UNIT == "V",
     )

@@ -1,17 +1,22 @@
 """Designs on several machines."""
 
+import json
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from exciter_rig import exciter_rig_text
 from model.cluster import on_cluster
+from model.config.document import parse_document
 from model.design.area import area_of
 from model.design.contacts import anywhere
+from model.design.layout_keys import layout_keys
 from model.design.problem import DesignProblem, layouts_of
 from model.design.run import Design, Runner, judge, rank_layouts
 from model.processes import on_processes
+from model.rig.file import parse_rig
 from paper_plate import make_paper_rig
 
 
@@ -67,3 +72,17 @@ def test_a_layout_is_judged_with_the_eras_of_its_problem(tmp_path) -> None:
     for each in found.layouts:
         alone = judge(each.problem.rig_with(soft.own_positions), few)
         assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))
+
+
+def test_layouts_of_exciters_state_their_own_keys() -> None:
+    """A suspension by stiffness and damping takes the place of resonance and q, and reads back."""
+    text = exciter_rig_text("type: DAEX25CT-4, resonance: 300, resonance_is: free, q: 4")
+    rig = parse_rig("board.yaml", text)
+    area, contacts = area_of("edge", rig.plate), anywhere(rig.plate)
+    sought = DesignProblem(rig, 4, area, contacts, stiffness=5e3)
+    places = np.array([[0.05, 0.04], [0.25, 0.04], [0.25, 0.19], [0.06, 0.18]])
+    keys = layout_keys(sought, places, parse_document("board.yaml", text).data)
+    found = parse_rig("layout.yaml", json.dumps(keys))
+    assert [(era.x, era.y) for era in found.eras] == [tuple(at) for at in places.tolist()]
+    assert [era.stiffness for era in found.eras] == [5e3] * 4
+    assert [era.damping for era in found.eras] == pytest.approx([rig.eras[0].damping] * 4, rel=1e-5)

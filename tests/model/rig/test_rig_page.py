@@ -29,6 +29,8 @@ def test_tables_of_keys_are_those_of_the_sections() -> None:
         "| `channel` | | none | 0 to 255 | its channel;",
         "| `bond` | | `full` | `full`, `none` | whether",
         "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
+        "| `resonance_is` | | required with `resonance` | `free`, `mounted` | of which",
+        "| `kind` | | none | `foam`, `rubber` | of a foot",
         "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
     ):
         assert f"\n{row}" in PAGE
@@ -45,3 +47,9 @@ def test_page_lists_the_known_materials():
     """By name, all of them and no other."""
     (names,) = re.findall(r"Materials by name are (.+?);", PAGE, re.DOTALL)
     assert re.findall(r"`([\w-]+)`", names) == [*KNOWN_MATERIALS]
+
+
+def test_choices_of_a_key_that_may_be_left_out() -> None:
+    """They are in its row, as those of a key with a default are."""
+    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
+    assert "| `magnet` | | `free` | `free`, `held` |" in rig_page.PARTS["exciters"]()

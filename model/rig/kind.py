@@ -25,6 +25,7 @@ from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
 from model.structure.attachments import Source
+from model.structure.exciter import Exciter
 from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem

@@ -128,8 +128,8 @@ _KNOWN = (
         source="birch, by its thickness of 3 plies (3.6 mm), 5 (6.4), 7 (9.2), 9 (12) and so on; "
         "E1, E2, G12, nu12 and rho Handbook of Finnish Plywood, from memory: veneers of 17.5 GPa, "
         "crosswise counted 0; G13 and G23, of which the cross plies roll, assumed",
-        variation="E1 10 %, E1 : E2 falls from 16 at 3 plies to 2.7 at 5 and 1.6 at 9; E2 up to 73 % "
-        "more at 3 plies and 12 % at 5 if crosswise veneers count 0.8 GPa; G12 0.6 to "
+        variation="E1 10 %, E1 : E2 falls from 16 at 3 plies to 2.7 at 5 and 1.6 at 9; E2 up to "
+        "73 % more at 3 plies and 12 % at 5 if crosswise veneers count 0.8 GPa; G12 0.6 to "
         "0.75 GPa, G13 and G23 30 %; 6.5 mm by name are 6.1 to 6.9 (a trade sheet, 670 kg/m³); "
         "shops cut along and across the faces' grain",
         loss_factor="0.01 to 0.03, assumed",

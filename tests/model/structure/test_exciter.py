@@ -61,16 +61,20 @@ def test_resonance_quality_and_force_of_the_glued_magnet() -> None:
 
 @pytest.mark.parametrize("held", [False, True])
 def test_errors_of_the_suspension_act_as_its_changes_say(held: bool) -> None:
-    """Force and stiffness of one that is stiffer and damps more, by differences of the hand's."""
+    """Of one that is stiffer or damps more, the force changes as much as the stiffness does.
+
+    At any size, by the motion of its base; and dampers by a difference.
+    """
     omega, step = 2 * np.pi * np.array([30.0, 47.0, 120.0, 400.0]), 1e-5
     exciter = replace(BY_HAND, held=held, gains=((100.0, 0.5, 0.3),))
-    for key, change in (("stiffness", exciter.by_stiffness), ("damping", exciter.by_damping)):
-        other = exciter.varied(**{key: 1 + step})
-        by_stiffness = (other.dynamic_stiffness(omega) - exciter.dynamic_stiffness(omega)) / step
-        by_force = (other.force(omega) - exciter.force(omega)) / step
-        assert change(omega) == pytest.approx(by_stiffness, rel=1e-3)
-        size = np.abs(exciter.force(omega)).max()
-        assert change(omega) * exciter.base(omega) == pytest.approx(by_force, abs=3e-4 * size)
+    at_rest, force = exciter.dynamic_stiffness(omega), exciter.force(omega)
+    damped = exciter.varied(damping=1 + step).dynamic_stiffness(omega)
+    assert exciter.by_damping(omega) == pytest.approx((damped - at_rest) / step, rel=1e-3)
+    for key in ("stiffness", "damping"):
+        other = exciter.varied(**{key: 1.3})
+        pushed = (other.dynamic_stiffness(omega) - at_rest) * exciter.base(omega)
+        size = np.abs(force).max()
+        assert pushed == pytest.approx(other.force(omega) - force, abs=1e-9 * size)
         drive = exciter.full_level * exciter.gain(omega / (2 * np.pi))
         off = {"stiffness": 1.0, "damping": 1.0, key: 1.3}
         stiffness, by_voltage = exciter.deviating(omega, **off)

@@ -1,7 +1,6 @@
 """How strongly vibrations are played: within the amplifiers' limits, and as quiet fingers allow."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -80,9 +79,7 @@ def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> Flo
     highest = limits.amplitudes or strokes
     full = amplitudes / [highest[name] for name in strokes]
     ways = np.array([table.excursion_of(layer.excitations) for layer in found.layers])
-    limited = np.column_stack(
-        [full, power / math.sqrt(limits.power), ways / limits.excursion]
-    )
+    limited = np.column_stack([full, power / math.sqrt(limits.power), ways / limits.excursion])
     streams = found.contents.streams
     promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])
     factors, _ = share_stroke(

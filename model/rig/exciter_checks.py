@@ -27,8 +27,9 @@ class Excursions:
     """Excursions [m] of each exciter at the rig's level, (n,).
 
     at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
-    those that are limited; passed (n,): whether these are more than they may be; allowed: the lowest frequency [Hz] from which all stay within up
-    to the highest, infinite where they do not there.
+    those that are limited; passed (n,): whether these are more than they may be; allowed: the
+    lowest frequency [Hz] from which all stay within up to the highest, infinite where they do not
+    there.
     """
 
     at_lowest: FloatArray

@@ -354,9 +354,7 @@ class LocalizationTable:
             for name, tone in each.items():
                 share = float(np.interp(tone.frequency, self.frequencies, self.allowed_shares))
                 part = tone.amplitude / self.full_levels[name] / share
-                parts[number, tone.frequency] = max(
-                    part, parts.get((number, tone.frequency), 0.0)
-                )
+                parts[number, tone.frequency] = max(part, parts.get((number, tone.frequency), 0.0))
         return sum(parts.values())
 
     @cached_property

@@ -171,7 +171,7 @@ class Exciter(MeasuredGains):
 
     @property
     def largest_force(self) -> float:
-        """Force Bl V / R [N] at full level and gain well above the magnet's resonance, without L."""
+        """Force Bl V / R [N] at full level, gain included, well above f_m, without L."""
         return self.in_time.by_drive * self.voltage * self.largest_gain
 
     def heat_by(self, volts: float) -> float:

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from model.answer.answer import Answer
+from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from model.answer.answer import Answer, Limits
 from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
 from model.answer.timing import Timing
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, Point
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -84,22 +85,18 @@ def furthest(volts: FloatArray) -> float:
     return largest
 
 
-def shaped(targets: int, *bands: float, level: float = 60.0) -> Iterable[Answer]:
-    """Answers for fingers at places with as much as exciters give, with envelopes."""
-    for places in PLACES:
-        fingers = [
-            Finger(at, Stimulus(level, band_hz=(bands[n], bands[n])) if n < targets else None)
-            for n, at in enumerate(places)
-        ]
-        found = answer(table(), fingers, drive_mode="phased", shaped=True, min_contrast_db=-60)
-        yield Timing(table()).shaped(found)
+def shaped(frequency: float) -> Iterable[Answer]:
+    """Answers for one of two fingers with as much as exciters give, with envelopes."""
+    for target, quiet in PLACES:
+        fingers = [Finger(target, Stimulus(60.0, band_hz=(frequency, frequency))), Finger(quiet)]
+        yield Timing(table()).shaped(answer(table(), fingers, drive_mode="phased", shaped=True))
 
 
 @pytest.mark.parametrize("frequency", [60.0, 70.0, 90.0])
 def test_onsets_keep_magnets_within_their_excursion(frequency: float) -> None:
     """At the most that is asked, along shaped onsets and along a jump, in either phase."""
     largest = []
-    for found in shaped(1, frequency):
+    for found in shaped(frequency):
         (layer,) = found.layers
         assert layer.onset is not None
         for phase in (1.0, 1j):
@@ -117,11 +114,19 @@ def jump(amplitudes: ComplexArray, frequency: float) -> FloatArray:
 
 
 def test_contents_together_keep_magnets_within_their_excursion() -> None:
-    """Of two that want all, at 70 and at 90 or 120 Hz, that begin at once; each alone is within."""
-    largest = []
-    for other in (90.0, 120.0):
-        for found in shaped(2, 70.0, other):
-            assert len(found.layers) == 2
-            onsets = [layer.onset for layer in found.layers if layer.onset]
-            largest += [furthest(voltages(onsets, phase=phase)) for phase in (1.0, 1j)]
+    """Of a tone at 70 Hz that takes half of it, and one at 90 Hz that wants all beside it."""
+    largest, every = [], PlaybackCapabilities("phased", ("phased",), Limits(), RAMPS_ONLY)
+    for first, second in PLACES:
+        one = alone(first, 70.0, Limits(excursion=0.5))
+        other = alone(second, 90.0, every.left_by(one.excitations, table()).limits)
+        onsets = [layer.onset for layer in (*one.layers, *other.layers) if layer.onset]
+        assert len(onsets) == 2
+        largest += [furthest(voltages(onsets, phase=phase)) for phase in (1.0, 1j)]
     assert 0.3 * ALLOWED < max(largest) < 1.01 * ALLOWED
+
+
+def alone(at: Point, frequency: float, limits: Limits) -> Answer:
+    """All that one finger can have within limits."""
+    finger = Finger(at, Stimulus(60.0, band_hz=(frequency, frequency)))
+    found = answer(table(), [finger], drive_mode="phased", shaped=True, limits=limits)
+    return Timing(table()).shaped(found)

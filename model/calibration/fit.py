@@ -43,9 +43,7 @@ _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 
 _ROUNDS = 8
 _SETTLED = 0.1  # of the noise between two rounds
 _LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
-CLEAR = 3.0
-"""Standard errors of a place that an ERA is off."""
-
+_CLEAR = 3.0  # standard errors
 _HOLD = 1e3  # by which a mean of scales is held
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
@@ -204,6 +202,11 @@ def solve(problem: CalibrationProblem, start: FitStart) -> Fit:
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
+def clear(fit: Fit) -> NDArray[np.bool_]:
+    """Which parameters (p,) are off by several standard errors."""
+    return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
+
+
 def without_form(problem: CalibrationProblem, fit: Fit) -> FloatArray:
     """Parameters z (p,) of the plate without form errors that explains best what was measured.
 
@@ -213,8 +216,7 @@ def without_form(problem: CalibrationProblem, fit: Fit) -> FloatArray:
     space, z = problem.plate.model.space, fit.z.copy()
     mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
     form = space.of(*FORM, "mode_shifts") & ~mine
-    place = space.of("place") & (np.abs(z) <= CLEAR * fit.error)
-    z[form | place] = 0.0
+    z[form | (space.of("place") & ~clear(fit))] = 0.0
     part = replace(problem, searched=problem.searched & mine)
     return _search(part, z, fit.used / fit.noise[:, :, None]).x
 

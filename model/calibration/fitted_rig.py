@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOutSensors, MovedEra
-from model.calibration.fit import CLEAR, CalibrationProblem, Fit, without_form
+from model.calibration.fit import CalibrationProblem, Fit, clear, without_form
 from model.calibration.sensed_plate import Parameter, sensed_plate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.identification.form_errors import MASS_CELLS
@@ -44,10 +44,10 @@ def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
     rig, space, found = problem.plate.rig, problem.plate.model.space, []
     sides = np.array([rig.plate.length, rig.plate.width])
-    places, errors = (space.values(x, "place").reshape(-1, 2) for x in (fit.z, fit.error))
+    off = np.where(clear(fit), fit.z, 0.0)
+    places, errors = (space.values(x, "place").reshape(-1, 2) for x in (off, fit.error))
     for era, place, error in zip(rig.eras, places, errors, strict=True):
-        clear = np.abs(place) > CLEAR * error
-        at = np.clip(np.array([era.x, era.y]) + np.where(clear, place, 0), 0, sides)
+        at = np.clip(np.array([era.x, era.y]) + place, 0, sides)
         if np.abs(at - [era.x, era.y]).max() > 0:
             found.append(
                 MovedEra(
@@ -172,7 +172,7 @@ def uncertainty_of(
         "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
-    feet = before.supports * fit.error[problem.plate.model.space.groups["supports"]]
+    feet = problem.plate.model.space.values(fit.error, "supports")
     if feet.any():
         fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(feet**2)), _MODEL_ERROR))
     if known["modulus"]:

@@ -76,7 +76,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     # Values of the plate that are off are what a calibration is for.
     verdict = diagnose(rig, observation, false_alarm=0.0, check=_check_claims)
     _check_wiring(verdict)
-    _check_size(verdict)
+    _check_size(rig, verdict)
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
     return Screening(
         np.array(["dead" in channel.states for channel in verdict.channels]),
@@ -203,13 +203,13 @@ def _check_wiring(verdict: Verdict) -> None:
         )
 
 
-def _check_size(verdict: Verdict) -> None:
+def _check_size(rig: Rig, verdict: Verdict) -> None:
     """Raise InputError where another length or width of the plate explains the responses best."""
     if verdict.plate_matches or not verdict.explanations:
         return
     best = verdict.explanations[0]
     if best.cause.is_geometry and best.match.error <= MAX_FIT_ERROR:
-        raise wrong_size(best.cause.key, best.expected, best.value)
+        raise wrong_size(rig.plate, best.cause.key, best.expected, best.value)
 
 
 def _joined(names: Sequence[str]) -> str:

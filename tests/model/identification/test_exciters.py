@@ -26,7 +26,7 @@ from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 
 KEYS = "type: DAEX25FHE-4, power: 1 W"
-PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"
+PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, supports: 0.3}"
 TONES = np.array([42.0, 80.0, 150.0, 250.0])
 MASS = 2e-3
 MOVED = Sensor("moved", x=0.2, y=0.15, mass=MASS)

@@ -366,6 +366,8 @@ class AmplifierSection(Section):
     """What it plays at level 1.
 
     Default: `output` where it drives an exciter, else `motion`
+
+    Limits: `motion`, `output`
     """
 
     clock_error: Annotated[

@@ -56,7 +56,7 @@ def test_places_that_are_off_change_fields_as_much_as_stiffnesses_do() -> None:
 def test_promises_of_exciters_whose_places_are_off_are_kept_on_nine_of_ten_plates() -> None:
     """On 60 plates each, solved with exciters where they stand, 24 answers: 86 to 96 % of all.
 
-    Counted as errors of stiffnesses alone 54 % keep them.
+    Counted as errors of stiffnesses alone two of three and less keep them.
     """
     known = replace(Uncertainty.none(), gain=0.01, place=0.001)
     rig = replace(load_rig(WEEKEND), uncertainty=known)

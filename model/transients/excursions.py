@@ -163,7 +163,7 @@ def excursions_of(rig: Rig) -> Excursions:
     some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
     if some:
         largest[:, some] = limits.level * magnets_of(rig, free).by_jumps(frequencies)
-    passed = largest > np.array([one.excursion for one in exciters])
+    passed = np.asarray(largest > np.array([one.excursion for one in exciters]))
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low
     if len(rows):

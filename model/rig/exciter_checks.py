@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.config.document import Document
@@ -34,7 +35,7 @@ class Excursions:
 
     at_lowest: FloatArray
     largest: FloatArray
-    passed: FloatArray
+    passed: NDArray[np.bool_]
     allowed: float
 
 

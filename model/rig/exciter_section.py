@@ -197,13 +197,8 @@ def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tu
         yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
     rated, power = of_type.get("power"), read("power")
     if rated is not None and isinstance(power, float) and power > rated.value:
-        yield (
-            "power",
-            (
-                f"must be at most {rated.value:g} W, which a {read('type')} bears, got {power:g} W; "
-                "lower it"
-            ),
-        )
+        bears = f"{rated.value:g} W, which a {read('type')} bears"
+        yield "power", f"must be at most {bears}, got {power:g} W; lower it"
     if {"stiffness", "resonance_is"} <= given:
         yield "resonance_is", "is of a resonance, got it with stiffness; remove it"
 

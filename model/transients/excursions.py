@@ -51,7 +51,8 @@ class MagnetMotions:
         """Share of full level (f,), 1 at most, with which all may jump at frequencies [Hz]."""
         if not len(self.rows):
             return np.ones(len(frequencies))
-        return np.minimum((self.excursions / self.by_jumps(frequencies)).min(axis=1), 1.0)
+        least: FloatArray = (self.excursions / self.by_jumps(frequencies)).min(axis=1)
+        return np.asarray(np.minimum(least, 1.0))
 
     def by_jumps(self, frequencies: FloatArray) -> FloatArray:
         """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].
@@ -81,7 +82,7 @@ class MagnetMotions:
             return knots
         first, last = knots[0], knots[-1]
         part = max(np.abs(first).max(), np.abs(last).max()) / full
-        times = KNOT_STEP * np.arange(len(knots))
+        times = KNOT_STEP * np.arange(len(knots), dtype=float)
         plain = first + rise(times, min(RISE, times[-1]))[:, None] * (last - first)
         allowed = part * self.excursions
         moved, least = (self.largest(frequency, each) for each in (knots, plain))
@@ -162,7 +163,7 @@ def excursions_of(rig: Rig) -> Excursions:
     some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
     if some:
         largest[:, some] = limits.level * magnets_of(rig, free).by_jumps(frequencies)
-    passed = largest > [one.excursion for one in exciters]
+    passed = np.asarray(largest > np.array([one.excursion for one in exciters]))
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low
     if len(rows):

@@ -106,12 +106,8 @@ def test_deviations_are_those_of_factors_where_losses_are_more(solved, stated, e
     plate = solved.of(replace(RIG, uncertainty=stated))
     z = np.zeros(plate.model.space.size)
     z[plate.model.space.groups["damping_added"]] = 2.0 / 0.7, -0.5 / 0.7, 0.0, 0.0
-    z[plate.model.space.groups["stiffness"]] = (
-        0.0,
-        0.0,
-        np.log(1.2) / max(stated.stiffness, 0.1),
-        0.0,
-    )
+    stiffer = np.log(1.2) / max(stated.stiffness, 0.1)
+    z[plate.model.space.groups["stiffness"]] = 0.0, 0.0, stiffer, 0.0
     by_name = dict(zip([row.name for row in plate.rows], plate.deviations(z), strict=True))
     first, second, third, _ = (era.name for era in RIG.eras)
     found = [by_name[f"{first} damping"], by_name[f"{second} damping"]]

@@ -26,7 +26,8 @@ from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 
 KEYS = "type: DAEX25FHE-4, power: 1 W"
-PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, supports: 0.3}"
+PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"
+FOAM = "supports: {foam: {at: [0.12, 0.1], kind: foam, foot: 5 mm}}"
 TONES = np.array([42.0, 80.0, 150.0, 250.0])
 MASS = 2e-3
 MOVED = Sensor("moved", x=0.2, y=0.15, mass=MASS)
@@ -48,11 +49,12 @@ def model_of(rig: Rig) -> ForwardModel:
 
 @pytest.mark.parametrize("magnet", ["free", "held"])
 def test_derivatives_are_slopes_of_the_responses(magnet: str) -> None:
-    """By central differences, of suspension, magnet, coil and force factor, under a moved sensor.
+    """By central differences, of suspension, magnet, coil, force factor and a foot, a sensor moved.
 
     A magnet that a frame holds has no weight that is felt.
     """
-    model = model_of(board(f"{KEYS}, magnet: {magnet}"))
+    keys = f"{KEYS}, magnet: {magnet}"
+    model = model_of(exciter_rig(keys, frequency="[40, 300]", more=f"{PARTS}\n{FOAM}"))
     space, step = model.space, 1e-4
     x = 0.5 * np.random.default_rng(2).standard_normal(space.size)
     x[space.groups["masses"].start] = 1.0
@@ -60,6 +62,7 @@ def test_derivatives_are_slopes_of_the_responses(magnet: str) -> None:
     found = jacobian(model.at(x))
     size = np.abs(model.at(x).responses).max()
     assert {"magnet mass SW", "force factor NE"} <= {*space.names}
+    assert space.std[space.index("stiffness of foot 1")] == 0.3  # of a kind alone
     for number in np.flatnonzero(space.uncertain):
         moved = step * np.eye(space.size)[number]
         slope = (model.at(x + moved).responses - model.at(x - moved).responses) / (2 * step)

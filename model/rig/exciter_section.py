@@ -195,7 +195,7 @@ def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tu
             yield instead, "missing; add it, or a type that has it"
     if "resonance" in given and "resonance_is" not in given:
         yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
-    rated, power = of_type.get("power"), read("power")
+    rated, power = None if unknown else _of_type(name).get("power"), read("power")
     if rated is not None and isinstance(power, float) and power > rated.value:
         bears = f"{rated.value:g} W, which a {read('type')} bears"
         yield "power", f"must be at most {bears}, got {power:g} W; lower it"

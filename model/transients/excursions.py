@@ -168,4 +168,4 @@ def excursions_of(rig: Rig) -> Excursions:
     allowed = low
     if len(rows):
         allowed = float(frequencies[rows[-1] + 1]) if rows[-1] + 1 < len(passed) else math.inf
-    return Excursions(limits.level * settled, largest.max(axis=0), passed.any(axis=0), allowed)
+    return Excursions(limits.level * settled, largest.max(axis=0), passed.max(axis=0), allowed)

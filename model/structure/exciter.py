@@ -29,7 +29,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.attachments import Factor, InTime, MeasuredGains, PointLoad
 
-_MOST_LAG = 0.1
+_MAX_LAG = 0.1
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class Exciter(MeasuredGains):
             finite="x y",
         )
         self._tuples_of_gains()
-        lag, most = -self.in_time.inertance, _MOST_LAG * self.magnet_mass
-        if lag > most:
+        lag, allowed = -self.in_time.inertance, _MAX_LAG * self.magnet_mass
+        if lag > allowed:
             raise InputError(
                 f"inductance of exciter {self.name} must let the current follow its back EMF, "
-                f"Bl² L / R² at most {_MOST_LAG:g} of the magnet's mass, {1e3 * most:.3g} g, got "
+                f"Bl² L / R² at most {_MAX_LAG:g} of the magnet's mass, {1e3 * allowed:.3g} g, got "
                 f"{1e3 * lag:.3g} g; check inductance and force_factor"
             )
 

@@ -163,9 +163,11 @@ def excursions_of(rig: Rig) -> Excursions:
     some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]
     if some:
         largest[:, some] = limits.level * magnets_of(rig, free).by_jumps(frequencies)
-    passed = np.asarray(largest > np.array([one.excursion for one in exciters]))
+    passed = largest > np.array([one.excursion for one in exciters])
     rows = np.flatnonzero(passed.any(axis=1))
     allowed = low
     if len(rows):
         allowed = float(frequencies[rows[-1] + 1]) if rows[-1] + 1 < len(passed) else math.inf
-    return Excursions(limits.level * settled, largest.max(axis=0), passed.max(axis=0), allowed)
+    return Excursions(
+        limits.level * settled, largest.max(axis=0), np.asarray(passed.any(axis=0)), allowed
+    )

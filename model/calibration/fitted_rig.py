@@ -128,7 +128,7 @@ def uncertainty_of(
     errors = problem.plate.errors(fit.z, fit.error)
     # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
     by_coils = [each for each in problem.plate.of_exciters if each.kind == "damping"]
-    told = [one for one in parameters if one.parameter not in by_coils]
+    stated = [one for one in parameters if one.parameter not in by_coils]
     relative = {
         kind: [
             math.hypot(
@@ -138,12 +138,12 @@ def uncertainty_of(
                 else _MODEL_ERROR,
             )
             for one, error in zip(parameters, errors, strict=True)
-            if one in told and one.parameter.kind == kind and one.is_identified and one.value > 0
+            if one in stated and one.parameter.kind == kind and one.is_identified and one.value > 0
         ]
         for kind in ("modulus", "loss_factor", "stiffness", "damping")
     }
     known = {
-        kind: len(values) == sum(one.parameter.kind == kind for one in told)
+        kind: len(values) == sum(one.parameter.kind == kind for one in stated)
         for kind, values in relative.items()
     }
 

@@ -128,7 +128,8 @@ class Rig:
 
         Springs that are no ERAs without an amplifier, which come after them, and act along no edge.
         """
-        springs = [number for number, each in enumerate(self.masses) if each.stiffness]
+        # A diagnosis tries a fingertip among them, which has none.
+        springs = [n for n, each in enumerate(self.masses) if getattr(each, "stiffness", 0.0)]
         feet = springs[: len(springs) - len(self.supports)]
         return tuple(number for number in feet if self.masses[number].foot != EDGE_FOOT)
 

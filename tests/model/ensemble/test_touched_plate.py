@@ -260,7 +260,11 @@ def test_expected_power_is_the_mean_square_of_the_draws():
     np.testing.assert_allclose(found, powers @ FIVE_POINTS.weights, rtol=0.05)
 
 
-@pytest.mark.parametrize(("rig", "count"), [(UNEQUAL, 1), (UNEQUAL, 3), (MIXED, 3)])
+@pytest.mark.parametrize(
+    ("rig", "count"),
+    [(UNEQUAL, 1), (UNEQUAL, 3), (MIXED, 3)],
+    ids=["1", "3", "exciter-3"],
+)
 @pytest.mark.usefixtures("kernels_or_numpy")
 def test_every_stage_is_that_of_numpy(rig, count):
     """Fields, forms and what drawn plates feel, in single precision: to 1e-4 of the largest.

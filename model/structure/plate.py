@@ -34,12 +34,13 @@ import math
 from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from model.arguments import expect_between, expect_values
-from model.arrays import FloatArray
 from model.errors import InputError
+
+if TYPE_CHECKING:
+    from model.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -149,14 +150,14 @@ class Sheet:
         """
         return math.sqrt(self.material.shares.e2) * self._along
 
-    def rigidity_towards(self, cos2: FloatArray | float) -> FloatArray:
+    def rigidity_towards(self, cos2: "FloatArray | float") -> "FloatArray | float":
         """Flexural rigidity [N m] of straight waves, by the squared cosine of their direction.
 
         To the length: D1 c⁴ + 2 (nu12 D2 + 2 D12) c² s² + D2 s⁴.
         """
         d1, mixed, d2 = self._rigidities
-        sin2 = 1 - np.asarray(cos2)
-        return np.asarray(d1 * cos2**2 + 2 * mixed * cos2 * sin2 + d2 * sin2**2)
+        sin2 = 1 - cos2
+        return d1 * cos2**2 + 2 * mixed * cos2 * sin2 + d2 * sin2**2
 
     @property
     def least_rigidity(self) -> float:

@@ -56,7 +56,7 @@ from controller.operation.states import (
     Operation,
     Trigger,
 )
-from controller.play.joint_answer import MAX_DB_SL
+from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
 from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame

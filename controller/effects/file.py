@@ -13,8 +13,7 @@ from controller.content.formats import named_content, named_contents, read_conte
 from controller.content.pattern import Pattern
 from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
-from controller.play.intent import Pulse
-from controller.play.joint_answer import MAX_DB_SL
+from controller.play.intent import MAX_DB_SL, Pulse
 from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 from model.errors import InputError

@@ -25,6 +25,9 @@ _MAX_DELAY = 0.1
 FADED_AFTER = 0.05
 """After the end of a pulse, or of a layer, by so long [s] none of it is left on any amplifier."""
 
+MAX_DB_SL = 26.0
+"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
+
 NO_CONTACTS = "no contact on the plate"
 
 Band: TypeAlias = tuple[float, float]

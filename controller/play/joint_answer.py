@@ -15,7 +15,7 @@ import numpy as np
 from controller.play.ahead import felt_on_ways, foreign_on_ways, with_ways
 from controller.play.capabilities import PlaybackCapabilities
 from controller.play.content import Content, Prediction, Selection, not_served
-from controller.play.intent import Target, band_of_table
+from controller.play.intent import MAX_DB_SL, Target, band_of_table
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import (
     HELD_BACK,
@@ -32,9 +32,6 @@ from model.answer.plan import answer
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration.excitation import Excitation, base_amplitudes
-
-MAX_DB_SL = 26.0
-"""Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
 
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2

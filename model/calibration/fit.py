@@ -277,7 +277,7 @@ def _result(
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = by_gain / gains
         of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
-    # A force factor is told together with the gain, and their product is what moves the plate.
+    # A force factor is found with the gain: their product is what moves the plate.
     space, numbers = problem.plate.model.space, np.flatnonzero(searched)
     for era, factor in enumerate(space.indices("force_factor")):
         relative[numbers == factor, :, era] += space.std[factor]

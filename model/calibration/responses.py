@@ -66,6 +66,11 @@ class Responses:
     skipped: int = 0
     masses: FloatArray | None = None
 
+    def __post_init__(self) -> None:
+        """Keep masses only where one is above 0."""
+        if self.masses is not None and not self.masses.any():
+            object.__setattr__(self, "masses", None)
+
     @property
     def count(self) -> int:
         """Number of measured values."""
@@ -161,7 +166,7 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
         frequencies,
         values,
         skipped=skipped,
-        masses=np.array([*masses.values()]) if any(masses.values()) else None,
+        masses=np.array([*masses.values()]),
     )
 
 

@@ -84,7 +84,8 @@ def mounts_of(
     off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
     stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
     by_stiffness = (stiffer - softer) / 2
-    by_damping = math.log(uncertainty.damping) * np.array([era.by_damping(w) for era in eras]).T
+    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
+    by_damping = math.log(uncertainty.damping) * np.array(damped).T
     strokes = np.array([era.base(w) for era in eras]).T
     each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes
     single = (part.astype(np.complex64) for part in (*each, by_stiffness, by_damping))

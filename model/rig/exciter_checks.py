@@ -13,11 +13,11 @@ from model.config.document import Document
 from model.rig.exciter_section import ExciterSection, misread_resonance, rated_power
 from model.rig.rig import Rig
 from model.structure.exciter import Exciter
+from model.structure.support import GRAVITY
 
 _EXCURSIONS = "model.transients.excursions:excursions_of"
 """By name: it solves plates, which the packages above this one do."""
 
-_GRAVITY = 9.81  # m/s²
 _NEARLY = 1.001
 _LAG = 0.01  # (omega L / R)² from which time and frequency differ visibly
 _ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
@@ -115,15 +115,15 @@ def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
         )
     if not math.isfinite(one.excursion):
         yield "excursion: missing, so that nothing limits how far its magnet moves; add it"
-    sag = 0.0 if one.held else _GRAVITY * one.magnet_mass / one.stiffness
+    sag = 0.0 if one.held else GRAVITY * one.magnet_mass / one.stiffness
     if math.isfinite(one.excursion) and sag > one.excursion:
         yield (
             f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet hangs "
             f"{1e3 * sag:.2g} mm from its middle by its weight, of an excursion of "
             f"{1e3 * one.excursion:.2g} mm; check resonance, resonance_is and weight, or hold it"
         )
-    total, highest = one.resistance + one.source_resistance, rig.limits.frequency_max
-    lag = (2 * math.pi * highest * one.inductance / total) ** 2
+    highest = rig.limits.frequency_max
+    lag = (2 * math.pi * highest * one.inductance / one.loop_resistance) ** 2
     if lag > _LAG:
         yield (
             f"inductance: (omega L / R)² is {lag:.2g} at {highest:g} Hz, by which onsets, "

@@ -181,21 +181,21 @@ def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tu
     name = read("type")
     # Of a type that is misspelt, nothing is known to be missing.
     unknown = "type" in given and name is None
-    of_type = ExciterSection.model_fields.keys() if unknown else _of_type(name).keys()
+    of_type = _of_type(name)
     for key in ("amplifier", "channel"):
         if key not in given:
             yield key, "missing; add it: an exciter is driven, and supports nothing by itself"
     for key in _NEEDED:
-        if key not in given and key not in of_type:
+        if not unknown and key not in given and key not in of_type:
             yield key, "missing; add it, or a type that has it"
     for key, instead in (("stiffness", "resonance"), ("damping", "q")):
         if {key, instead} <= given:
             yield key, f"must not be given with {instead}; remove one of the two"
-        elif not {key, instead} & given and instead not in of_type:
+        elif not unknown and not {key, instead} & given and instead not in of_type:
             yield instead, "missing; add it, or a type that has it"
     if "resonance" in given and "resonance_is" not in given:
         yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
-    rated, power = None if unknown else _of_type(name).get("power"), read("power")
+    rated, power = of_type.get("power"), read("power")
     if rated is not None and isinstance(power, float) and power > rated.value:
         bears = f"{rated.value:g} W, which a {read('type')} bears"
         yield "power", f"must be at most {bears}, got {power:g} W; lower it"

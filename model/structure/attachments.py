@@ -125,9 +125,6 @@ class Source(Support, Protocol):
     def base(self, omega: FloatArray) -> ComplexArray:
         """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
 
-    def by_damping(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of its damping [N/m]."""
-
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """The source with another stiffness and damping, by factors."""
 
@@ -245,10 +242,6 @@ class Era(MeasuredGains):
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
         return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
-
-    def by_damping(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of c, i omega c [N/m]."""
-        return np.asarray(1j * omega * self.damping)
 
     def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
         """An ERA that is stiffer and damps more by factors."""

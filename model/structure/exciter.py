@@ -92,6 +92,11 @@ class Exciter(MeasuredGains):
         return self.voltage
 
     @property
+    def loop_resistance(self) -> float:
+        """R = R_e + R_g [ohm], of coil and amplifier."""
+        return self.resistance + self.source_resistance
+
+    @property
     def magnet_frequency(self) -> float:
         """Resonance of the magnet on the coil that is held, f_m [Hz]."""
         return math.sqrt(self.stiffness / self.magnet_mass) / (2 * math.pi)
@@ -112,8 +117,7 @@ class Exciter(MeasuredGains):
         u is the voltage less the back EMF. Force and damping are within (omega L / R)² of the exact
         ones, 0.5 % at 500 Hz of a common coil.
         """
-        total = self.resistance + self.source_resistance
-        delay = self.inductance / total
+        total, delay = self.loop_resistance, self.inductance / self.loop_resistance
         return InTime(
             mass=self.coil_mass,
             stiffness=self.stiffness,
@@ -154,11 +158,6 @@ class Exciter(MeasuredGains):
             return np.zeros(w.shape, dtype=complex)
         return np.asarray(self._pull(w) / (w**2 * self.magnet_mass))
 
-    def by_damping(self, omega: FloatArray) -> ComplexArray:
-        """Change of D with the logarithm of c, T² i omega c [N/m]."""
-        w = np.asarray(omega)
-        return np.asarray(self._share(w) ** 2 * 1j * w * self.damping)
-
     @property
     def quality(self) -> float:
         """Q = sqrt(k M) / (c + Bl² / R) of the magnet on the coil that is held, driven."""
@@ -176,8 +175,7 @@ class Exciter(MeasuredGains):
 
     def heat_by(self, volts: float) -> float:
         """Mean power [W] in the coil by an amplitude of the voltage [V], held still."""
-        total = self.resistance + self.source_resistance
-        return (volts / total) ** 2 * self.resistance / 2
+        return (volts / self.loop_resistance) ** 2 * self.resistance / 2
 
     def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
         """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
@@ -230,7 +228,7 @@ class Exciter(MeasuredGains):
 
     def _impedance(self, w: FloatArray) -> ComplexArray:
         """Z [ohm]."""
-        return np.asarray(self.resistance + self.source_resistance + 1j * w * self.inductance)
+        return np.asarray(self.loop_resistance + 1j * w * self.inductance)
 
     def _spring(
         self, w: FloatArray, stiffness: Factor = 1.0, damping: Factor = 1.0

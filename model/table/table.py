@@ -345,14 +345,21 @@ class LocalizationTable:
     @cached_property
     def allowed_shares(self) -> FloatArray:
         """Share of full level that all actuators may play together in any phases, (f,)."""
+        if not self._is_limited:
+            return np.ones(len(self.frequencies))
         return MagnetMotions.of(self.in_time).shares(self.frequencies)
+
+    @cached_property
+    def _is_limited(self) -> bool:
+        """Whether an excursion limits what any of its actuators plays."""
+        return any(math.isfinite(era.excursion) for era in self.eras)
 
     def excursion_of(self, excitations: Iterable[Excitation]) -> float:
         """Part of the magnets' excursion that is kept for excitations, whose parts add.
 
         Of full level the share of each that is strongest in `allowed_shares`; 0 without a limit.
         """
-        if not any(math.isfinite(era.excursion) for era in self.eras):
+        if not self._is_limited:
             return 0.0
         parts = dict[tuple[int, float], float]()
         for number, each in enumerate(excitations):

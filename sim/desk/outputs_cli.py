@@ -148,7 +148,7 @@ def _said(
     names: Sequence[str],
     taken: Sequence[str],
 ) -> str:
-    """The actuator that somebody says has moved, "" for none."""
+    """The actuator that has moved, as the person says; "" for none."""
     from registry.suggestions import did_you_mean
 
     left = [name for name in names if name not in taken]

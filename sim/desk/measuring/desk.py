@@ -80,14 +80,13 @@ class Desk:
 
         looped (f,): of the loop-back.
         """
-        masses = np.array([sensor.mass for sensor in self.sensors])
         plain = values[:, self.columns, : len(self.full_levels)] / converters(looped)[:, None, None]
         return Responses(
             tuple(sensor.name for sensor in self.sensors),
             np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
             frequencies,
             plain.transpose(0, 2, 1) / self.full_levels[:, None] / self.sensitivities,
-            masses=masses if masses.any() else None,
+            masses=np.array([sensor.mass for sensor in self.sensors]),
         )
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ _AT = 5e-4  # m; places of a file are those of the sensors within that
 _NOISY = 0.03  # of the response
 
 Ask = Callable[[str], str]
-"""Shows a person what to do and returns what was typed; "q" where nobody answers."""
+"""Shows a person what to do and returns what was typed; "q" without an answer."""
 Tell = Callable[[str], None]
 """Shows a person a line."""
 
@@ -82,13 +82,12 @@ class PlacesFile:
     def responses(self) -> Responses:
         """All that is measured."""
         places = [place for place in self.desk.sensors if place.name in self.values]
-        masses = np.array([place.mass for place in places])
         return Responses(
             tuple(place.name for place in places),
             np.array([[place.x, place.y] for place in places]),
             self.frequencies,
             np.stack([self.values[place.name] for place in places], axis=2),
-            masses=masses if masses.any() else None,
+            masses=np.array([place.mass for place in places]),
         )
 
     def _check(self, each: MeasuredValue) -> None:
@@ -124,7 +123,7 @@ def measure_places(
 ) -> dict[str, Measured]:
     """Guide a person through the missing places; returns what was measured now, by place.
 
-    A place that fails a check is told with its remedy, and asked for again. Raises DeviceLost,
+    A place that fails a check is reported with its remedy, and asked for again. Raises DeviceLost,
     OSError; what was measured before is in the file then.
     """
     found: dict[str, Measured] = {}

@@ -1,6 +1,6 @@
 """Which output of a sound card drives which actuator: one output after the other plays.
 
-A soft tone is felt or seen by whoever stands there. An accelerometer that is put beside each
+A person feels or sees a soft tone. An accelerometer that is put beside each
 actuator in turn tells it by itself, also of a plate that is hardly known: an actuator moves its own
 place more than others do, and by the velocity there it gives power to the plate. Responses at all
 places are compared with those of the rig's model, each frequency by its own size. The delay of the

@@ -52,7 +52,7 @@ def test_moduli_along_across_and_of_shear_are_found() -> None:
     found = identify(rig, Measurement.of(sensors, tones, responses), seed=1)
     assert found.is_explained
     known = found.rig.plate
-    # A thicker board of a smaller modulus has the same modes: rigidities are what is told.
+    # A thicker board of a smaller modulus has the same modes: rigidities are what is found.
     for key, factor in HIDDEN.items():
         rigidity = known.material.moduli[key] * known.thickness**3
         before = own.moduli[key] * rig.plate.thickness**3

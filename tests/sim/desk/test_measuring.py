@@ -110,7 +110,7 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
 ) -> None:
     """The last ERA's output is the loop-back's, too: four runs, the same responses and delay.
 
-    Inputs exchanged, and another ERA's output in the cable, are told with their places.
+    Inputs exchanged, and another ERA's output in the cable, are reported with their places.
     """
     desk = Desk(rig, SENSORS, is_shared=True)
     sines = Multisine(FREQUENCIES, 4, RATE, LEVEL)

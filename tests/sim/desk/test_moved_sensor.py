@@ -127,7 +127,7 @@ def test_each_place_is_measured_under_the_sensors_mass(
 ) -> None:
     """Against the plate's closed form with the mass at that place alone; the file has all of it.
 
-    5 g change responses by several percent, so that the bare plate is told from it.
+    5 g change responses by several percent, so that the bare plate can be distinguished from it.
     """
     assert bench.measure() == ["P1", "P2", "P3"]
     assert "x 30 mm, y 50 mm (place 1 of 3)" in bench.person.prompts[0]

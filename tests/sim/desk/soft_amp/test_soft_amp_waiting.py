@@ -31,7 +31,7 @@ RATE = 96_000  # not the one that is assumed until the server says its own
 async def test_amplifier_waits_for_its_server_and_plays_by_the_clock_of_that(
     tmp_path: Path,
 ) -> None:
-    """In fault at first, which is told once; then 1 kHz is 1 kHz at a rate nobody had stated."""
+    """In fault at first, reported once; then 1 kHz is 1 kHz at a rate that was not stated."""
     name = f"wait{os.getpid()}"
     environment = os.environ | {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1"}
     options = ("--device", "jack:card", "--channels", str(CHANNELS), "--link", str(tmp_path / "a"))

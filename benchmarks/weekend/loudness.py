@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from benchmarks.page import write_parts
-from benchmarks.weekend.boards import ACRYLIC, BIRCH, LOWEST, MDF, PAGE, Board
+from benchmarks.weekend.boards import BOARDS, PAGE
 from model.finger.perception import detection_threshold
 
 AIR, DISTANCE, REFERENCE = 1.2, 1.0, 20e-6  # kg/m³, m, Pa
@@ -33,8 +33,7 @@ def table() -> str:
         f"| board | {' | '.join(f'{level} dB SL' for level in LEVELS)} |",
         f"|---|{'---|' * len(LEVELS)}",
     ]
-    for name, plate in (("acrylic", ACRYLIC), ("birch", BIRCH), ("MDF", MDF)):
-        rig = Board(name, plate, "foam", next(iter(LOWEST))).rig
+    for name, rig in {board.name.split()[0]: board.rig for board in BOARDS}.items():
         area, cells = rig.plate.length * rig.plate.width, []
         for level in LEVELS:
             peaks = detection_threshold(FREQUENCIES, rig.threshold) * 10 ** (level / 20)

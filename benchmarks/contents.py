@@ -322,7 +322,7 @@ def _kept(
         np.random.default_rng([9, seed]),
         table.uncertainty,
         count=HELD_OUT,
-        era_count=len(table.eras),
+        of=table,
         contact_count=count,
     )
     contents = range(len(found.layers))

@@ -98,5 +98,8 @@ def _dynamic_stiffness(each: Actuator | PointLoad | FingertipLoad, omega: float)
         pulp = tip.stiffness + 1j * omega * tip.damping
         bone = tip.joint_stiffness + 1j * omega * tip.joint_damping - omega**2 * tip.phalanx_mass
         return pulp * bone / (pulp + bone) - omega**2 * tip.contact_mass
-    mass = each.bolt_mass if isinstance(each, Era) else each.mass
-    return each.stiffness + 1j * omega * each.damping - omega**2 * mass
+    if isinstance(each, Era):
+        mass, loss = each.bolt_mass, 0.0
+    else:
+        mass, loss = each.mass, each.loss_factor
+    return each.stiffness * (1 + 1j * loss) + 1j * omega * each.damping - omega**2 * mass

@@ -148,7 +148,7 @@ def realised(
         np.random.default_rng([SEED, number, len(asked.quiet)]),
         rig.uncertainty,
         count=DRAWS,
-        era_count=len(eras),
+        of=rig,
         contact_count=len(asked.contacts),
     )
     shares = bases / [era.full_level for era in eras]

@@ -166,7 +166,7 @@ def _score(
             np.random.default_rng([SEED, quiet, number]),
             rig.uncertainty,
             count=DRAWS,
-            era_count=len(rig.eras),
+            of=rig,
             contact_count=1 + quiet,
         )
         felt = felt_on(table, question, excitation, plates)

@@ -54,8 +54,8 @@ class _Case:
     @property
     def fields(self) -> ComplexArray:
         """Fields of each ERA alone at full stroke, (f, points, eras)."""
-        n, k = len(self.table.eras), len(self.contacts.contacts)
-        one = draw_plates(self.rng, Uncertainty.none(), count=1, era_count=n, contact_count=k)
+        k, none = len(self.contacts.contacts), Uncertainty.none()
+        one = draw_plates(self.rng, none, of=self.table, count=1, contact_count=k)
         (found,) = self.fields_on(np.arange(len(self.table.frequencies)), one)
         return np.asarray(found)
 
@@ -159,7 +159,7 @@ def _hindsight(case: _Case) -> Excitation:
         np.random.default_rng([case.found.seed, case.contacts.number]),
         table.uncertainty,
         count=case.found.draws,
-        era_count=len(table.eras),
+        of=table,
         contact_count=k,
     )
     points = len(case.weights) // k

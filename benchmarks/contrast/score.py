@@ -128,7 +128,7 @@ def on_held_out(
         np.random.default_rng([found.seed, contacts.number]),
         table.uncertainty,
         count=found.draws,
-        era_count=len(table.eras),
+        of=table,
         contact_count=len(contacts.contacts),
     )
     felt = felt_on(table, contacts.placement, excitation, plates)

@@ -120,7 +120,7 @@ def _drawn_plates(
         np.random.default_rng(seed),
         rig.uncertainty,
         count=plates,
-        era_count=len(rig.eras),
+        of=rig,
         contact_count=1,
     )
     for number in range(plates):

@@ -83,9 +83,7 @@ def _contrasts_db(
     table, rig, count = CASE.table, CASE.rig, len(delays)
     names = sorted(rig.amplifiers)
     of = [names.index(rig.wiring[era.name].amplifier) for era in table.eras]
-    plates = draw_plates(
-        rng, rig.uncertainty, count=count, era_count=len(of), contact_count=len(places)
-    )
+    plates = draw_plates(rng, rig.uncertainty, of=rig, count=count, contact_count=len(places))
     placed, weights = Placement((places[0],), tuple(places[1:])), read_fingertips(table, places)
     power = []
     for layer in given.layers:

@@ -59,7 +59,7 @@ def main() -> None:
                 fingers = [Finger(at, Stimulus(14.0)) for at in places]
                 found = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
                 plates = draw_plates(
-                    rng, known, count=options.plates, era_count=len(table.eras), contact_count=2
+                    rng, known, count=options.plates, of=table, contact_count=2
                 )
                 contrasts = np.array([each.promised_contrast_db for each in found.fingers])
                 kept.append(contrasts_on(table, found, plates) >= contrasts[:, None])

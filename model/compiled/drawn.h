@@ -118,13 +118,13 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
     const size_t n = on->n, b = on->b, k = on->k, a = b + k, r = on->r;
     const arena mark = *memory;
     value *drives = values(memory, n), *strokes = values(memory, n), *by_damping = values(memory, n);
-    value *by_stiffness = values(memory, n), *without = values(memory, b * n), *attached = values(memory, b);
+    value *by_stiffness = values(memory, on->off), *without = values(memory, b * n), *attached = values(memory, b);
     value *moved = values(memory, a), *held = values(memory, a), *by_loss = values(memory, r);
     value *loss = forces, *damping = loss + a, *own = damping + a, *gains = own + a;
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
     load(by_damping, on->by_damping, n, rows);
-    load(by_stiffness, on->by_stiffness, n, rows);
+    load(by_stiffness, on->by_stiffness, on->off, rows);
     load(attached, on->attached, b, rows);
     load(without, on->moved, b * n, cases);
     load(by_loss, on->by_loss, r, cases);
@@ -143,6 +143,7 @@ INLINE void find_changes(value *forces, value *lost, const touched *of, const pl
         value stretched = subtract_product(times(strokes[e], w[e]), (value){.re = filled(1), .im = ZERO.im}, moved[e]);
         damping[e] = times(by_damping[e], stretched), own[e] = times(by_stiffness[e], stretched);
     }
+    for (size_t j = n; j < (size_t)on->off; j++) own[j] = subtract_product(ZERO, by_stiffness[j], moved[j]);
     for (size_t j = 0; j < a; j++) {
         value by = j < b ? attached[j] : of->D[j - b];
         if (j >= b) own[j] = scaled(times(by, moved[j]), filled(-on->load_std));

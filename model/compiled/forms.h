@@ -35,7 +35,7 @@ INLINE void drive(value *h, const value *drives, size_t p, size_t n) {
 
 /* At frequencies (LANES). */
 SHARED void find_forms(formed *to, const plates *on, const grouped *of, const int *rows, arena *memory) {
-    const size_t n = on->n, b = on->b, k = on->k, a = b + k, j = n + k;
+    const size_t n = on->n, b = on->b, k = on->k, a = b + k, off = on->off, j = off + k;
     const size_t p = of->p, groups = of->groups, at = groups * p, each = at % k ? at : at / k; /* of a finger */
     const int parts = of->others ? 4 : 2;
     const arena mark = *memory;
@@ -46,7 +46,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     value *space = values(memory, touched_space(on)), *room = values(memory, points * a);
     value *t = values(memory, at * a), *h = values(memory, parts * at * n), *fine = to->fine;
     value *moved = values(memory, a * n), *without = values(memory, b * n), *drives = values(memory, n);
-    value *strokes = values(memory, n), *by_damping = values(memory, n), *by_stiffness = values(memory, n);
+    value *strokes = values(memory, n), *by_damping = values(memory, n), *by_stiffness = values(memory, off);
     value *damped = values(memory, n * n), *changes = values(memory, j * n);
     value *X = values(memory, (parts * p + j) * n), *R = to->power, *U = to->uncertain;
     value *modelled = values(memory, n * n);
@@ -55,7 +55,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     load(drives, on->drives, n, rows);
     load(strokes, on->strokes, n, rows);
     load(by_damping, on->by_damping, n, rows);
-    load(by_stiffness, on->by_stiffness, n, rows);
+    load(by_stiffness, on->by_stiffness, off, rows);
     load(without, on->moved, b * n, cases);
     load_real(error, of->error, n, rows);
     if (of->shares) load_real(shares, of->shares, n * n, rows);
@@ -77,17 +77,17 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
     }
     memcpy(to->fields, h, at * n * sizeof(value));
     with_fingers_moved(moved, without, &now, drives, on);
-    for (size_t i = 0; i < n; i++) {
+    for (size_t i = 0; i < off; i++) {
         for (size_t e = 0; e < n; e++) {
             value own = scaled(moved[i * n + e], filled(-1));
             if (i == e) own = (value){.re = own.re + strokes[e].re, .im = own.im + strokes[e].im};
-            damped[i * n + e] = times(by_damping[i], own);
+            if (i < n) damped[i * n + e] = times(by_damping[i], own);
             changes[i * n + e] = times(by_stiffness[i], own);
         }
     }
     for (size_t i = 0; i < k; i++)
         for (size_t e = 0; e < n; e++)
-            changes[(n + i) * n + e] =
+            changes[(off + i) * n + e] =
                 scaled(times(now.D[i], moved[(b + i) * n + e]), filled(on->load_std));
     product(h + at * n, t, a, damped, at, n, n);
 
@@ -123,7 +123,7 @@ SHARED void find_forms(formed *to, const plates *on, const grouped *of, const in
         for (size_t s = 0; s < j; s++) {
             lanes share = {0};
             for (size_t i = group * p; i < (group + 1) * p; i++)
-                share += of->weights[i] * power(t[i * a + (s < n ? s : b + s - n)]);
+                share += of->weights[i] * power(t[i * a + (s < off ? s : b + s - off)]);
             share = root(share);
             for (size_t e = 0; e < n; e++) *to++ = scaled(changes[s * n + e], share);
         }

@@ -43,7 +43,7 @@ class TouchedPlates(Structure):
     """`plates`: the plate on its ERAs, with fingers on it."""
 
     _fields_ = [
-        *_fields(i="n b k r t rows lanes kept", f="load_std"),
+        *_fields(i="n b k r t off rows lanes kept", f="load_std"),
         *_fields(p="receptance by_force coupling moved minus_omega2 forces strokes by_damping"),
         *_fields(p="by_stiffness by_loss attached shapes centres stiffness of_blocks"),
     ]

@@ -41,8 +41,8 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
             places = random_contacts(rng, fingers, rig.plate)
             placed = Placement(places[:1], places[1:])
             answer = query(table, placed)
-            size = {"era_count": len(rig.eras), "contact_count": fingers}
-            exact = draw_plates(rng, Uncertainty.none(), count=1, **size)
+            none = Uncertainty.none()
+            exact = draw_plates(rng, none, of=there, count=1, contact_count=fingers)
             felt = felt_on(there, placed, answer.layers[0].excitation, exact).contrast
             promised = answer.fingers[0].promised_contrast_db
             assert felt is not None  # noqa: S101  there are quiet fingers

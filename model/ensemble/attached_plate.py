@@ -40,6 +40,7 @@ from model.structure.attachments import (
     attached_stiffness,
     coupled_forces,
     drive_forces,
+    feet_of,
 )
 from model.structure.modal_elasticity import (
     Dispersion,
@@ -61,8 +62,9 @@ class Mounts:
     - stiffness: (f, b) dynamic stiffness of the attachments [N/m]
     - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m], by which
       errors of its spring and damper act
-    - by_stiffness: (f, n), by_damping: (f, n) change of the ERAs' dynamic stiffness by one standard
-      deviation [N/m]
+    - by_stiffness: (f, s) change of the dynamic stiffness of the attachments up to the last foot
+      that deviates by one standard deviation of their stiffness, 0 of what is no foot [N/m]
+    - by_damping: (f, n) of the ERAs' by one of their damping [N/m]
     """
 
     minus_omega2: Float32Array
@@ -79,11 +81,15 @@ def mounts_of(
     """ERAs and masses at w (f,) [rad/s], wherever they are.
 
     Errors of stiffnesses by half the difference of one standard deviation to both sides: an
-    exciter's suspension is resonant.
+    exciter's suspension is resonant. Feet deviate by `supports`.
     """
     off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
     stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
-    by_stiffness = (stiffer - softer) / 2
+    feet = feet_of(masses) if uncertainty.supports else ()
+    by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
+    for number in feet:
+        by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
+    by_stiffness = np.hstack([(stiffer - softer) / 2, by_foot])
     damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
     by_damping = math.log(uncertainty.damping) * np.array(damped).T
     strokes = np.array([era.base(w) for era in eras]).T

@@ -40,8 +40,8 @@ COMMON = 2.0
 class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
-    loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA, nothing of
-    masses, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
+    loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA and of
+    masses up to the last foot, nothing of others, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
     d): of discretisation at each finger, complex of mean square 1; harmonics (n, d): second
     harmonic of each ERA, complex, relative to its motion; node (d,): which of the thicknesses each
     has.
@@ -62,6 +62,7 @@ def draw(
     finger_count: int,
     *,
     masses: int = 0,
+    to_feet: int = 0,
     count: int,
     seed: int,
     gain: float,
@@ -72,21 +73,23 @@ def draw(
 ) -> Draws:
     """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
-    gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together; harmonic:
+    to_feet: of the masses, up to the last foot that deviates; gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together; harmonic:
     root mean square of each ERA's. Of each thickness as many plates, or one less. All answers of a
     plate share its common gain: half of the plates have it COMMON standard deviations low, the
     others high, so that a plate whose own is no farther off keeps nine of ten levels.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n, count)
+    # Those of feet last, so that all else of a rig stays.
+    numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n + to_feet, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
-    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature = np.split(
-        numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n])
+    parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet = np.split(
+        numbers, np.cumsum([3 + n + k, n, n, k, k, 1, n, n])
     )
     common = np.where(common > np.median(common), COMMON, -COMMON)
     gains = (1 + gain * sizes) * np.exp(1j * phase * phases + common_gain * common) - 1
-    own = np.insert(parameters[3:], [n] * masses, 0.0, axis=0)
+    of_masses = np.pad(feet, ((0, masses - to_feet), (0, 0)))
+    own = np.insert(parameters[3:], [n] * masses, of_masses, axis=0)
     drawn = Draws(
         loss=parameters[1].astype(np.float32),
         damping=parameters[2].astype(np.float32),

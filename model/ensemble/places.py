@@ -37,9 +37,10 @@ def with_places(
     changed, left = np.empty_like(by_one), np.empty_like(by_one)
     for row in range(len(by_one)):
         changed[row], left[row] = _by_places(on, row, shifts, gram, np.array(by_field))
-    by_stiffness = np.hypot(np.abs(plate.by_stiffness), changed / by_one)
-    by_stiffness = by_stiffness * np.exp(1j * np.angle(plate.by_stiffness))
-    found = replace(plate, by_stiffness=by_stiffness.astype(np.complex64))
+    by_stiffness, of_springs = plate.by_stiffness.copy(), plate.by_stiffness[:, :n]
+    size = np.hypot(np.abs(of_springs), changed / by_one)
+    by_stiffness[:, :n] = size * np.exp(1j * np.angle(of_springs))
+    found = replace(plate, by_stiffness=by_stiffness)
     return replace(on, plate=found), left
 
 

@@ -122,7 +122,8 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
     plate = on.plate
     (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
     kept = min(t, THINNER + 1)  # thicknesses that searches rank by
-    found = TouchedPlates(plate.era_count, b, 0, r, t, f, 0, kept, plate.uncertainty.fingertip)
+    n, off = plate.era_count, plate.by_stiffness.shape[1]
+    found = TouchedPlates(n, b, 0, r, t, off, f, 0, kept, plate.uncertainty.fingertip)
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},

@@ -12,8 +12,8 @@ thickness each. The expected power of weights w at a fingertip is w^H R w to fir
 
 with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j by how much
 each ERA at full stroke deforms it. Each change d is one by a standard deviation, s_j that of the
-stiffness: the ERAs' damping c together, stiffness of each ERA and load of each finger j on their
-own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects locally.
+stiffness: the ERAs' damping c together, stiffness of each ERA and foot and load of each finger j on
+their own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects locally.
 For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly; the
 modulus counts along with it (`attached_plate`). The loss factor changes next to nothing.
 
@@ -152,8 +152,8 @@ class TouchedPlate:
             for node in (THICKER, THINNER):
                 other, _ = self.sources(rows, np.full(f, node), every)
                 changes.append((other[:, :, :n] * forces - h) * np.float32(math.sqrt(0.5)))
-        a, k = moved.shape[1], len(self.centres)
-        uncertain = np.concatenate([np.arange(n), np.arange(a - k, a)])
+        a, k, s = moved.shape[1], len(self.centres), plate.by_stiffness.shape[1]
+        uncertain = np.concatenate([np.arange(s), np.arange(a - k, a)])
         load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
         by_one = np.concatenate([plate.by_stiffness[rows], load], axis=1)
         deformed = stretched[:, uncertain] * by_one[:, :, None]
@@ -192,8 +192,8 @@ class TouchedPlate:
         stretched = -moved
         stretched[:, :n] += plate.strokes[rows] * weights
         damping[:, :n] = plate.by_damping[rows] * stretched[:, :n]
-        own[:, :n] = plate.by_stiffness[rows] * stretched[:, :n]
-        b = plate.stiffness.shape[1]
+        b, s = plate.stiffness.shape[1], plate.by_stiffness.shape[1]
+        own[:, :s] = plate.by_stiffness[rows] * stretched[:, :s]
         by_load = np.float32(plate.uncertainty.fingertip) * self.stiffness[rows]
         own[:, b:] = by_load * stretched[:, b:]
         held = np.asarray(drives - stiffness * moved, dtype=np.complex64)
@@ -326,6 +326,7 @@ def drawn_on(
         plate.era_count,
         finger_count,
         masses=plate.stiffness.shape[1] - plate.era_count,
+        to_feet=plate.by_stiffness.shape[1] - plate.era_count,
         count=by.count,
         seed=by.seed,
         gain=plate.uncertainty.gain,

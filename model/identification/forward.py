@@ -158,8 +158,8 @@ class ForwardModel:
     @cached_property
     def springs(self) -> ComplexArray:
         """Dynamic stiffness of the springs of the rig's feet, with their losses (f, q) [N/m]."""
-        feet = [replace(self.rig.masses[n], mass=0.0, damping=0.0) for n in self.rig.feet]
-        return attached_stiffness(self.omega, feet)
+        found = [self.rig.masses[number].spring(self.omega) for number in self.rig.feet]
+        return np.array(found, dtype=complex).reshape(-1, len(self.omega)).T
 
     @cached_property
     def drive_gains(self) -> ComplexArray:

@@ -59,7 +59,7 @@ def expected_contrast(
                 rng,
                 identified.uncertainty,
                 count=_PLATES,
-                era_count=len(identified.eras),
+                of=identified,
                 contact_count=quiet + 1,
             )
             each = []

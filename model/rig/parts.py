@@ -125,6 +125,7 @@ def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
                 damping=damping,
                 foot=section.foot,
                 loss_factor=loss_factor,
+                is_foot=True,
             ),
         )
     edge = 2 * (plate.length + plate.width)

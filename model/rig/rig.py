@@ -18,8 +18,7 @@ from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
-from model.structure.attachments import Fingertip, PointLoad
-from model.structure.feet_and_frames import EDGE_FOOT
+from model.structure.attachments import Fingertip, PointLoad, feet_of
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.suggestions import did_you_mean
@@ -124,14 +123,8 @@ class Rig:
 
     @cached_property
     def feet(self) -> tuple[int, ...]:
-        """Numbers of the masses that are feet, in the order of their file.
-
-        Springs that are no ERAs without an amplifier, which come after them, and act along no edge.
-        """
-        # A diagnosis tries a fingertip among them, which has none.
-        springs = [n for n, each in enumerate(self.masses) if getattr(each, "stiffness", 0.0)]
-        feet = springs[: len(springs) - len(self.supports)]
-        return tuple(number for number in feet if self.masses[number].foot != EDGE_FOOT)
+        """Numbers of the masses that are feet, in the order of their file."""
+        return feet_of(self.masses)
 
     @property
     def largest_stiffness(self) -> float:

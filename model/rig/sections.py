@@ -423,7 +423,7 @@ class UncertaintySection(Section):
     """Second harmonic of each ERA's motion as a share of its own amplitude, of any phase."""
 
     supports: Annotated[float, _within("supports")] | None = None
-    """Of the stiffness of each foot, relative: of what measurements are fitted by.
+    """Of the natural logarithm of the stiffness of each foot.
 
     Default: 0.3 where a foot is given by its `kind` alone, else 0
     """

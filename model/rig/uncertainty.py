@@ -21,7 +21,7 @@ BOUNDS = {
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
-_RELATIVE = ("gain", "thickness", "modulus", "stiffness", "common_gain", "field", "harmonic")
+_RELATIVE = ("gain", "thickness", "modulus", "stiffness", "supports", "common_gain", "field", "harmonic")
 
 MAX_UNCERTAINTY = 1000.0
 """Of any of them, also in a study of plates beyond BOUNDS."""
@@ -38,9 +38,8 @@ class Uncertainty:
     its root mean square over the plate, beside all others; modulus: of the plate's modulus of
     elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
     [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
-    amplitude, of any phase; supports: stiffness of each foot, relative, which a fit and simulated
-    plates read, not answers. The defaults are those of a plate as built from its drawing and not
-    measured.
+    amplitude, of any phase; supports: of the logarithm of the stiffness of each foot. The defaults
+    are those of a plate as built from its drawing and not measured.
     """
 
     gain: float = 0.05

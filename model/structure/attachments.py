@@ -376,6 +376,7 @@ class PointLoad:
 
     foot [m]: radius of the disc on which it acts, 0 for a point. It follows the mean deflection;
     its rotary inertia is not modelled. loss_factor: eta of the spring, k (1 + i eta), as of foam.
+    is_foot: whether it is a foot, whose stiffness `supports` of a rig's uncertainty is of.
     """
 
     x: float
@@ -385,6 +386,7 @@ class PointLoad:
     mass: float = 0.0
     foot: float = 0.0
     loss_factor: float = 0.0
+    is_foot: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
@@ -401,8 +403,18 @@ class PointLoad:
 
         At negative frequencies, as in the lower sideband of a fast ramp, the conjugate.
         """
-        lossy = self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega))
-        return np.asarray(lossy + 1j * omega * self.damping - omega**2 * self.mass)
+        spring = self.spring(omega)
+        return np.asarray(spring + 1j * omega * self.damping - omega**2 * self.mass)
+
+    def spring(self, omega: FloatArray) -> ComplexArray:
+        """Its part k (1 + i eta) [N/m], of the shape of omega [rad/s]."""
+        return np.asarray(self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega)))
+
+
+def feet_of(loads: Iterable[Support]) -> tuple[int, ...]:
+    """Numbers of the loads that are feet, in their order."""
+    # A diagnosis tries a fingertip among them, which is none.
+    return tuple(n for n, each in enumerate(loads) if getattr(each, "is_foot", False))
 
 
 Complex = TypeVar("Complex", bound="np.complexfloating[Any, Any]")

@@ -16,11 +16,13 @@ from model.answer.fingers import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.draws import over_fingertips
+from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import (
     FingertipLoad,
     attached_stiffness,
     coupled_forces,
+    feet_of,
     fingertip_loads,
     footprints_of,
 )
@@ -36,8 +38,9 @@ class Plates:
     thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
     load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
     deviation (d, contacts): of the response at each finger, in errors of the field; modulus (d,):
-    of elasticity. Further, places (d, eras, 2): by how far each ERA is off [m]; harmonic (d, eras):
-    complex second harmonic of each ERA's motion, relative to its own.
+    of elasticity; feet (d, feet): of the stiffness of each foot. Further, places (d, eras, 2): by
+    how far each ERA is off [m]; harmonic (d, eras): complex second harmonic of each ERA's motion,
+    relative to its own.
     """
 
     thickness: FloatArray
@@ -50,17 +53,19 @@ class Plates:
     modulus: FloatArray
     places: FloatArray
     harmonic: ComplexArray
+    feet: FloatArray
 
 
 def draw_plates(
     rng: np.random.Generator,
     uncertainty: Uncertainty,
     *,
+    of: Rig | LocalizationTable,
     count: int,
-    era_count: int,
     contact_count: int,
 ) -> Plates:
-    """Draw plates: normal numbers, of logarithms for damping, loss and load."""
+    """Draw plates on ERAs and feet: normal numbers, of logarithms for damping, loss, load, feet."""
+    era_count, foot_count = len(of.eras), len(feet_of(of.masses))
 
     def normal(*shape: int) -> FloatArray:
         return rng.standard_normal((count, *shape))
@@ -86,6 +91,7 @@ def draw_plates(
         modulus=1 + uncertainty.elasticity * normal(),
         places=uncertainty.place * normal(era_count, 2),
         harmonic=uncertainty.harmonic * complex_normal(era_count),
+        feet=np.exp(uncertainty.supports * normal(foot_count)),
     )
 
 
@@ -203,8 +209,10 @@ def accelerations_on(
     at_eras, pushes = (np.stack(part, axis=-1) for part in zip(*each, strict=True))
     loads = plates.load[:, : len(fingers)]
     factors = np.pad(loads, ((0, 0), (len(table.masses), 0)), constant_values=1.0)
-    resting = attached_stiffness(w, table.masses, fingers)
-    stiffness = np.concatenate([at_eras, factors[:, None] * resting], axis=-1)
+    resting = factors[:, None] * attached_stiffness(w, table.masses, fingers)
+    for number, by in zip(feet_of(table.masses), plates.feet.T, strict=True):
+        resting[:, :, number] += np.multiply.outer(by - 1, table.masses[number].spring(w))
+    stiffness = np.concatenate([at_eras, resting], axis=-1)
     nominal = attached.modal[rows]
     lossy = nominal.real + 1j * plates.loss[:, None, None] * nominal.imag
     stiffer = np.asarray(plates.modulus[:, None, None] * lossy, dtype=complex)

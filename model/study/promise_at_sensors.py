@@ -160,7 +160,7 @@ def _promise(
         rng,
         table.uncertainty,
         count=PLATES,
-        era_count=len(table.eras),
+        of=table,
         contact_count=len(names),
     )
     tones = amplitudes_on(table, placed.contacts, layer.excitation, plates)

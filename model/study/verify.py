@@ -252,7 +252,7 @@ def _kept_share(table: LocalizationTable, answer: Answer, rng: np.random.Generat
         rng,
         table.uncertainty,
         count=PLATES,
-        era_count=len(table.eras),
+        of=table,
         contact_count=len(answer.fingers),
     )
     contrast = felt_on(table, answer.placement(layer), layer.excitation, plates).contrast

@@ -65,8 +65,9 @@ class ChannelErrors:
 class PlateErrors:
     """A plate on its ERAs relative to the rig's: factors, by default 1.
 
-    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; masses:
-    on the plate beside the rig's; mesh: on which it is solved, None for the rig's.
+    stiffness: by ERA; places [m]: by ERA, by how far it is off; era_damping: of all ERAs; feet: of
+    the stiffness of each foot, by its number among the rig's masses; masses: on the plate beside
+    the rig's; mesh: on which it is solved, None for the rig's.
     """
 
     thickness: float = 1.0
@@ -75,6 +76,7 @@ class PlateErrors:
     era_damping: float = 1.0
     stiffness: Mapping[str, float] = field(default_factory=dict)
     places: Mapping[str, Point] = field(default_factory=dict)
+    feet: Mapping[int, float] = field(default_factory=dict)
     masses: tuple[PointLoad, ...] = ()
     mesh: PlateMesh | None = None
 
@@ -96,11 +98,14 @@ class PlateErrors:
             rig.plate.scaled(thickness=self.thickness, modulus=self.modulus),
             loss_factor=min(self.loss_factor * rig.plate.loss_factor, _MAX_LOSS_FACTOR),
         )
+        masses = list(rig.masses)
+        for number, factor in self.feet.items():
+            masses[number] = replace(masses[number], stiffness=factor * masses[number].stiffness)
         return replace(
             rig,
             plate=plate,
             eras=tuple(map(of, rig.eras)),
-            masses=(*rig.masses, *self.masses),
+            masses=(*masses, *self.masses),
             mesh=self.mesh or rig.mesh,
         )
 
@@ -176,7 +181,7 @@ class Imperfections:
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
 
-    Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved on another mesh
+    Feet log-normal. Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved on another mesh
     than the rig's, as accurate as `mesh: auto`.
     """
     rng = np.random.default_rng(seed)
@@ -200,10 +205,12 @@ def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     )
     # Numbers of their own, so that all else of a seed stays.
     rng = np.random.default_rng([seed, crc32(b"modulus, places, harmonics")])
+    of_feet = np.random.default_rng([seed, crc32(b"feet")])
     plate = replace(
         plate,
         modulus=relative(std.elasticity),
         places=_places(rig, std.place * rng.standard_normal((len(rig.eras), 2))),
+        feet=_feet(rig, np.exp(std.supports * of_feet.standard_normal(len(rig.feet)))),
     )
     real, imaginary = rng.standard_normal((2, len(channels))) * (std.harmonic * math.sqrt(0.5))
     channels = {
@@ -219,6 +226,10 @@ def _places(rig: Rig, off: FloatArray) -> dict[str, Point]:
     return {era.name: (x, y) for era, (x, y) in zip(rig.eras, off.tolist(), strict=True)}
 
 
+def _feet(rig: Rig, factors: FloatArray) -> dict[int, float]:
+    return dict(zip(rig.feet, factors.tolist(), strict=True))
+
+
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
     """Draw a plate as those on which promises are checked (`model.study.exact_plates`).
 
@@ -227,8 +238,8 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
     drawn = draw_plates(
         np.random.default_rng(seed),
         rig.uncertainty,
+        of=rig,
         count=1,
-        era_count=len(rig.eras),
         contact_count=0,
     )
     plate = PlateErrors(
@@ -241,6 +252,7 @@ def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
             era.name: max(factor, _MIN_FACTOR)
             for era, factor in zip(rig.eras, drawn.stiffness[0].tolist(), strict=True)
         },
+        feet=_feet(rig, drawn.feet[0]),
         mesh=_other_mesh(rig),
     )
     channels = {

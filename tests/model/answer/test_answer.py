@@ -68,6 +68,7 @@ def as_modelled(fingers):
         one,
         np.zeros((1, 4, 2)),
         np.zeros((1, 4)),
+        np.ones((1, 0)),
     )
 
 
@@ -83,8 +84,8 @@ def test_promise_of_several_contents_is_kept(contents, quiet):
         plates = draw_plates(
             np.random.default_rng(number),
             table.uncertainty,
+            of=table,
             count=150,
-            era_count=4,
             contact_count=contents + quiet,
         )
         contrast, level = given(table, found, others, plates)

@@ -69,8 +69,8 @@ def test_promise_of_a_modulated_content_is_kept(table, modulation):
         plates = draw_plates(
             np.random.default_rng(number),
             table.uncertainty,
+            of=table,
             count=150,
-            era_count=4,
             contact_count=3,
         )
         each = [
@@ -187,7 +187,7 @@ def test_fingers_that_share_or_are_held_back_feel_side_bands_too(table):
         assert found.layers[found.fingers[other].layer].side_bands
         places = [each.at for each in requests]
         plates = draw_plates(
-            np.random.default_rng(1), table.uncertainty, count=200, era_count=4, contact_count=3
+            np.random.default_rng(1), table.uncertainty, of=table, count=200, contact_count=3
         )
         tones = [
             tones

@@ -69,8 +69,8 @@ def test_nine_of_ten_plates_keep_the_promise_by_every_set():
         plates = draw_plates(
             np.random.default_rng(number),
             smooth_rig().uncertainty,
+            of=smooth_rig(),
             count=150,
-            era_count=4,
             contact_count=3,
         )
 

@@ -137,7 +137,7 @@ def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
 def kept(found: Answer, delays: Callable[[], FloatArray], *, seed: int, count: int = 100) -> float:
     """Share of exactly solved plates that keep the worst finger's promise; delays (d, 2) [s]."""
     rng, places = np.random.default_rng(seed), [each.finger.at for each in found.fingers]
-    plates = draw_plates(rng, IDENTIFIED, count=count, era_count=4, contact_count=len(places))
+    plates = draw_plates(rng, IDENTIFIED, of=table(), count=count, contact_count=len(places))
     late, weights = delays()[:, OF], read_fingertips(table(), places).fine_weights
     power = []
     for layer in found.layers:

@@ -66,7 +66,7 @@ def test_promises_of_exciters_whose_places_are_off_are_kept_on_nine_of_ten_plate
         target, quiet = random_contacts(rng, 2, (0.4, 0.3), margin=0.02).tolist()
         placed = Placement((tuple(target),), (tuple(quiet),))
         layer, promise = only(table, placed, drive_mode="phased")
-        plates = draw_plates(rng, known, count=60, era_count=4, contact_count=2)
+        plates = draw_plates(rng, known, of=rig, count=60, contact_count=2)
         contrast = felt_on(table, placed, layer.excitation, plates).contrast
         assert contrast is not None
         assert promise.promised_contrast_db is not None

@@ -27,7 +27,11 @@ FREQUENCIES = np.array([60.0, 145.0, 260.0, 430.0])
 RIG = replace(
     smooth_rig(),
     mesh=Mesh(4, 3, LENGTH, WIDTH, ELEMENTS["Q5"]),
-    masses=(PointLoad(0.2, 0.05, mass=0.03),),
+    masses=(
+        PointLoad(0.2, 0.05, mass=0.03),
+        PointLoad(0.02, 0.2, stiffness=30e3, damping=1.0, loss_factor=0.15, is_foot=True),
+        PointLoad(0.29, 0.12, mass=0.01),
+    ),
 )
 UNEQUAL = replace(
     RIG,
@@ -96,7 +100,8 @@ def changed(touched, points, weights, *, node=MODELLED):
         "loss": np.matvec(by_force, changes.loss) + changes.by_loss,
         "damping": np.matvec(by_force, changes.damping),
         "stiffness": by_force[:, :, 1] * changes.own[:, 1, None],
-        "load": by_force[:, :, 6] * changes.own[:, 6, None],  # after four ERAs and a mass
+        "foot": by_force[:, :, 5] * changes.own[:, 5, None],  # after four ERAs and a mass
+        "load": by_force[:, :, 8] * changes.own[:, 8, None],  # of the second finger
     }
 
 
@@ -110,6 +115,7 @@ def directly(
     damping=1.0,
     stiffness=(1, 1, 1, 1),
     load=(1, 1, 1),
+    foot=1,
     pressed=(1, 1, 1),
 ):
     """Fields (f, eras, points) of a plate that differs by these factors.
@@ -125,6 +131,7 @@ def directly(
     eras = [
         era.varied(stiffness=k, damping=damping) for era, k in zip(rig.eras, stiffness, strict=True)
     ]
+    mass, stand, other = rig.masses
     fingers = [
         FingertipLoad(*place, rig.fingertip.scaled(more).multiplied(factor))
         for place, more, factor in zip(PLACES, pressed, load, strict=True)
@@ -134,7 +141,7 @@ def directly(
         eras,
         FREQUENCIES,
         POINTS.reshape(-1, 2),
-        loads=[*rig.masses, *fingers],
+        loads=[mass, replace(stand, stiffness=foot * stand.stiffness), other, *fingers],
     )
 
 
@@ -161,6 +168,7 @@ CHANGES = {
     "damping": lambda d: {"damping": math.exp(d)},
     "stiffness": lambda d: {"stiffness": (1, 1 + 0.01 * d, 1, 1)},  # of 1 %
     "load": lambda d: {"load": (1, 1 + d, 1)},
+    "foot": lambda d: {"foot": 1 + 0.3 * d},  # of 30 %
 }
 
 
@@ -205,7 +213,7 @@ def test_thickness_is_exact_at_its_nodes(modulus):
 @pytest.mark.parametrize("what", CHANGES)
 def test_sensitivities_of_a_thicker_plate_are_differences_of_the_direct_solve(what, rig):
     """Of a plate 3 % thicker, by central differences: within 1 % of the largest change."""
-    touched, _, points = solved(Uncertainty(0, 0, 0.02, 0.01, math.e, 1.0), rig=rig)
+    touched, _, points = solved(Uncertainty(0, 0, 0.02, 0.01, math.e, 1.0, supports=0.3), rig=rig)
     node = touched.on.first[5] + 4
     found = changed(touched, points, np.tile(WEIGHTS, (4, 1)), node=node)[what]
     thickness = 1 + 0.02 * float(thickness_nodes(5)[4])
@@ -251,7 +259,9 @@ def test_expected_power_is_the_mean_square_of_the_draws():
 
     Of two thicknesses that deviate so little that they count in proportion.
     """
-    touched, contacts, points = solved(replace(Uncertainty(), thickness=0.002, damping=1.0))
+    touched, contacts, points = solved(
+        replace(Uncertainty(), thickness=0.002, damping=1.0, supports=0.3)
+    )
     rng = np.random.default_rng(0)
     weights = (rng.normal(size=(4, 4)) + 1j * rng.normal(size=(4, 4))).astype(np.complex64)
     powers = felt_of(touched, points, weights, count=4000, seed=5, thicknesses=2).powers
@@ -272,7 +282,9 @@ def test_every_stage_is_that_of_numpy(rig, count):
     ERAs differ in stiffness, stroke and gain, so that none takes the place of another.
     """
     loads = (0.4, 1.0, 2.5)[:count]
-    touched, _, points = solved(Uncertainty(), loads, rig=rig, count=count)
+    touched, _, points = solved(
+        replace(Uncertainty(), supports=0.3), loads, rig=rig, count=count
+    )
     by_numpy = TouchedPlate(touched.on, touched.centres, touched.stiffness)
     weights = np.tile(WEIGHTS, (4, 1))
     few, shares = points.reshape(count, 5, -1), np.tile(FIVE_POINTS.weights, (count, 1))

@@ -1,6 +1,7 @@
 """Plates within the uncertainty, by the direct solver, and what answers promise of them."""
 
 import math
+from functools import cache
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from model.fem.plate import assemble
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import detection_threshold
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import FingertipLoad
+from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
 from model.table.build import build_table
 from model.vibration.excitation import base_amplitudes
@@ -21,6 +22,20 @@ from only import only
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
+ON_FEET = replace(
+    smooth_rig(),
+    masses=(
+        PointLoad(0.02, 0.03, stiffness=30e3, loss_factor=0.15, is_foot=True),
+        PointLoad(0.2, 0.05, mass=0.03),
+        PointLoad(0.27, 0.2, stiffness=20e3, damping=2.0, is_foot=True),
+    ),
+)
+
+
+@cache
+def table_on_feet():
+    return build_table(ON_FEET, frequencies=FREQUENCIES)
+
 
 PLACES_OFF = np.array([[1.0, 0.5], [-1.0, 0.8], [-0.6, -1.2], [0.9, -0.7]])  # inwards
 
@@ -38,6 +53,7 @@ PLATES = Plates(
     modulus=np.array([1.0, 0.96, 1.03]),
     places=1e-3 * np.array([np.zeros((4, 2)), PLACES_OFF, -0.5 * PLACES_OFF]),
     harmonic=np.zeros((3, 4), dtype=complex),
+    feet=np.array([[1.0, 1.0], [0.6, 1.4], [1.5, 0.8]]),
 )
 
 
@@ -69,6 +85,9 @@ def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
         FingertipLoad(*place, rig.fingertip.scaled(more).multiplied(factor))
         for place, more, factor in zip(places, pressed, PLATES.load[number], strict=True)
     ]
+    masses = list(rig.masses)
+    for foot, factor in zip((0, 2), PLATES.feet[number], strict=True):
+        masses[foot] = replace(masses[foot], stiffness=factor * masses[foot].stiffness)
     discs = [fingertip_points(*place, rig.plate) for place in places]
     frequencies, bases = base_amplitudes(layer.excitation, rig.eras)
     unit = direct_acceleration(
@@ -76,7 +95,7 @@ def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
         eras,
         frequencies,
         np.concatenate(discs),
-        loads=[*rig.masses, *fingers],
+        loads=[*masses, *fingers],
     )
     weights = bases / [era.stroke for era in rig.eras] * PLATES.gain[number]
     amplitudes = np.abs(np.einsum("fe,fep->fp", weights, unit))
@@ -91,13 +110,13 @@ def directly(rig, layer, number, *, targets=1, pressed=(1, 1, 1)):
 
 @pytest.mark.parametrize(("targets", "mode"), [(1, "switched"), (1, "phased"), (2, "switched")])
 def test_felt_on_agrees_with_the_direct_solve(targets, mode):
-    """Thicker, softer, damped otherwise, misdriven, other fingers on it: within 0.15 dB."""
+    """Thicker, softer, damped otherwise, misdriven, other fingers and feet: within 0.15 dB."""
     places = (TARGET, *QUIET)
     placed = Placement(places[:targets], places[targets:])
-    layer, _ = only(smooth_table(), placed, drive_mode=mode)
-    contrast = felt_on(smooth_table(), placed, layer.excitation, PLATES).contrast
+    layer, _ = only(table_on_feet(), placed, drive_mode=mode)
+    contrast = felt_on(table_on_feet(), placed, layer.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
-    solved = [directly(smooth_rig(), layer, number, targets=targets) for number in range(3)]
+    solved = [directly(ON_FEET, layer, number, targets=targets) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
     assert np.ptp(solved) > 0.15  # the plates do differ
 
@@ -110,13 +129,13 @@ def test_answers_for_fingers_that_press_differently_agree_with_the_direct_solve(
     """
     loads = (2.5, 0.4, 1.0)
     placed = Placement((TARGET,), QUIET, loads)
-    layer, predicted = only(smooth_table(), placed, drive_mode="phased")
-    contrast = felt_on(smooth_table(), placed, layer.excitation, PLATES).contrast
+    layer, predicted = only(table_on_feet(), placed, drive_mode="phased")
+    contrast = felt_on(table_on_feet(), placed, layer.excitation, PLATES).contrast
     found = 20 * np.log10(contrast)
-    solved = [directly(smooth_rig(), layer, number, pressed=loads) for number in range(3)]
+    solved = [directly(ON_FEET, layer, number, pressed=loads) for number in range(3)]
     np.testing.assert_allclose(found, solved, atol=0.15)
     assert predicted.contrast_db == pytest.approx(solved[0], abs=0.15)
-    alike = [directly(smooth_rig(), layer, number) for number in range(3)]
+    alike = [directly(ON_FEET, layer, number) for number in range(3)]
     assert np.abs(np.subtract(alike, solved)).max() > 0.2
 
 
@@ -131,7 +150,7 @@ def test_discretisation_error_enters_the_contrast_of_plates():
     excitation = only(table, placed, drive_mode="phased")[0].excitation
     plates = replace(
         draw_plates(
-            np.random.default_rng(0), Uncertainty.none(), count=3, era_count=4, contact_count=2
+            np.random.default_rng(0), Uncertainty.none(), of=table, count=3, contact_count=2
         ),
         deviation=1e6 * np.array([[0, 0], [1, 0], [0, 1j]]),
     )
@@ -158,9 +177,10 @@ def test_error_power_is_the_error_of_the_direct_field():
 
 
 def test_draw_plates_has_the_spreads_of_the_uncertainty():
-    """Normal numbers: of the logarithm for damping, loss and load."""
+    """Normal numbers: of the logarithm for damping, loss, load and feet."""
+    known = replace(Uncertainty(), supports=0.3)
     plates = draw_plates(
-        np.random.default_rng(0), Uncertainty(), count=4000, era_count=3, contact_count=2
+        np.random.default_rng(0), known, of=ON_FEET, count=4000, contact_count=2
     )
     expected_stds = [
         (np.abs(plates.gain), 0.05),
@@ -173,6 +193,7 @@ def test_draw_plates_has_the_spreads_of_the_uncertainty():
         (plates.modulus, 0.02),
         (plates.places, 0.001),
         (plates.harmonic, 0.01),
+        (np.log(plates.feet), 0.3),
     ]
     for values, std in expected_stds:
         assert values.std() == pytest.approx(std, rel=0.04)
@@ -189,7 +210,7 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
         placed = Placement((places[0],), tuple(places[1 : 1 + count]))
         layer, promise = only(table, placed, drive_mode=mode)
         plates = draw_plates(
-            rng, table.uncertainty, count=200, era_count=4, contact_count=1 + count
+            rng, table.uncertainty, of=table, count=200, contact_count=1 + count
         )
         felt = felt_on(table, placed, layer.excitation, plates)
         contrasts = 20 * np.log10(felt.contrast)
@@ -229,7 +250,7 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
         for places in contact_sets(20, fingers=1 + quiet, seed=100 + quiet):
             placed = Placement((places[0],), tuple(places[1:]))
             layer, _ = only(table, placed, drive_mode="phased")
-            plates = draw_plates(rng, known, count=100, era_count=4, contact_count=1 + quiet)
+            plates = draw_plates(rng, known, of=table, count=100, contact_count=1 + quiet)
             contrast = felt_on(table, placed, layer.excitation, plates).contrast
             found.append(20 * np.log10(np.percentile(contrast, percent)))
         assert np.median(found) == pytest.approx(optimum, abs=2.0)
@@ -244,7 +265,7 @@ def test_promise_holds_where_the_thickness_moves_resonances(places: int) -> None
     placed = Placement((target,), tuple(quiet))
     layer, promise = only(table, placed)
     plates = draw_plates(
-        np.random.default_rng(3), uncertainty, count=600, era_count=4, contact_count=1 + len(quiet)
+        np.random.default_rng(3), uncertainty, of=table, count=600, contact_count=1 + len(quiet)
     )
     contrast = felt_on(table, placed, layer.excitation, plates).contrast
     assert contrast is not None

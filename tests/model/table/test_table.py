@@ -243,7 +243,7 @@ def test_an_era_moved_by_a_micrometre_stays_on_its_foot(rig: Rig) -> None:
 
 def test_a_frequency_that_a_table_lacks_is_refused(table: LocalizationTable) -> None:
     """Between two of its own and beyond; one of a wire's steps is its own."""
-    sizes = (1, 1, 1, (1, 4), (1, 1), (1, 4), (1, 1), 1, (1, 4, 2), (1, 4))
+    sizes = (1, 1, 1, (1, 4), (1, 1), (1, 4), (1, 1), 1, (1, 4, 2), (1, 4), (1, 0))
     one = Plates(*(np.ones(size) for size in sizes))
     placed = Placement(((0.08, 0.06),))
     for frequency in (79.0, 115.0, 145.1, 451.0, math.nan):

@@ -120,7 +120,9 @@ def identify(
     """
     import time
 
+    from controller.diagnosis.plate_measurement import observation_of
     from model.config.points import parse_frequencies
+    from model.diagnosis.grain_direction import check_grain
     from model.identification import identification_report
     from model.identification.identify import identify as fit
     from model.identification.measurement import DeviceSettings, measure_by_device
@@ -164,6 +166,7 @@ def identify(
             measured = measured_by_amplifiers(rig, url or [], level=level, is_quick=quick)
     started = time.perf_counter()
     try:
+        check_grain(rig, observation_of(measured.measurement, rig))
         with progress_bar("fits") as progress:
             found = fit(rig, measured.measurement, seed=seed, progress=progress)
     except InputError as error:

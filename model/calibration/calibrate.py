@@ -39,7 +39,6 @@ from model.identification.parameters import KINDS
 from model.progress import Progress, unseen
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
-from model.structure.plate import Plate
 
 
 def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutSensors | None:
@@ -191,17 +190,15 @@ def _check_sides(problem: CalibrationProblem, fit: Fit) -> None:
     offs = space.values(fit.z, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
         if abs(off) > _MAX_SIDE * KINDS["side"].std:
-            raise wrong_size(plate, f"plate.{key}", side, side + off)
+            raise wrong_size(f"plate.{key}", side, side + off)
 
 
-def wrong_size(plate: Plate, key: str, in_rig: float, measured: float) -> InputError:
+def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     """What to say of a side [m] of the plate, by its key, that another one explains better."""
     rig_has, fits = (in_display_unit(side, "m", digits=4) for side in (in_rig, measured))
-    has_grain = plate.material.orthotropy is not None
-    grain = ", or try the other plate.grain: boards are cut both ways" if has_grain else ""
     return InputError(
         f"{key} must be that of the measured plate, got {rig_has} in the rig while responses fit "
-        f"{fits}, as it looks; measure it, and correct the rig or take its own measurement{grain}"
+        f"{fits}, as it looks; measure it, and correct the rig or take its own measurement"
     )
 
 

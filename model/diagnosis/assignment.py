@@ -49,6 +49,12 @@ class ShapeMatch:
             for i, row in enumerate(found)
         )
 
+    @property
+    def error(self) -> float:
+        """Share of the responses, rms over them, that is not of the shapes of the nearest ERAs."""
+        alike = self.mac[:, range(self.mac.shape[1]), self.nearest]
+        return math.sqrt(float(np.nanmean(1 - alike))) if np.isfinite(alike).any() else math.inf
+
     def confidence(self, channel: int, era: int, other: int) -> float:
         """Confidence 0..1 that the channel drives one ERA and not the other.
 

@@ -19,6 +19,7 @@ from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch
+from model.diagnosis.grain_direction import TurnedGrain
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.verdict import Verdict, best_wiring, diagnose
 from model.errors import InputError
@@ -63,7 +64,8 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     """Refuse responses that are not what they claim; return what of them a fit can use.
 
     Raises InputError that names the cause: too few sensors or frequencies, another quantity or
-    unit, conjugated phases, sensors at swapped places, swapped or inverted channels.
+    unit, a grain along the other side, conjugated phases, sensors at swapped places, swapped or
+    inverted channels.
     """
     rows = np.unique(
         np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
@@ -76,7 +78,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     # Values of the plate that are off are what a calibration is for.
     verdict = diagnose(rig, observation, false_alarm=0.0, check=_check_claims)
     _check_wiring(verdict)
-    _check_size(rig, verdict)
+    _check_size(verdict)
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
     return Screening(
         np.array(["dead" in channel.states for channel in verdict.channels]),
@@ -85,8 +87,12 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     )
 
 
-def _check_claims(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
-    """Raise InputError where responses are of another quantity, conjugated, or of other places."""
+def _check_claims(
+    plate: SensedPlate, shapes: ShapeMatch, grain: TurnedGrain | None, observation: Responses
+) -> None:
+    """Raise InputError where responses are of another board, quantity, phase or other places."""
+    if grain is not None:
+        raise InputError(str(grain))
     _check_quantity(plate, shapes, observation)
     _check_phases_and_places(plate, shapes, observation)
 
@@ -203,13 +209,13 @@ def _check_wiring(verdict: Verdict) -> None:
         )
 
 
-def _check_size(rig: Rig, verdict: Verdict) -> None:
+def _check_size(verdict: Verdict) -> None:
     """Raise InputError where another length or width of the plate explains the responses best."""
     if verdict.plate_matches or not verdict.explanations:
         return
     best = verdict.explanations[0]
     if best.cause.is_geometry and best.match.error <= MAX_FIT_ERROR:
-        raise wrong_size(rig.plate, best.cause.key, best.expected, best.value)
+        raise wrong_size(best.cause.key, best.expected, best.value)
 
 
 def _joined(names: Sequence[str]) -> str:

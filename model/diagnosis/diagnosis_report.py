@@ -7,6 +7,7 @@ from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
+from model.diagnosis.grain_direction import TurnedGrain
 from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
 from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
@@ -30,7 +31,7 @@ _MIN_SHARE = 0.05  # likelihood of a reported explanation
 def verdict_rows(verdict: Verdict) -> list[str]:
     """Lines of findings with their remedies, and one that all is well where nothing is amiss."""
     by_era = {channel.era: channel for channel in verdict.channels}
-    rows = []
+    rows = [] if verdict.grain is None else [f"GRAIN: {verdict.grain}"]
     for cycle in verdict.swapped:
         confidence = f"(confidence {min(by_era[era].confidence for era in cycle):.3f})"
         if len(cycle) == 2:
@@ -58,7 +59,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
         rows.append("all of them: check mounting of sensors and sign convention of phases")
     rows += [f"SENSOR {each.name} {each.why}: left out" for each in verdict.bad_sensors]
     is_loose = any("loose" in channel.states for channel in verdict.channels)
-    if not verdict.plate_matches and not is_loose:
+    if verdict.grain is None and not verdict.plate_matches and not is_loose:
         rows += _plate_rows(verdict)
     elif verdict.match is not None and verdict.match.outliers.any():
         by_sensor = verdict.match.outliers.sum(axis=(0, 1))
@@ -211,6 +212,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "wiring_matches": verdict.wiring_matches,
         "plate": {
             "matches": verdict.plate_matches,
+            "grain": None if verdict.grain is None else _grain_as_json(verdict.grain),
             "beyond": None if verdict.beyond is None else _beyond_as_json(verdict.beyond),
             "changes": verdict.changes or {},
             "kept_share": verdict.kept_share,
@@ -262,6 +264,15 @@ def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
         "farthest": beyond.farthest or None,
         "standard_deviations": beyond.deviation or None,
         "unexplained": beyond.error,
+    }
+
+
+def _grain_as_json(grain: TurnedGrain) -> dict[str, Any]:
+    return {
+        "expected": grain.as_written,
+        "found": grain.along,
+        "unexplained": grain.error,
+        "unexplained_as_written": grain.error_as_written,
     }
 
 

@@ -27,6 +27,7 @@ from model.diagnosis.diagnosis_screening import (
     off_scale,
     usable_sensors,
 )
+from model.diagnosis.grain_direction import TurnedGrain, turned_grain
 from model.diagnosis.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
@@ -55,8 +56,8 @@ _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
 
-Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, Responses], None]
-"""Of responses at usable sensors, by the plate there and what its shapes are most like."""
+Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, TurnedGrain | None, Responses], None]
+"""Of responses at usable sensors, by the plate there, what its shapes are most like, its grain."""
 
 ChannelState: TypeAlias = Literal[
     "well",
@@ -102,7 +103,8 @@ class Verdict:
     plate that fits; sensors: names of those that were not left out; beyond: what of a plate that
     matches is beyond tolerances, None for nothing or where it was not sought; promise_margins: by
     what that plate exceeds the contrasts that the rig's table promises [dB], none where they were
-    not compared.
+    not compared; grain: the board that was measured, where its grain runs along the other side than
+    the rig's, and of which all else then is.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -116,6 +118,7 @@ class Verdict:
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
     promise_margins: tuple[float, ...] = ()
+    grain: TurnedGrain | None = None
 
     @property
     def wiring_matches(self) -> bool:
@@ -188,8 +191,13 @@ def diagnose(
     if removed:
         plate = _plate_of(rig, observation)
     shapes = match_shapes(plate, observation.values)
+    live = np.where(dead[:, None], np.nan, observation.values)
+    grain = turned_grain(plate, match_shapes(plate, live), replace(observation, values=live))
     if check is not None:
-        check(plate, shapes, observation)
+        check(plate, shapes, grain, observation)
+    if grain is not None:
+        found = diagnose(grain.rig, observation, false_alarm=false_alarm)
+        return replace(found, plate_matches=False, changes=None, grain=grain)
     dead |= dead_channels(plate, observation, shapes)
     values = np.where(dead[:, None], np.nan, observation.values)
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))

@@ -61,8 +61,7 @@ class Template:
         """Its direction, of a board that has one."""
         if self.rig.plate.material.orthotropy is None:
             return None
-        data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
-        return (0.0, 1.0) if data.get("plate", {}).get("grain") == "width" else (1.0, 0.0)
+        return (0.0, 1.0) if self.rig.grain == "width" else (1.0, 0.0)
 
     @property
     def title(self) -> str:

@@ -104,6 +104,12 @@ class Rig:
             )
         return eras[name]
 
+    @property
+    def grain(self) -> str:
+        """The side along which its keys say that the grain of a board runs."""
+        keys = self.document.data.get("plate", {}) if self.document else {}
+        return str(keys.get("grain", "length"))
+
     @cached_property
     def full_levels(self) -> dict[str, float]:
         """Full level of each ERA, by its name: its stroke [m], or volts of an exciter."""

@@ -1,0 +1,102 @@
+"""Motions of magnets by what a simulated amplifier plays, by another solution than the product's.
+
+The terms of every output are recorded as they reach the plate, sampled, and move the matrices of
+plate and magnets, whose motion is integrated step by step.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from model.arrays import ComplexArray, FloatArray
+from model.reduction.reduced_plate import modal_matrices, reduce_plate
+from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
+from model.transients.base_motion import Motion
+from sim.plant.plant import Plant
+
+STEP = 1e-4
+"""Time [s] between samples."""
+
+
+@dataclass
+class Outputs:
+    """Terms that exciters are driven by: exciter, terms and since when [s], in order."""
+
+    changes: list[tuple[int, Motion, float]] = field(default_factory=list)
+
+    @classmethod
+    @contextmanager
+    def recorded(cls) -> Iterator["Outputs"]:
+        """All that simulated plates are driven by."""
+        found, obey = cls(), Plant.set_input
+
+        def note(plant: Plant, era: int, motion: Motion, **given: Any) -> None:
+            found.changes.append((era, tuple(motion), given.get("since", plant.time)))
+            obey(plant, era, motion, **given)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Plant, "set_input", note)
+            yield found
+
+    def volts(self, exciters: int, *, after: float = 0.1) -> ComplexArray:
+        """Voltages (n, exciters) as phasors, of which the imaginary part is played.
+
+        From the first change to some time [s] after the last.
+        """
+        begin, end = self.changes[0][2], self.changes[-1][2] + after
+        times = begin + STEP * np.arange(round((end - begin) / STEP))
+        found: ComplexArray = np.zeros((len(times), exciters), dtype=complex)
+        for number in range(exciters):
+            own = [(since, motion) for era, motion, since in self.changes if era == number]
+            for (since, motion), (until, _) in pairwise([*own, (end, ())]):
+                first, last = np.searchsorted(times, [since, until])
+                for term in motion:
+                    each = times[first:last]
+                    tau = each - term.start
+                    wave = (term.c0 + term.c1 * tau) * np.exp(1j * term.omega * tau)
+                    found[first:last, number] += np.where(
+                        (each >= term.start) & (each < term.end), wave, 0
+                    )
+        return found
+
+
+class Magnets:
+    """Plate and magnets of a rig, from rest."""
+
+    def __init__(self, rig: Rig) -> None:
+        eras, places = rig.eras, footprints_of(rig.eras, rig.masses)
+        reduced = reduce_plate(
+            rig.plate, rig.mesh, places, frequency_max=rig.limits.frequency_max
+        )
+        shapes = reduced.at(places)
+        M, C, K = modal_matrices(reduced, eras, loads=rig.masses, attachment_shapes=shapes)
+        r, count, inverse = len(K), len(eras), np.linalg.inv(M)
+        apart = np.hstack([shapes[:count], -np.eye(count)])
+        A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
+        B = np.vstack([np.zeros((r, count)), inverse @ apart.T])
+        self._out = np.hstack([apart, np.zeros((count, r))])
+        self._a, self._b, *_ = cont2discrete((A, B, self._out, np.zeros((count, count))), STEP)
+        parts = [era.in_time for era in eras]
+        self._by_drive, self._by_rate = (
+            np.array([getattr(each, key) for each in parts]) for key in ("by_drive", "by_rate")
+        )
+
+    def moved(self, volts: FloatArray | ComplexArray) -> FloatArray:
+        """Motion of each magnet against its coil (n, exciters) [m], by Bl (u - L u' / R) / R.
+
+        Of phasors the magnitude: what it is at the worst phase of all tones together.
+        """
+        forces = volts * self._by_drive + np.gradient(volts, STEP, axis=0) * self._by_rate
+        both = np.stack([forces.real, forces.imag], axis=2)
+        state, found = np.zeros((len(self._a), 2)), np.empty(both.shape)
+        for number, force in enumerate(both):
+            found[number] = self._out @ state
+            state = self._a @ state + self._b @ force
+        return np.hypot(found[..., 0], found[..., 1])

@@ -11,6 +11,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
+from model.arrays import FloatArray
+
 ERA = Path(sys.executable).with_name("era")
 PLATE = (sys.executable, "-m", "benchmarks.desk_plate", "rig.yaml", "--sensors", "sensors.csv")
 EXAMPLES = Path(__file__).parents[2] / "examples" / "desk"
@@ -18,7 +22,7 @@ RATE, BLOCK = 48_000, 128
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
 _COMMAND = 900.0  # s
-_MOVED = 2.0  # s; the plate is computed anew
+_AGAIN, _REPEATS = "is not kept", 12  # said of a place; at most
 
 Place = tuple[float, float]
 
@@ -28,7 +32,9 @@ _numbers = itertools.count()
 class Desk:
     """A running JACK server and its plate, in a folder with the example's rig and sensors."""
 
-    def __init__(self, folder: Path, environment: Mapping[str, str], plate: IO[str]) -> None:
+    def __init__(
+        self, folder: Path, environment: Mapping[str, str], plate: "subprocess.Popen[str]"
+    ) -> None:
         self.folder, self.environment = folder, dict(environment)
         self._plate = plate
 
@@ -50,12 +56,28 @@ class Desk:
         found: dict[str, Any] = json.loads(done.stdout)
         return found
 
-    def touch_plate(self, fingers: Sequence[Place]) -> None:
-        """Put fingers on the plate."""
+    def touch_plate(self, fingers: Sequence[Sequence[float]]) -> None:
+        """Put fingers on the plate: x and y of each [m], and the factor of its load if any."""
         self._change({"fingers": list(fingers)})
 
-    def measure_by_moving(self, *arguments: object) -> None:
-        """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError."""
+    def begin_feeling(self, seconds: float) -> None:
+        """Keep for some time what the fingers feel; nothing else may change meanwhile."""
+        self._say({"feel": seconds, "file": str(self.folder / "felt.npy")})
+
+    def felt(self) -> FloatArray:
+        """What they felt (n, k, p) [m/s²], as `DeskPlate.felt`."""
+        self._answer()
+        return np.asarray(np.load(self.folder / "felt.npy"))
+
+    def log_count(self, word: str) -> int:
+        """How many lines of the server and the plate have a word."""
+        return (self.folder / "desk.log").read_text("utf-8", "replace").count(word)
+
+    def measure_by_moving(self, *arguments: object) -> int:
+        """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError.
+
+        Return how often a place was not kept, and measured again.
+        """
         with subprocess.Popen(
             [str(ERA), "measure", *map(str, arguments)],
             stdin=subprocess.PIPE,
@@ -73,15 +95,26 @@ class Desk:
                 said += letter
                 if said.endswith("then Enter: "):
                     self._change({"sensor": said.rpartition("sensor at ")[2].split(",")[0]})
-                    time.sleep(_MOVED)
-                    process.stdin.write("\n")
+                    process.stdin.write("q\n" if said.count(_AGAIN) > _REPEATS else "\n")
                     process.stdin.flush()
-        if process.returncode or "not kept" in said:
+        if process.returncode or said.count(_AGAIN) > _REPEATS:
             raise RuntimeError(f"era measure: status {process.returncode}: {said}")
+        return said.count(_AGAIN)
 
     def _change(self, what: Mapping[str, object]) -> None:
-        self._plate.write(json.dumps(what) + "\n")
-        self._plate.flush()
+        self._say(what)
+        self._answer()
+
+    def _say(self, what: Mapping[str, object]) -> None:
+        assert self._plate.stdin is not None
+        self._plate.stdin.write(json.dumps(what) + "\n")
+        self._plate.stdin.flush()
+
+    def _answer(self) -> None:
+        """Wait until the plate has done what was said; raises RuntimeError where it has ended."""
+        assert self._plate.stdout is not None
+        if not self._plate.stdout.readline():
+            raise RuntimeError(f"the plate ended: {(self.folder / 'desk.log').read_text('utf-8')}")
 
     @property
     def truth(self) -> dict[str, Any]:
@@ -92,9 +125,18 @@ class Desk:
 
 @contextlib.contextmanager
 def desk(
-    folder: Path, *, seed: int, mesh: str = "8x6 Q3", sensors: str | None = None
+    folder: Path,
+    *,
+    seed: int,
+    mesh: str = "8x6 Q3",
+    rig: str | None = None,
+    sensors: str | None = None,
+    options: Sequence[str] = (),
 ) -> Iterator[Desk]:
-    """A desk with a plate of its own; seed: of its deviations; sensors: another file's content."""
+    """A desk with a plate of its own; seed: of its deviations.
+
+    rig, sensors: content of other files than the example's; options: further ones of the plate.
+    """
     name = f"desk{os.getpid()}-{next(_numbers)}"  # several plates may be on desks at once
     environment = os.environ | {
         "JACK_DEFAULT_SERVER": name,
@@ -102,19 +144,19 @@ def desk(
         "OPENBLAS_NUM_THREADS": "1",
     }
     link = folder / "amp"
-    text = (EXAMPLES / "rig.yaml").read_text("utf-8")
+    text = (EXAMPLES / "rig.yaml").read_text("utf-8") if rig is None else rig
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
     given = (EXAMPLES / "sensors.csv").read_text("utf-8") if sensors is None else sensors
     (folder / "sensors.csv").write_text(given, "utf-8")
     server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
+    plate += options
     with contextlib.ExitStack() as stack:
         stack.enter_context(_own_server(name))
         log = stack.enter_context((folder / "desk.log").open("w"))
         running(stack, server, folder, environment, log)
         process = _plate(stack, plate, folder, environment, log)
-        assert process.stdin is not None
-        yield Desk(folder, environment, process.stdin)
+        yield Desk(folder, environment, process)
 
 
 @contextlib.contextmanager

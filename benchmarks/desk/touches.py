@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from model.finger.perception import detection_threshold
 from sim.desk.measuring.sound_card import open_card
 
 _START = 180.0  # s; on a busy machine
-_REPEAT = 0.05  # s; a contact that is not confirmed is lifted
+REPEAT = 0.05  # s; a contact that is not confirmed is lifted
 _SETTLING, _WINDOW = 1.5, 1.0  # s
 
 
@@ -38,28 +39,13 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
         rows = list(csv.DictReader(lines))
     places = {row["sensor"]: (float(row["x_m"]), float(row["y_m"])) for row in rows}
     inputs = {row["sensor"]: int(row["input"]) - 1 for row in rows}
-    socket = desk.folder / "era.sock"
-    config = "rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: 30\n"
-    (desk.folder / "daemon.yaml").write_text(config, "utf-8")
-    amplifier = [ERA, "soft-amp", "--device", "jack:desk", "--channels", 4]
-    amplifier += ["--link", desk.folder / "amp", "--until-eof"]
-    daemon = [ERA, "daemon", "daemon.yaml"]
     found = []
-    with contextlib.ExitStack() as stack:
-        log = stack.enter_context((desk.folder / "touches.log").open("w"))
-        started = running(stack, amplifier, desk.folder, desk.environment, log)
-        assert started.stdout is not None
-        started.stdout.readline()
-        running(stack, daemon, desk.folder, desk.environment, log)
-        era = stack.enter_context(connected(socket))
-        until_ready(era)
+    with playing(desk, level_db_sl=30) as era:
         card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1, limit=0)
-        stack.callback(card.close)
-        stack.enter_context(era.armed("desk", lease_s=60))
         for names in sets:
             target, *quiet = (places[name] for name in names)
             desk.touch_plate([target, *quiet])
-            status = _hold(era, [*quiet, target], _SETTLING)
+            status = hold(era, [*quiet, target], _SETTLING)
             recorded = card.begin(np.zeros((round(_WINDOW * card.rate), 0)))
             while card.position < len(recorded):
                 era.touch([*quiet, target])
@@ -68,17 +54,41 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
             era.touch([])
             assert status.promised_contrast_db is not None
             assert status.predicted_contrast_db is not None
-            frequencies = np.unique([tone.frequency_hz for tone in status.drive.values()])
             samples = heard[:, [inputs[name] for name in names]]
+            target_size, *quiet_sizes = sizes(samples, status, card.rate)
             found.append(
                 Touch(
                     len(names),
                     status.promised_contrast_db,
                     status.predicted_contrast_db,
-                    _contrast(samples, frequencies, card.rate),
+                    float(20 * np.log10(target_size / max(quiet_sizes))),
                 )
             )
+        card.close()
     return found
+
+
+@contextlib.contextmanager
+def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
+    """Software amplifier and daemon, which play what is calibrated and in the table, armed."""
+    socket = desk.folder / "era.sock"
+    config = (
+        f"rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: {level_db_sl}\n"
+    )
+    (desk.folder / "daemon.yaml").write_text(config, "utf-8")
+    amplifier = [ERA, "soft-amp", "--device", "jack:desk", "--channels", 4]
+    amplifier += ["--link", desk.folder / "amp", "--until-eof"]
+    daemon = [ERA, "daemon", "daemon.yaml"]
+    with contextlib.ExitStack() as stack:
+        log = stack.enter_context((desk.folder / "touches.log").open("w"))
+        started = running(stack, amplifier, desk.folder, desk.environment, log)
+        assert started.stdout is not None
+        started.stdout.readline()
+        running(stack, daemon, desk.folder, desk.environment, log)
+        era = stack.enter_context(connected(socket))
+        until_ready(era)
+        stack.enter_context(era.armed("desk", lease_s=60))
+        yield era
 
 
 def connected(socket: Path) -> Client:
@@ -104,7 +114,7 @@ def until_ready(era: Client) -> None:
         time.sleep(0.1)
 
 
-def _hold(era: Client, places: list[Place], seconds: float) -> StatusResult:
+def hold(era: Client, places: list[Place], seconds: float) -> StatusResult:
     """Hold fingers for some time, and until something plays; return what does."""
     begin = time.monotonic()
     while True:
@@ -114,14 +124,14 @@ def _hold(era: Client, places: list[Place], seconds: float) -> StatusResult:
             return status
         if held > seconds + _START:
             raise RuntimeError(f"nothing plays for fingers at {places}: {status.silence_reason}")
-        time.sleep(_REPEAT)
+        time.sleep(REPEAT)
 
 
-def _contrast(samples: FloatArray, frequencies: FloatArray, rate: float) -> float:
-    """Felt contrast [dB] of the first of samples (n, sensors) to the loudest other."""
+def sizes(samples: FloatArray, status: StatusResult, rate: float) -> FloatArray:
+    """What is felt in samples (n, points) [m/s²] of what plays, relative to the threshold."""
+    frequencies = np.unique([tone.frequency_hz for tone in status.drive.values()])
     angles = 2 * np.pi * np.outer(np.arange(len(samples)) / rate, frequencies)
     basis = np.hstack([np.sin(angles), np.cos(angles)])
     fitted = np.linalg.lstsq(basis, samples)[0]
-    sizes = np.hypot(*np.split(fitted, 2)) / detection_threshold(frequencies)[:, None]
-    target, *quiet = np.linalg.norm(sizes, axis=0)
-    return float(20 * np.log10(target / max(quiet)))
+    felt = np.hypot(*np.split(fitted, 2)) / detection_threshold(frequencies)[:, None]
+    return np.asarray(np.linalg.norm(felt, axis=0))

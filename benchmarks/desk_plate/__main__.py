@@ -49,6 +49,10 @@ def desk_plate(
     mesh: Annotated[
         str | None, typer.Option(metavar="NXxNY", help="Mesh that the plate is solved on.")
     ] = None,
+    built: Annotated[
+        Path | None,
+        typer.Option(metavar="RIG", help="Be the plate of this file, in place of one drawn."),
+    ] = None,
     truth: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write what the plate really is.")
     ] = None,
@@ -57,7 +61,8 @@ def desk_plate(
         typer.Option(
             "--until-eof",
             help='Exit at the end of standard input; lines {"fingers": [[X, Y], ...]} touch it, '
-            '{"sensor": NAME} moves the only sensor.',
+            '{"sensor": NAME} moves the only sensor, {"feel": SECONDS, "file": FILE.npy} writes '
+            "what the fingers feel.",
         ),
     ] = False,
 ) -> None:
@@ -72,14 +77,17 @@ def desk_plate(
     from benchmarks.desk_plate.desk_plate import DeskPlate
     from benchmarks.desk_plate.jack_plate import JackPlate
     from benchmarks.desk_plate.sensing import Converters
-    from benchmarks.desk_plate.truth import MESH, draw_truth
+    from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
     from model.rig.file import load_rig
     from sim.desk.libjack import JackClient
     from sim.sensors.sensor_file import read_sensors
 
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate, may_move=True)
-    drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
+    if built is None:
+        drawn = draw_truth(rig, seed=seed, mesh=mesh or MESH)
+    else:
+        drawn = as_built(load_rig(built), mesh=mesh or MESH)
     client = JackClient(name, is_only=True)
     try:
         converters = Converters(delay=delay, noise=noise)
@@ -113,22 +121,35 @@ def _run(running: "JackPlate", plate: "DeskPlate", *, until_eof: bool) -> None:
             line = sys.stdin.readline()
             if not line:
                 return
-            print(json.dumps(_changed(plate, line)), flush=True)
+            print(json.dumps(_changed(running, plate, line)), flush=True)
 
 
-def _changed(plate: "DeskPlate", line: str) -> dict[str, object]:
+def _changed(running: "JackPlate", plate: "DeskPlate", line: str) -> dict[str, object]:
     """Change what a line says; return what is there now."""
+    import numpy as np
+
     try:
         wanted = json.loads(line)
         if "sensor" in wanted:
             plate.move_sensor(str(wanted["sensor"]))
             return {"sensor": wanted["sensor"]}
-        places = [(float(x), float(y)) for x, y in wanted["fingers"]]
+        if "feel" in wanted:
+            plate.begin_feeling()
+            running.wait(float(wanted["feel"]))
+            felt = plate.felt()
+            np.save(wanted["file"], felt)
+            return {"felt": felt.shape}
+        fingers = [[float(each) for each in finger] for finger in wanted["fingers"]]
+        places, factors = (
+            [(x, y) for x, y, *_ in fingers],
+            [each[2] for each in fingers if each[2:]],
+        )
+        plate.set_fingers(places, factors)
     except (ValueError, TypeError, KeyError) as problem:
         raise InputError(
-            f'a line must be {{"fingers": [[X, Y], ...]}} or {{"sensor": NAME}}, got {line[:60]!r}'
+            'a line must be {"fingers": [[X, Y], ...]}, with a factor of its load after each Y or '
+            f'none, {{"sensor": NAME}} or {{"feel": SECONDS, "file": FILE.npy}}, got {line[:60]!r}'
         ) from problem
-    plate.set_fingers(places)
     return {"fingers": len(places)}
 
 

@@ -1,6 +1,7 @@
 """The plate behind a sound card: samples of all outputs in, samples of all inputs out."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.finger.fingertip import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
 from sim.desk.measuring.desk import Desk
 from sim.sensors.sensor_file import WiredSensor, are_places
@@ -22,8 +24,8 @@ class DeskPlate:
 
     Outputs and inputs of the card are those of a `Desk`; is_shared: the loop-back is a Y-cable
     beside the last ERA. rate [Hz]. One sensor that is
-    moved is at the first of its places, with its mass. `advance`, `set_fingers` and `move_sensor`
-    may be called by different threads.
+    moved is at the first of its places, with its mass, and off the plate while it is touched.
+    `advance` and all else may be called by different threads.
     """
 
     def __init__(
@@ -56,13 +58,36 @@ class DeskPlate:
         self._plate = self._now()
         self._kept = self._model.shared
 
-    def set_fingers(self, places: Sequence[tuple[float, float]]) -> None:
+    def set_fingers(
+        self, places: Sequence[tuple[float, float]], factors: Sequence[float] = ()
+    ) -> None:
         """Replace the fingers on the plate, at places [m]; computed here, swapped between blocks.
 
-        The plate's motion is continuous; phalanges begin at rest.
+        factors: of their loads, empty for those of the rig's. The plate's motion is continuous;
+        phalanges begin at rest.
         """
-        self._fingers = tuple(fingertip_loads(self._truth.rig.fingertip, places))
+        loads = fingertip_loads(self._truth.rig.fingertip, places)
+        self._fingers = tuple(
+            replace(each, fingertip=each.fingertip.multiplied(factor))
+            for each, factor in zip(loads, factors or [1.0] * len(loads), strict=True)
+        )
         self._next = self._now()
+
+    def begin_feeling(self) -> None:
+        """Keep from now on what the fingers feel."""
+        self._plate.history = []
+
+    def felt(self) -> FloatArray:
+        """What they felt: accelerations (n, k, p) [m/s²] at the points under k fingertips.
+
+        At the rate of the samples over SAMPLES; until now, and no longer.
+        """
+        history, self._plate.history = self._plate.history, None
+        plate, at = self._truth.rig.plate, np.array([(each.x, each.y) for each in self._fingers])
+        points, _ = fingertips_on(at, length=plate.length, width=plate.width)
+        model = self._model.under(self._fingers, points=points.reshape(-1, 2))
+        found = sampled(model, rate=self._rate).outputs(np.array(history))
+        return found.reshape(-1, *points.shape[:2])
 
     def move_sensor(self, name: str) -> None:
         """Put a sensor that is moved to another of its places; raises InputError."""
@@ -76,7 +101,10 @@ class DeskPlate:
         self._next = self._now()
 
     def _now(self) -> LiftedBlocks:
-        moved = None if self._place is None else (self._place, self._sensors[self._place].mass)
+        moved = None
+        if self._place is not None:
+            mass = 0.0 if self._fingers else self._sensors[self._place].mass
+            moved = self._place, mass
         return LiftedBlocks(sampled(self._model.under(self._fingers, moved=moved), rate=self._rate))
 
     def advance(self, played: FloatArray) -> FloatArray:

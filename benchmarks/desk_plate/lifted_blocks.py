@@ -46,6 +46,12 @@ class SampledModel:
         )
         return np.asarray(sum(both) / 2 + self.D)
 
+    def outputs(self, history: FloatArray) -> FloatArray:
+        """Accelerations (n, outputs) at the samples of a history (n, state + inputs)."""
+        m = len(self.E)
+        states = history[:, :m] + 1j * history[:, m : 2 * m]
+        return np.asarray((states @ self.C.T).real + history[:, 2 * m :] @ self.D.T)
+
     @cached_property
     def lifted(self) -> FloatArray:
         """The matrix of a block: (state + SAMPLES outputs, state + SAMPLES inputs)."""
@@ -92,12 +98,17 @@ def sampled(model: ModelInTime, *, rate: float) -> SampledModel:
 
 
 class LiftedBlocks:
-    """Advances a sampled model from rest, in multiples of SAMPLES samples."""
+    """Advances a sampled model from rest, in multiples of SAMPLES samples.
+
+    history: where, if anywhere, the state and the input (state + inputs,) at the first sample of
+    each SAMPLES are left from now on.
+    """
 
     def __init__(self, model: SampledModel) -> None:
         self._model = model
         self._lifted = model.lifted
         self._state = np.zeros(2 * len(model.E))
+        self.history: list[FloatArray] | None = None
 
     def advance(self, samples: FloatArray) -> FloatArray:
         """Accelerations (n, outputs) for samples (n, inputs); n a multiple of SAMPLES."""
@@ -105,6 +116,8 @@ class LiftedBlocks:
         rows = np.ascontiguousarray(samples, dtype=float).reshape(-1, SAMPLES * inputs)
         found = np.empty((len(rows), SAMPLES * outputs))
         for row, into in zip(rows, found, strict=True):
+            if self.history is not None:
+                self.history.append(np.concatenate([self._state, row[:inputs]]))
             after = self._lifted @ np.concatenate([self._state, row])
             self._state, into[:] = after[:size], after[size:]
         return found.reshape(-1, outputs)

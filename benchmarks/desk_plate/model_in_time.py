@@ -81,11 +81,16 @@ class DeskModel:
         return 2 * self._size + 2 * len(self._truth.rig.eras)
 
     def under(
-        self, fingers: Sequence[FingertipLoad] = (), *, moved: tuple[int, float] | None = None
+        self,
+        fingers: Sequence[FingertipLoad] = (),
+        *,
+        moved: tuple[int, float] | None = None,
+        points: FloatArray | None = None,
     ) -> ModelInTime:
         """The plate with fingers on it.
 
-        moved: the only point with an accelerometer now, by its number, and its mass [kg].
+        moved: the only point with an accelerometer now, by its number, and its mass [kg]; points
+        (p, 2) [m]: in place of the accelerometers'.
         """
         rig, r = self._truth.rig, self._size
         count = len(rig.eras)
@@ -105,6 +110,8 @@ class DeskModel:
             stiffness += load.stiffness * np.outer(shape, shape)
         damping += self._structural(mass, stiffness)
         at_points = self._at_points
+        if points is not None:
+            at_points = self._extended(self._plate.at(points))
         if moved is not None:
             number, weight = moved
             at_points = at_points[[number]]

@@ -20,6 +20,7 @@ _RESONANCES = 550.0, 800.0  # Hz, of actuators; above the played range, but felt
 _AMPLIFIERS = 2.5e3, 3.5e3  # Hz, of filters before exciters; far above the band
 _MAGNET = 0.05
 _RATIOS = 0.2, 0.4  # of their damping
+_FLAT, _LEAST_LAG = 0.7, math.radians(3)  # ratio of a damping that lets gains be flat
 _PLACE = 1e-3  # m
 _BOLT = 0.008  # kg
 
@@ -109,6 +110,31 @@ def draw_truth(rig: Rig, *, seed: int, mesh: str = MESH) -> Truth:
     return Truth(
         replace(rig, plate=plate, eras=tuple(eras), mesh=parse_mesh(mesh, plate)), actuators
     )
+
+
+def as_built(rig: Rig, *, mesh: str) -> Truth:
+    """The plate that a rig describes, solved on another mesh; its gains are those of actuators.
+
+    Of each the magnitude, and the phase amid the rig's band, which no lag makes positive: all are
+    late by what the earliest has too much, and by 3 degrees.
+    """
+    middle = math.sqrt(rig.limits.frequency_min * rig.limits.frequency_max)
+    gains = [complex(era.gain(np.array([middle]))[0]) for era in rig.eras]
+    phases = np.angle(gains)
+    lags = np.tan(phases.max() - phases + _LEAST_LAG)
+    # tan(lag) = 2 zeta x / (1 - x²)
+    x = (np.sqrt(_FLAT**2 + lags**2) - _FLAT) / lags
+    actuators = tuple(
+        Actuator(middle / of_resonance, _FLAT, abs(gain) * _flatness(of_resonance))
+        for of_resonance, gain in zip(x.tolist(), gains, strict=True)
+    )
+    eras = tuple(replace(era, gains=()) for era in rig.eras)
+    return Truth(replace(rig, eras=eras, mesh=parse_mesh(mesh, rig.plate)), actuators)
+
+
+def _flatness(x: float) -> float:
+    """What an actuator lacks of its gain at a share x of its resonance, inverted."""
+    return math.hypot(1 - x**2, 2 * _FLAT * x)
 
 
 def _near(place: Sequence[float], plate: Plate, rng: np.random.Generator) -> tuple[float, float]:

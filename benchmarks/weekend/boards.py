@@ -225,7 +225,7 @@ def sensed(
     """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
     import numpy as np
 
-    from model.finger.perception import decibels, detection_threshold
+    from model.finger.perception import detection_threshold
 
     names = [each.name for each in rig.eras]
     squares: FloatArray = np.zeros(weights.size)
@@ -235,10 +235,16 @@ def sensed(
             shares[names.index(name)] = tone.phasor / rig.full_levels[name]
         field = np.abs(shares @ response(layer.frequency))
         squares += (field / detection_threshold(layer.frequency, rig.threshold)) ** 2
-    total = np.sqrt(squares).reshape(len(answer.fingers), -1)
-    return float(
-        decibels(total[0] @ np.reshape(weights, (-1, total.shape[1]))[0] / total[1:].max())
-    )
+    return felt_contrast(np.sqrt(squares).reshape(len(answer.fingers), -1), weights)
+
+
+def felt_contrast(felt: "FloatArray", weights: "FloatArray") -> float:
+    """Contrast [dB] of what is felt (k, p), relative to the threshold, the target first."""
+    import numpy as np
+
+    from model.finger.perception import decibels
+
+    return float(decibels(felt[0] @ np.reshape(weights, felt.shape)[0] / felt[1:].max()))
 
 
 def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, float]:

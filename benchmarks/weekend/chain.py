@@ -26,6 +26,7 @@ import era_haptics as era
 from benchmarks.page import write_parts
 from benchmarks.setting import random_contacts, use_one_thread
 from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
+from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
@@ -40,6 +41,7 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad, fingertip_loads
 from model.structure.exciter import Exciter
 from model.table.build import build_table
+from model.table.table import LocalizationTable
 from sim.plant.imperfections import draw_imperfections
 from sim.sensors.sensor_file import read_sensors
 
@@ -111,7 +113,13 @@ class BuiltBoard:
             masses=np.array([at.mass for at in places]),
         )
 
-    def contrast(self, answer: Any, factors: FloatArray) -> float:
+    @property
+    def exactly_known(self) -> Rig:
+        """The rig of one who knows all but the loads of fingers."""
+        loads = self.rig.uncertainty.fingertip
+        return replace(self.rig, uncertainty=replace(Uncertainty.none(), fingertip=loads))
+
+    def contrast(self, answer: Answer, factors: FloatArray) -> float:
         """Felt contrast [dB] of an answer under fingers whose loads differ by factors."""
         plate, fingers = self.rig.plate, [each.finger.at for each in answer.fingers]
         points, weights = fingertips_on(np.array(fingers), length=plate.length, width=plate.width)
@@ -149,33 +157,63 @@ def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Responses]:
 
 def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
     """Build, measure, calibrate and touch a board; count: for each number of quiet fingers."""
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
     built, responses = measured(rig, seed)
     known = calibrate(rig, responses, check_consistency(rig, responses)).rig
-    frequencies = np.arange(low, high + 1, 10.0)
-    std = Uncertainty(0, 0, 0, 0, 1, rig.uncertainty.fingertip, 0, 0, 0, 0, 0)
-    exact = replace(built.rig, uncertainty=std)
-    tables = [
-        build_table(each, frequencies=frequencies, drive_mode="phased")
-        for each in (rig, known, exact)
-    ]
+    tables = [phased_table(each) for each in (rig, known, built.exactly_known)]
+    for fingers in random_fingers(rig, seed, count):
+        bought, calibrated, exact = (fingers.query(each) for each in tables)
+        yield Touch(
+            len(fingers.quiet),
+            promised_by(bought),
+            promised_by(calibrated),
+            built.contrast(calibrated, fingers.factors),
+            built.contrast(exact, fingers.factors),
+        )
+
+
+@dataclass(frozen=True)
+class Fingers:
+    """A target and quiet fingers at places [m], and by which factor the load of each is another."""
+
+    target: tuple[float, float]
+    quiet: tuple[tuple[float, float], ...]
+    factors: FloatArray
+
+    def query(self, table: LocalizationTable) -> Answer:
+        """The answer of a table."""
+        return era.query(table, self.target, quiet=self.quiet, level_db_sl=LEVEL_DB_SL)
+
+
+def random_fingers(rig: Rig, seed: int, count: int) -> Iterator[Fingers]:
+    """Draw fingers on a board; count: for each number of quiet ones."""
     rng = np.random.default_rng([SEED, seed, 2])
     size = (rig.plate.length, rig.plate.width)
     for number in range(2 * count):
-        quiet = 1 + number % 2
-        target, *others = random_contacts(rng, 1 + quiet, size, margin=EDGE).tolist()
-        factors = np.exp(rig.uncertainty.fingertip * rng.standard_normal(1 + quiet))
-        answers = [
-            era.query(each, target, quiet=others, level_db_sl=LEVEL_DB_SL) for each in tables
-        ]
-        felt, best = (built.contrast(each, factors) for each in answers[1:])
-        bought, promised = (each.fingers[0].promised_contrast_db for each in answers[:2])
-        assert bought is not None
-        assert promised is not None
-        yield Touch(quiet, bought, promised, felt, best)
+        places = random_contacts(rng, 2 + number % 2, size, margin=EDGE).tolist()
+        target, *quiet = ((x, y) for x, y in places)
+        factors = np.exp(rig.uncertainty.fingertip * rng.standard_normal(len(places)))
+        yield Fingers(target, tuple(quiet), factors)
 
 
-def _rig() -> Rig:
+def frequencies_of(rig: Rig) -> FloatArray:
+    """Frequencies of the tables [Hz]."""
+    return np.arange(rig.limits.frequency_min, rig.limits.frequency_max + 1, 10.0)
+
+
+def phased_table(rig: Rig) -> LocalizationTable:
+    """The table of a rig."""
+    return build_table(rig, frequencies=frequencies_of(rig), drive_mode="phased")
+
+
+def promised_by(answer: Answer) -> float:
+    """Contrast that an answer promises to the target [dB]."""
+    promised = answer.fingers[0].promised_contrast_db
+    assert promised is not None
+    return promised
+
+
+def rig_as_bought() -> Rig:
+    """The rig of the example."""
     return load_rig(FOLDER / "rig.yaml")
 
 
@@ -183,7 +221,7 @@ def outcome(board: int, touched: int) -> "Outcome":
     """Touches on a board by its number."""
     use_one_thread()
     try:
-        return Outcome(board, tuple(touches(_rig(), board, touched)))
+        return Outcome(board, tuple(touches(rig_as_bought(), board, touched)))
     except InputError as refused:
         return Outcome(board, (), str(refused))
 
@@ -231,7 +269,7 @@ def main() -> None:
     parser.add_argument("--measured", type=Path, help="only write what the sensor reads of --first")
     options = parser.parse_args()
     if options.measured:
-        rig = _rig()
+        rig = rig_as_bought()
         write_responses(options.measured, measured(rig, options.first)[1], rig)
         return
     found = []

@@ -1,0 +1,208 @@
+"""Boards whose parts deviate, measured, calibrated and touched by real processes through JACK.
+
+    python -m benchmarks.weekend.through_jack [--boards 10] [--touches 20] [--report]
+
+The boards and touches of `python -m benchmarks.weekend.chain`. Each board is a process that moves
+in time, with viscous losses and amplifiers that lag, on a JACK server of the dummy driver: `era
+measure` with one sensor that is moved, `era calibrate`, `era table build`, then `era soft-amp` and
+`era daemon`, which is told of the fingers that are put on the board. What these feel is kept by the
+board, half a second after it begins. As bought and exactly known is answered in memory, and felt in
+the steady state. Five minutes a board.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.desk.session import Desk, desk
+from benchmarks.desk.touches import REPEAT, hold, playing, sizes
+from benchmarks.desk_plate.lifted_blocks import SAMPLES
+from benchmarks.desk_plate.truth import as_built
+from benchmarks.page import write_parts
+from benchmarks.setting import use_one_thread
+from benchmarks.weekend.boards import LEVEL_DB_SL, PAGE, ROOT, felt_contrast
+from benchmarks.weekend.chain import (
+    FOLDER,
+    BuiltBoard,
+    Fingers,
+    Outcome,
+    Touch,
+    frequencies_of,
+    phased_table,
+    promised_by,
+    random_fingers,
+    rig_as_bought,
+    table,
+)
+from controller.api.client import Client
+from controller.api.methods import StatusResult
+from model.arrays import FloatArray
+from model.finger.fingertip import fingertips_on
+from model.rig.rewritten import rewritten_text
+from model.rig.rig import Rig
+
+RESULTS = ROOT / "out" / "weekend_through_jack.json"
+MESH = "13x11 Legendre"
+"""Of the board in time: not that of the rig."""
+_LEVEL = 0.2  # of a measurement: more clips the sensor
+_SETTLING, _WINDOW = 0.5, 0.4  # s
+
+
+@dataclass(frozen=True)
+class Played:
+    """A board through JACK: what came of it, seconds of its measurement, places measured again.
+
+    xruns: blocks that the server lost.
+    """
+
+    outcome: Outcome
+    measure_s: float
+    repeated: int
+    xruns: int
+
+
+def played(number: int, count: int) -> Played:
+    """Measure, calibrate and touch a board; count: touches for each number of quiet fingers."""
+    rig = rig_as_bought()
+    built = BuiltBoard.drawn(rig, number)
+    assert rig.document is not None
+    text = rewritten_text(rig.document, rig, built.exactly_known, comment="As it is built.")
+    exact = phased_table(_with_lags(built).exactly_known)
+    bought = phased_table(rig)
+    with tempfile.TemporaryDirectory(prefix="weekend") as name:
+        folder = Path(name)
+        (folder / "built.yaml").write_text(text, "utf-8")
+        with desk(
+            folder,
+            seed=number,
+            mesh=MESH,
+            rig=(FOLDER / "rig.yaml").read_text("utf-8"),
+            sensors=(FOLDER / "places.csv").read_text("utf-8"),
+            options=["--y-cable", "--built", "built.yaml"],
+        ) as board:
+            begin = time.monotonic()
+            repeated = board.measure_by_moving(
+                "rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv", "--y-cable",
+                "-o", "measured.uff", "--level", _LEVEL,
+            )  # fmt: skip
+            measure_s = time.monotonic() - begin
+            board.run("calibrate", "rig.yaml", "measured.uff", "-o", "calibrated.yaml")
+            low, *_, high = frequencies_of(rig)
+            board.run(
+                "table", "build", "calibrated.yaml", "-o", "table.npz", "--mode", "phased",
+                "--frequencies", f"{low:g}:{high:g}:10",
+            )  # fmt: skip
+            found = []
+            drawn = [*random_fingers(rig, number, count)]
+            for fingers, (promised, felt) in zip(drawn, _felt(board, rig, drawn), strict=True):
+                best = _with_lags(built).contrast(fingers.query(exact), fingers.factors)
+                was = promised_by(fingers.query(bought))
+                found.append(Touch(len(fingers.quiet), was, promised, felt, best))
+            xruns = board.log_count("XRun")
+    return Played(Outcome(number, tuple(found)), measure_s, repeated, xruns)
+
+
+def _with_lags(built: BuiltBoard) -> BuiltBoard:
+    """The board with the gains that its drives have in time."""
+    truth, frequencies = as_built(built.rig, mesh=MESH), frequencies_of(built.rig)
+    eras = tuple(
+        replace(
+            era,
+            gains=tuple(
+                (f, abs(gain), float(np.angle(gain)))
+                for f, gain in zip(
+                    frequencies.tolist(), actuator.response(frequencies).tolist(), strict=True
+                )
+            ),
+        )
+        for era, actuator in zip(built.rig.eras, truth.actuators, strict=True)
+    )
+    return replace(built, rig=replace(built.rig, eras=eras))
+
+
+def _felt(board: Desk, rig: Rig, drawn: Sequence[Fingers]) -> Iterator[tuple[float, float]]:
+    """Yield the contrast promised to touches, and felt [dB]."""
+    with playing(board, level_db_sl=LEVEL_DB_SL) as era:
+        for fingers in drawn:
+            places = [fingers.target, *fingers.quiet]
+            board.touch_plate(
+                [(*at, load) for at, load in zip(places, fingers.factors.tolist(), strict=True)]
+            )
+            status = hold(era, [*fingers.quiet, fingers.target], _SETTLING)
+            yield _contrast_promised(status), _contrast_felt(board, era, rig, places, status)
+            era.touch([])
+
+
+def _contrast_promised(status: StatusResult) -> float:
+    assert status.promised_contrast_db is not None
+    return status.promised_contrast_db
+
+
+def _contrast_felt(
+    board: Desk,
+    era: Client,
+    rig: Rig,
+    places: Sequence[tuple[float, float]],
+    status: StatusResult,
+) -> float:
+    """Contrast that fingers at places feel now, the target first [dB]."""
+    board.begin_feeling(_WINDOW)
+    end = time.monotonic() + _WINDOW
+    while time.monotonic() < end:
+        era.touch([*places[1:], places[0]])
+        time.sleep(REPEAT)
+    felt: FloatArray = board.felt()
+    size = {"length": rig.plate.length, "width": rig.plate.width}
+    _, weights = fingertips_on(np.array(places), **size)
+    found = sizes(felt.reshape(len(felt), -1), status, 48_000 / SAMPLES)
+    return felt_contrast(found.reshape(felt.shape[1:]), weights)
+
+
+def summary(found: Sequence[Played]) -> str:
+    """The figures as Markdown."""
+    seconds = [each.measure_s for each in found]
+    return (
+        f"{table([each.outcome for each in found])}\n\n"
+        f"Measured in {min(seconds):.0f} to {max(seconds):.0f} s a board; "
+        f"{sum(each.repeated for each in found)} places measured again; "
+        f"{sum(each.xruns for each in found)} blocks lost by the server."
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.weekend.through_jack", description=__doc__
+    )
+    parser.add_argument("--boards", type=int, default=10)
+    parser.add_argument("--touches", type=int, default=20, help="for each number of quiet fingers")
+    parser.add_argument("--first", type=int, default=0, help="number of the first board")
+    parser.add_argument("--report", action="store_true")
+    options = parser.parse_args()
+    use_one_thread()
+    found: list[Played] = []
+    for number in range(options.first, options.first + options.boards):
+        try:
+            found.append(played(number, options.touches))
+        except RuntimeError as problem:
+            print(f"board {number}: {problem}", file=sys.stderr, flush=True)
+            continue
+        print(summary(found[-1:]), flush=True)
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps([asdict(each) for each in found]), "utf-8")
+    text = summary(found)
+    print(f"\n{text}")
+    if options.report:
+        counts = f"--boards {options.boards} --touches {options.touches}"
+        run = f"Printed by `python -m benchmarks.weekend.through_jack {counts} --report`."
+        write_parts(PAGE, {"through-jack": f"{run}\n\n{text}"})
+
+
+if __name__ == "__main__":
+    main()

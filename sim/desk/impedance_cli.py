@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -94,7 +94,7 @@ def impedance(
         ),
     ] = 1.0,
     level: Annotated[
-        float, typer.Option(help="Largest sample of output 1, 1 is full scale.", max=1.0)
+        float, typer.Option(help="Largest sample of output 1, 1 is full scale.", min=1e-4, max=1.0)
     ] = 0.1,
     periods: Annotated[
         int, typer.Option(metavar="N", help="Seconds that count.", min=2, max=60)
@@ -108,7 +108,7 @@ def impedance(
     holds nine of ten.
     """
     from model.files.replacing import check_ending, check_place
-    from sim.desk.measuring.impedance import Bench, exciter_values, fitted
+    from sim.desk.measuring.impedance import NAMES, Bench, exciter_values, fitted
     from sim.desk.measuring.impedance_run import (
         default_lines,
         measured_impedance,
@@ -117,18 +117,18 @@ def impedance(
     )
     from sim.desk.measuring.sound_card import open_card
 
-    given = {"free": free_file, "glued": glued_file}
-    read = {name: read_impedance(path) for name, path in given.items() if path is not None}
-    names = {name: f"--{name} {path}" for name, path in given.items()}
+    circuits = {
+        name: fitted(*read_impedance(path), what=f"--{name} {path}")
+        for name, path in (("free", free_file), ("glued", glued_file))
+        if path is not None
+    }
     if (device is None) != (output is None):
         missing = "--device" if device is None else "--output"
         raise InputError(f"{missing} is missing; a measurement needs both, files neither")
-    if device is None and not read:
-        raise InputError("--device is missing; measure, or give --free and --glued")
     taken = _inputs(inputs)
     bench = Bench(
-        _kilograms(weight),
-        _kilograms(coil),
+        weight and 1e-3 * weight,
+        coil and 1e-3 * coil,
         math.inf if base is None else 1e-3 * base,
         1e-3 * scale_error,
         series,
@@ -138,19 +138,15 @@ def impedance(
     if device is not None and output is not None:
         check_place(output, example="free.csv")
         check_ending(output, ".csv", what="an impedance")
-        if len(read) == 2:
+        if len(circuits) == 2:
             raise InputError("--free and --glued are both given; omit the one that is measured")
-        if level <= 0:
-            raise InputError(f"--level must be above 0, got {level:g}")
+        name = {"glued": "free", "free": "glued"}.get("".join(circuits), "measured")
         with closing(open_card(device, outputs=1, inputs=max(taken), limit=level)) as card:
             found = measured_impedance(
                 card, inputs=taken, series=series, level=level, periods=periods, move=_moved
             )
-        name = "free" if "glued" in read else "glued" if "free" in read else "measured"
-        read[name], names[name] = found, f"{device}"
-        fitted(*found, what=device)  # what is no exciter is not written
+        circuits[name] = fitted(*found, what=device)  # what is no exciter is not written
         write_impedance(output, *found)
-    circuits = {name: fitted(*each, what=names[name]) for name, each in read.items()}
     runs = circuits.get("free", circuits.get("measured")), circuits.get("glued")
     values = exciter_values(*runs, bench)
     by_light = {}
@@ -169,15 +165,23 @@ def impedance(
         *_warnings(circuits, values, by_light),
         following,
     ]
-    answer = _as_json(circuits, values, output) | {"change_by_light_base": by_light}
+    answer = {
+        "runs": {
+            name: dict(zip(NAMES, each.values.tolist(), strict=True)) | {"misfit": each.misfit}
+            for name, each in circuits.items()
+        },
+        "resonance_is": "mounted" if "glued" in circuits else "free",
+        "values": {
+            name: {"value": value, "half_width_90": width}
+            for name, (value, width) in values.items()
+        },
+        "files": [] if output is None else [str(output)],
+        "change_by_light_base": by_light,
+    }
     print_report(rows, answer, as_json=as_json)
 
 
 _LIGHT = 300.0  # g, a base that is not heavy
-
-
-def _kilograms(grams: float | None) -> float | None:
-    return None if grams is None else 1e-3 * grams
 
 
 def _inputs(text: str) -> tuple[int, ...]:
@@ -208,8 +212,6 @@ _BY_BASE = ("resonance", "coil_mass", "stiffness", "force_factor")
 def _rows(
     circuits: "Mapping[str, Circuit]", values: Mapping[str, tuple[float, float]], bench: "Bench"
 ) -> Iterator[str]:
-    from sim.desk.measuring.impedance import HALF_WIDTH
-
     for name, each in circuits.items():
         yield (
             f"{name}: resonance {each['resonance']:.4g} Hz, Q_ms {each['q']:.3g}, R "
@@ -222,9 +224,9 @@ def _rows(
     )
     for key, (factor, unit) in _UNITS.items():
         if key in values:
-            value, error = (factor * each for each in values[key])
+            value, width = (factor * each for each in values[key])
             text = f"{key}: {value:.4g} {unit}".rstrip()
-            held = f"± {HALF_WIDTH * error:.2g} {unit}".rstrip() if error else "as given, exactly"
+            held = f"± {width:.2g} {unit}".rstrip() if width else "as given, exactly"
             yield f"    {text:28s} # {held}"
         if key == "resonance":
             yield f"    resonance_is: {'mounted' if 'glued' in circuits else 'free'}"
@@ -249,37 +251,13 @@ def _warnings(
         yield f"taken as glued to something heavy; by --base {_LIGHT:g} grams: {changes}"
 
 
-def _as_json(
-    circuits: "Mapping[str, Circuit]",
-    values: Mapping[str, tuple[float, float]],
-    output: Path | None,
-) -> dict[str, Any]:
-    from sim.desk.measuring.impedance import HALF_WIDTH, NAMES
-
-    return {
-        "runs": {
-            name: {key: each[key] for key in NAMES} | {"misfit": each.misfit}
-            for name, each in circuits.items()
-        },
-        "resonance_is": "mounted" if "glued" in circuits else "free",
-        "values": {
-            name: {"value": value, "half_width_90": HALF_WIDTH * error}
-            for name, (value, error) in values.items()
-        },
-        "files": [] if output is None else [str(output)],
-    }
-
-
 class MeasureCommand(TyperCommand):
-    """`era measure`; with a flag it is another command, with options of its own."""
-
-    variants: ClassVar = {FLAG: get_command(app)}
+    """`era measure`; with --impedance it is another command, with options of its own."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
-        """The context of this command, or of a variant that a flag asks for."""
-        asked = [variant for flag, variant in self.variants.items() if flag in args]
-        if asked:
-            return asked[0].make_context(info_name, args, parent, **extra)
+        """The context of this command, or of the one that the flag asks for."""
+        if FLAG in args:
+            return get_command(app).make_context(info_name, args, parent, **extra)
         return super().make_context(info_name, args, parent, **extra)

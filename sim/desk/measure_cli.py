@@ -1,22 +1,12 @@
 """`era measure`: frequency responses of a plate through a sound card."""
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from model.commands.options import JsonOption, RigArgument, next_line, print_report
 from model.errors import InputError
-
-if TYPE_CHECKING:
-    from sim.desk.measuring.desk import Desk
-    from sim.desk.measuring.measure import Measured, Stepped
-    from sim.desk.measuring.multisine import Multisine
-    from sim.desk.measuring.sound_card import SoundCard
-
-DEFAULT_LEVEL = 0.3
 
 
 def measure(
@@ -54,8 +44,12 @@ def measure(
         ),
     ] = None,
     level: Annotated[
-        float, typer.Option(help="Largest sample of each output, 1 is full scale.")
-    ] = DEFAULT_LEVEL,
+        float | None,
+        typer.Option(
+            help="Largest sample of each output, 1 is full scale; default: 0.3, or less by the "
+            "rig's limits."
+        ),
+    ] = None,
     periods: Annotated[
         int, typer.Option(metavar="N", help="Seconds of each run that count.", min=2, max=60)
     ] = 2,
@@ -128,86 +122,23 @@ def measure(
             raise InputError(f"{option} needs {needs}; leave it out")
     is_whole = True
     if source is not None:
-        from sim.desk.measuring.stepped_import import measured_from
+        from sim.desk.measuring.stepped_file import measured_from
 
         rows, answer = measured_from(source, desk, output)
     else:
+        from sim.desk.measuring.at_once import measure_at_once
+        from sim.desk.measuring.moved_sensor import measure_by_moving
+
         opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)
         if is_moved:
-            from sim.desk.measuring.moved_dialogue import measure_by_moving
-
             rows, answer, is_whole = measure_by_moving(
                 desk, opened, output, periods=periods, is_resumed=resume
             )
         else:
-            rows, answer = _measure_at_once(desk, opened, output, periods=periods, stepped=stepped)
+            rows, answer = measure_at_once(
+                desk, opened, output, periods=periods, is_stepped=stepped
+            )
     if is_whole:
         next_words = ("calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated"))
         rows.append(next_line("era", *next_words))
     print_report(rows, answer, as_json=as_json)
-
-
-def _measure_at_once(
-    desk: "Desk",
-    opened: "AbstractContextManager[tuple[SoundCard, Multisine]]",
-    output: Path,
-    *,
-    periods: int,
-    stepped: bool,
-) -> tuple[list[str], dict[str, Any]]:
-    """Measure with all sensors where they stay; write the file, and return the report."""
-    from model.calibration.responses_file import write_responses
-    from model.commands.options import Stopwatch, progress_bar
-    from sim.desk.measuring.live_plot import live_plot
-    from sim.desk.measuring.measure import check_by_steps
-    from sim.desk.measuring.measure import measure as measured_by
-
-    check: Stepped | None = None
-    with Stopwatch() as timed, opened as (card, multisine):
-        with live_plot(multisine, desk.sensors) as show:
-            found = measured_by(desk, card, multisine, periods=periods, show=show)
-        if stepped:
-            with progress_bar("tones") as progress:
-                check = check_by_steps(desk, card, found, level=multisine.level, progress=progress)
-        rate = card.rate
-    write_responses(output, found.responses, desk.rig)
-    rows = [
-        *_rows(found, check, rate=rate),
-        f"measured in {timed.elapsed:.1f} s; wrote {output}",
-    ]
-    return rows, _as_json(found, check) | {"measure_time_s": timed.elapsed, "files": [str(output)]}
-
-
-def _as_json(found: "Measured", check: "Stepped | None") -> dict[str, Any]:
-    names = found.responses.sensors
-    return {
-        "frequencies_hz": found.responses.frequencies.tolist(),
-        "latency_s": found.latency,
-        "repeated_runs": found.repeated,
-        "sensors": {name: found.quality(n) for n, name in enumerate(names)},
-        "stepped": None if check is None else check.as_json(),
-    }
-
-
-def _rows(found: "Measured", check: "Stepped | None", *, rate: float) -> Iterator[str]:
-    """Yield how well responses were measured."""
-    import numpy as np
-
-    lines = found.responses.frequencies
-    yield (
-        f"{len(lines)} frequencies from {lines[0]:g} to {lines[-1]:g} Hz; delay of the sound card "
-        f"{1e3 * found.latency:.3f} ms ({found.latency * rate:.1f} samples); "
-        f"{found.repeated} runs repeated for lost blocks"
-    )
-    yield "sensor      coherence   lowest   noise    square law"
-    for n, name in enumerate(found.responses.sensors):
-        yield (
-            f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
-            f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
-            f"{100 * found.even[n]:8.2f} %"
-        )
-    if check is not None:
-        yield (
-            f"stepped tones differ by {check.level_db[0]:.3f} dB rms, {check.level_db[1]:.2f} dB "
-            f"at most, and {check.phase_deg[0]:.2f}° rms, {check.phase_deg[1]:.1f}° at most"
-        )

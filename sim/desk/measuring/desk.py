@@ -13,7 +13,6 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.transients.time_response import plate_in_time
-from sim.desk.measuring.loopback import converters
 from sim.desk.measuring.multisine import PERIOD
 from sim.sensors.sensor_file import WiredSensor
 
@@ -22,6 +21,15 @@ MIN_SETTLING = 1.0
 
 _MAX_SETTLING = 5.0  # s
 _LEFT = 0.01  # of a free vibration
+
+
+def converters(response: ComplexArray) -> ComplexArray:
+    """The loop-back's complex response (f,) with a modulus of 1 in the median.
+
+    Dividing by it takes out the delay, fractions of a sample included, and the shape of filters;
+    gains are left, since those of a level and of a sensitivity are stated.
+    """
+    return np.asarray(response / np.median(np.abs(response)))
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,17 @@ class Desk:
         return max(sensor.input for sensor in self.sensors) + 1
 
     @property
+    def looped(self) -> int:
+        """Number of the source that the loop-back brings back, the last one."""
+        return self.sources.index(self.output)
+
+    @property
+    def named_inputs(self) -> dict[int, str]:
+        """What each input has, the loop-back included."""
+        named = {sensor.input: f"sensor {sensor.name}" for sensor in self.sensors}
+        return named | {self.input: f"the loop-back of output {self.output}"}
+
+    @property
     def columns(self) -> list[int]:
         """Index of each sensor's input."""
         return [sensor.input - 1 for sensor in self.sensors]
@@ -91,9 +110,7 @@ class Desk:
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:
         """Samples (n, outputs) of the sources (n, sources)."""
-        found = np.zeros((len(sources), self.output))
-        found[:, [at - 1 for at in self.sources]] = sources
-        return found
+        return np.asarray(sources @ np.eye(self.output)[[at - 1 for at in self.sources]])
 
     @cached_property
     def settling(self) -> float:

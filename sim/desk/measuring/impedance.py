@@ -17,12 +17,11 @@ A resistor that is s S in place of S, and a first input that has g times the gai
 make (Z / s + S) g - S of Z: another circuit of this kind, so that each fitted value tells the true.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -36,18 +35,12 @@ NAMES = ("resistance", "inductance", "semi_inductance", "motional_resistance", "
 INDUCTANCE_AT = 300.0
 """Frequency [Hz] at which a semi-inductance is stated as an inductance."""
 
-HALF_WIDTH = 1.645
-"""Standard errors on either side that hold nine of ten values."""
-
+_HALF_WIDTH = 1.645  # standard errors on either side that hold nine of ten values
 _LEAST_LINES = 12
 _TRIED_Q = (0.4, 1.0, 2.5, 6.0, 15.0, 40.0)
 _EACH = 3  # line that is tried as a peak
 _CLEAR = 5.0  # standard errors of a peak
-_SEMI = 25.0  # variances by which a semi-inductance must improve the fit
 _SAME = 0.1  # relative, of Bl² by either run
-
-Known = Mapping[str, tuple[float, float]]
-"""Values with their standard errors."""
 
 
 @dataclass(frozen=True)
@@ -112,23 +105,6 @@ def fitted(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Ci
     Errors are taken as relative, and their size from the misfit. what: names the run. Raises
     InputError for what is no exciter: open, short, inputs exchanged, without a resonance.
     """
-    _check(frequencies, impedance, what=what)
-    start = _start(frequencies, impedance)
-    plain = _fit(frequencies, impedance, start, has_semi=False)
-    semi = _fit(frequencies, impedance, start, has_semi=True)
-    gained = (plain.misfit / semi.misfit) ** 2 - 1 if semi.misfit > 0 else 0.0
-    found = semi if gained * 2 * len(frequencies) > _SEMI else plain
-    peak = NAMES.index("motional_resistance")
-    error = np.sqrt(found.covariance[peak, peak])
-    if not (found.values[peak] > _CLEAR * error and LOW < found["resonance"] < HIGH):
-        raise InputError(
-            f"{what}: the impedance must have a resonance between {LOW:g} and {HIGH:g} Hz, got "
-            "none; check that the exciter's moving part is free to move, and the level"
-        )
-    return found
-
-
-def _check(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> None:
     if len(frequencies) < _LEAST_LINES or not np.isfinite(impedance).all():
         raise InputError(
             f"{what}: an impedance must have at least {_LEAST_LINES} frequencies and finite "
@@ -140,6 +116,15 @@ def _check(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> No
             f"{np.median(impedance.real):.3g} ohm; check for an open or short circuit, --series, "
             "and that the first input is before the resistor, the second one over it"
         )
+    found = _fit(frequencies, impedance)
+    peak = NAMES.index("motional_resistance")
+    error = np.sqrt(found.covariance[peak, peak])
+    if not (found.values[peak] > _CLEAR * error and LOW < found["resonance"] < HIGH):
+        raise InputError(
+            f"{what}: the impedance must have a resonance between {LOW:g} and {HIGH:g} Hz, got "
+            "none; check that the exciter's moving part is free to move, and the level"
+        )
+    return found
 
 
 def _shares(f: FloatArray, resonance: float, q: float) -> ComplexArray:
@@ -149,42 +134,27 @@ def _shares(f: FloatArray, resonance: float, q: float) -> ComplexArray:
     return np.stack([np.ones_like(f), 1j * omega, np.sqrt(1j * omega), motion], axis=1)
 
 
-def _start(f: FloatArray, impedance: ComplexArray) -> tuple[float, float]:
-    """The resonance and Q, of those tried, that explain most with the rest fitted linearly."""
-
-    def misfit(tried: tuple[float, float]) -> float:
-        matrix = _parts(_shares(f, *tried) / np.abs(impedance)[:, None])
-        return float(np.linalg.lstsq(matrix, ones, rcond=None)[1].sum())
-
-    ones = _parts(impedance / np.abs(impedance))
-    return min(((float(peak), q) for peak in f[::_EACH] for q in _TRIED_Q), key=misfit)
-
-
-def _fit(
-    f: FloatArray, impedance: ComplexArray, start: tuple[float, float], *, has_semi: bool
-) -> Circuit:
+def _fit(f: FloatArray, impedance: ComplexArray) -> Circuit:
+    """Least squares of relative differences, from the best of resonances and Q that are tried."""
     size = np.abs(impedance)
-    kept = [0, 1, 2, 3] if has_semi else [0, 1, 3]
+    ones = _parts(impedance / size)
 
-    def matrix(x: FloatArray) -> FloatArray:
-        return _parts(_shares(f, *np.exp(x[-2:]))[:, kept] / size[:, None])
+    def matrix(resonance: float, q: float) -> FloatArray:
+        return _parts(_shares(f, resonance, q) / size[:, None])
 
     def residual(x: FloatArray) -> FloatArray:
-        return np.asarray(matrix(x) @ x[:-2] - ones)
+        return np.asarray(matrix(*x[4:]) @ x[:4] - ones)
 
-    ones, nonlinear = _parts(impedance / size), np.log(start)
-    linear = np.linalg.lstsq(matrix(nonlinear), ones, rcond=None)[0]
-    first = np.concatenate([linear, nonlinear])
+    # The rest of the circuit follows linearly from resonance and Q.
+    tried = [(float(peak), q) for peak in f[::_EACH] for q in _TRIED_Q]
+    linear = [np.linalg.lstsq(matrix(*each), ones, rcond=None) for each in tried]
+    best = min(range(len(tried)), key=lambda n: float(linear[n][1].sum()))
+    first = np.array([*linear[best][0], *tried[best]])
     done = least_squares(residual, first, x_scale=np.maximum(np.abs(first), 1e-6), method="lm")
-    free = max(2 * len(f) - len(first), 1)
+    variance = 2 * done.cost / max(2 * len(f) - len(first), 1)
     slopes: FloatArray = np.asarray(done.jac)
-    inner = np.linalg.pinv(slopes.T @ slopes) * float((done.fun**2).sum()) / free
-    at = [*kept, 4, 5]
-    values, covariance = np.zeros(6), np.zeros((6, 6))
-    values[at] = [*done.x[:-2], *np.exp(done.x[-2:])]
-    slope = np.diag([*np.ones(len(kept)), *values[4:]])
-    covariance[np.ix_(at, at)] = slope @ inner @ slope
-    return Circuit(values, covariance, float(np.sqrt((done.fun**2).mean())))
+    covariance = np.asarray(np.linalg.pinv(slopes.T @ slopes) * variance)
+    return Circuit(done.x, covariance, float(np.sqrt((done.fun**2).mean())))
 
 
 def _parts(values: ComplexArray) -> FloatArray:
@@ -194,7 +164,7 @@ def _parts(values: ComplexArray) -> FloatArray:
 def exciter_values(
     free: Circuit | None, glued: Circuit | None, bench: Bench
 ) -> dict[str, tuple[float, float]]:
-    """The values of a rig's exciter that follow, each with its standard error.
+    """The values of a rig's exciter that follow, each with half the interval of nine of ten.
 
     Raises InputError for runs that are exchanged or not of one exciter.
     """
@@ -240,9 +210,18 @@ def exciter_values(
             }
         return found
 
+    def listed(x: FloatArray) -> FloatArray:
+        return np.array(list(values(x).values()))
+
     if free is not None and glued is not None:
         _check_pair(free, glued)
-    return _with_errors(values, x, covariance)
+    steps = np.maximum(1e-3 * np.sqrt(np.diag(covariance)), 1e-9)
+    slopes = approx_fprime(x, listed, steps)
+    widths = _HALF_WIDTH * np.sqrt(np.einsum("vn,nm,vm->v", slopes, covariance, slopes))
+    return {
+        name: (float(value), float(width))
+        for (name, value), width in zip(values(x).items(), widths, strict=True)
+    }
 
 
 def _check_pair(free: Circuit, glued: Circuit) -> None:
@@ -262,23 +241,3 @@ def _check_pair(free: Circuit, glued: Circuit) -> None:
             f"by {100 * abs(ratio - 1):.0f} %; glue the coil's side firmly to something heavy, and "
             "let the exciter hang by its wires, touching nothing"
         )
-
-
-def _with_errors(
-    function: Callable[[FloatArray], dict[str, float]], x: FloatArray, covariance: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """Values of a function and their standard errors, by its slopes."""
-
-    def listed(x: FloatArray) -> FloatArray:
-        return np.array(list(function(x).values()))
-
-    errors = np.sqrt(np.diag(covariance))
-    slopes = np.zeros((len(listed(x)), len(x)))
-    for n in np.flatnonzero(errors):
-        step = 1e-3 * errors[n] * np.eye(len(x))[n]
-        slopes[:, n] = (listed(x + step) - listed(x - step)) / (2 * step[n])
-    found = np.sqrt(np.einsum("vn,nm,vm->v", slopes, covariance, slopes))
-    return {
-        name: (float(value), float(error))
-        for (name, value), error in zip(function(x).items(), found, strict=True)
-    }

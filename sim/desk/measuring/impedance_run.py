@@ -12,18 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.files.csv_file import read_lines, write_columns
 from sim.desk.measuring.impedance import HIGH, LOW
-from sim.desk.measuring.loopback import SILENT
+from sim.desk.measuring.loopback import check_levels
 from sim.desk.measuring.multisine import Multisine
-from sim.desk.measuring.single_run import settled
+from sim.desk.measuring.runs import play_on_one
 from sim.desk.measuring.sound_card import SoundCard
 
 _LINES = 120
-_FULL = 0.999  # of full scale
+_PLACES = ("before the exciter", "over the resistor")
 _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
 
 
@@ -47,25 +46,15 @@ def measured_impedance(
     with where to, before each run. Raises InputError, LinkError.
     """
     sines = Multisine(default_lines(), 1, card.rate, level)
-    voltages = []
-    for n, place in enumerate(("before the exciter", "over the resistor")):
+    voltages = list[ComplexArray]()
+    for at, place in zip((inputs[0], inputs[-1]), _PLACES, strict=True):
         if len(inputs) == 1:
             move(place)
-        if n == 0 or len(inputs) == 1:
-            recorded = settled(card, sines, 1, outputs=1, periods=periods)
-        voltage = recorded[:, inputs[min(n, len(inputs) - 1)] - 1]
-        _check(voltage, f"input {inputs[min(n, len(inputs) - 1)]}, {place}")
-        voltages.append(sines.found(voltage))
+        if len(inputs) == 1 or not voltages:
+            recorded = play_on_one(card, sines, 1, outputs=1, periods=periods)
+        check_levels(recorded, {at: f"what is {place}"})
+        voltages.append(sines.found(recorded[:, at - 1]))
     return sines.frequencies, np.asarray(series * (voltages[0] / voltages[1] - 1))
-
-
-def _check(voltage: FloatArray, what: str) -> None:
-    if np.abs(voltage).max() >= _FULL:
-        raise InputError(f"{what}: clipped; turn down the gain of the input, or --level")
-    if np.sqrt((voltage**2).mean()) < SILENT:
-        raise LinkError(
-            f"{what}: silent; check the circuit, the output's volume and the cable of the input"
-        )
 
 
 def write_impedance(path: Path, frequencies: FloatArray, impedance: ComplexArray) -> None:

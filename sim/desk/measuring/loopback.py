@@ -5,15 +5,15 @@ Two devices, or an aggregate of two, drift by 10 to 100 millionths. What is play
 is then no longer orthogonal, and nothing else shows it where the loop-back has the right clock.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
+from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.multisine import PERIOD, Estimate, Multisine
-from sim.sensors.sensor_file import WiredSensor
 
 SILENT = 1e-5
 """Of full scale, rms: what an input without a signal stays below."""
@@ -39,15 +39,6 @@ def is_whole(periods: FloatArray, *, samples: int) -> bool:
 def is_as_late(gain: ComplexArray, before: ComplexArray) -> bool:
     """Whether two gains (f,) have one delay, which a block lost between two runs changes."""
     return bool(np.abs(gain - before).max() <= _AS_LATE * np.abs(before).max())
-
-
-def converters(response: ComplexArray) -> ComplexArray:
-    """The loop-back's complex response (f,) with a modulus of 1 in the median.
-
-    Dividing by it takes out the delay, fractions of a sample included, and the shape of filters;
-    gains are left, since those of a level and of a sensitivity are stated.
-    """
-    return np.asarray(response / np.median(np.abs(response)))
 
 
 def latency(response: ComplexArray, frequencies: FloatArray) -> float:
@@ -116,19 +107,11 @@ _FAINT = 0.01  # of full scale: what converters themselves add is heard beside i
 _MOVED = 5.0  # times the noise, in the median over frequencies and the maximum over sensors
 
 
-def check_levels(
-    recorded: FloatArray,
-    sensors: Sequence[WiredSensor],
-    *,
-    cable: tuple[int, int] | None = None,
-) -> None:
+def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
     """Raise InputError for clipped inputs, LinkError for silent ones, of one run (n, inputs).
 
-    cable: output and input of the loop-back, to be checked too.
+    named: what the inputs have that are checked, by their number from 1.
     """
-    named = {sensor.input: f"sensor {sensor.name}" for sensor in sensors}
-    if cable is not None:
-        named[cable[1]] = "the loop-back"
     clipped = [name for n, name in named.items() if np.abs(recorded[:, n - 1]).max() >= _FULL]
     if clipped:
         raise InputError(
@@ -142,29 +125,14 @@ def check_levels(
             "inputs not swapped, amplifier and sensor supply switched on"
         )
     if silent:
-        hint = ""
-        if cable is not None and cable[1] in silent:
-            hint = f"; the loop-back is a cable from output {cable[0]} to input {cable[1]}"
         inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
-        raise LinkError(f"silent: {inputs}; check cables and the supply of sensors (IEPE){hint}")
+        raise LinkError(f"silent: {inputs}; check cables and the supply of sensors (IEPE)")
 
 
-def check_wiring(
-    found: Estimate,
-    sensors: Sequence[WiredSensor],
-    eras: Sequence[tuple[str, int]],
-    *,
-    loopback: int,
-    output: int,
-) -> None:
-    """Raise InputError where the loop-back shows inputs or outputs to be swapped.
-
-    eras: name and output of each source, in order; the loop-back is the last one, or of the ERA
-    that has its output.
-    """
+def check_wiring(found: Estimate, desk: Desk) -> None:
+    """Raise InputError where the loop-back shows inputs or outputs to be swapped."""
     came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
-    named = {sensor.input: f"of sensor {sensor.name}" for sensor in sensors}
-    own = next((n for n, (_, at) in enumerate(eras) if at == output), len(eras))
+    own, eras, output, loopback = desk.looped, desk.eras, desk.output, desk.input
     first, others = came.max(axis=1), np.sort(came, axis=1)[:, -2]
     alone = (first > _LOOPED) & (others < _CROSSTALK * first)  # of one output, as cables are
     source = int(came[loopback - 1].argmax())
@@ -178,7 +146,8 @@ def check_wiring(
     if back != loopback and came[back - 1, own] > _LOOPED and alone[back - 1]:
         raise InputError(
             f"the loop-back of output {output} must come back at input {loopback}, got it at input "
-            f"{back}, {named.get(back, 'of no sensor')}: inputs are swapped; exchange their cables"
+            f"{back}, {desk.named_inputs.get(back, 'of no sensor')}: inputs are swapped; exchange "
+            "their cables"
         )
     looped = came[loopback - 1, own]
     if looped < _LOOPED:
@@ -195,20 +164,12 @@ def check_wiring(
         )
 
 
-def check_clocks(
-    multisine: Multisine,
-    recorded: Sequence[FloatArray],
-    sensors: Sequence[WiredSensor],
-    *,
-    loopback: int,
-) -> None:
+def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:
     """Raise InputError for inputs with another clock than the outputs'; runs (n, inputs) each."""
-    named = {loopback: "the loop-back"} | {s.input: f"sensor {s.name}" for s in sensors}
-    drifts = {n: certain_drift(multisine, [each[:, n - 1] for each in recorded]) for n in named}
     found = [
-        f"{1e6 * each:.0f} millionths at {named[n]} (input {n})"
-        for n, each in drifts.items()
-        if each
+        f"{1e6 * drift:.0f} millionths at {name} (input {n})"
+        for n, name in desk.named_inputs.items()
+        if (drift := certain_drift(multisine, [each[:, n - 1] for each in recorded]))
     ]
     if found:
         raise InputError(
@@ -220,8 +181,7 @@ def check_clocks(
 def check_coherence(
     found: Estimate,
     recorded: Sequence[FloatArray],
-    sensors: Sequence[WiredSensor],
-    eras: Sequence[tuple[str, int]],
+    desk: Desk,
     *,
     is_heard: bool = False,
 ) -> None:
@@ -230,7 +190,7 @@ def check_coherence(
     found: of what was recorded, runs (n, inputs) each; is_heard: whether every ERA was heard at
     another place.
     """
-    columns = [sensor.input - 1 for sensor in sensors]
+    columns = desk.columns
     coherence = np.median(found.coherence[:, columns], axis=0)
     peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
     for are_faint, remedy in (
@@ -239,7 +199,7 @@ def check_coherence(
     ):
         incoherent = [
             f"{sensor.name} ({each:.2f}, input up to {100 * peak:.2g} % of full scale)"
-            for sensor, each, peak in zip(sensors, coherence, peaks, strict=True)
+            for sensor, each, peak in zip(desk.sensors, coherence, peaks, strict=True)
             if each < _COHERENT and (peak < _FAINT) == are_faint
         ]
         if incoherent:
@@ -248,7 +208,7 @@ def check_coherence(
                 f"{', '.join(incoherent)}; {remedy}"
             )
     moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
-    for (name, at), each in zip(eras, np.median(moved, axis=0).max(axis=0), strict=False):
+    for (name, at), each in zip(desk.eras, np.median(moved, axis=0).max(axis=0), strict=False):
         if each < _MOVED:
             raise LinkError(
                 f"output {at} is not heard here, but was at another place: this one is near a "

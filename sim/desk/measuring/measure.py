@@ -3,14 +3,14 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.progress import Progress, unseen
-from sim.desk.measuring.desk import MIN_SETTLING, Desk
+from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import (
     check_clocks,
     check_coherence,
@@ -21,31 +21,16 @@ from sim.desk.measuring.loopback import (
     latency,
 )
 from sim.desk.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
+from sim.desk.measuring.runs import TRIES, Run, play, run_time
 from sim.desk.measuring.sound_card import SoundCard, open_card
 
-_TAIL = 0.05  # s; longer than the ramp
 
-TRIES = 3
-"""Attempts of a run."""
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What was recorded of a run: whole periods of the settled plate, (n, inputs).
-
-    loopback (f,): complex gain of the cable; is_whole: whether no block was lost, in the last
-    attempt; repeated: attempts before it.
-    """
-
-    recorded: FloatArray
-    loopback: ComplexArray
-    is_whole: bool
-    repeated: int
-
-
-def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
-    """Time [s] of a run of which so many periods are analysed, after it has settled."""
-    return settling + PERIOD * periods + _TAIL
+def loopback_gain(
+    desk: Desk, multisine: Multisine, number: int, recorded: FloatArray
+) -> ComplexArray:
+    """Complex gain (f,) of the cable in whole periods of a run (n, inputs)."""
+    amplitudes = multisine.played(number)[:, desk.looped]
+    return np.asarray(multisine.found(recorded[:, desk.input - 1]) / amplitudes)
 
 
 def play_run(
@@ -58,35 +43,28 @@ def play_run(
     before: ComplexArray | None,
     tries: int = TRIES,
 ) -> Run:
-    """Play a run, again where blocks were lost in it or since the first one.
+    """Play a run, again where blocks were lost in it or since the first one; keep whole periods.
 
     before (f,): the loop-back's gain in the first run, None in that. Raises InputError, LinkError
     for inputs that are clipped or silent.
     """
+
+    def is_same(kept: FloatArray) -> bool:
+        """By the cable: drivers report losses that were none, and miss others."""
+        check_levels(kept, desk.named_inputs)
+        return is_whole(kept[:, desk.input - 1], samples=multisine.samples) and (
+            before is None or is_as_late(loopback_gain(desk, multisine, number, kept), before)
+        )
+
     seconds = run_time(periods, settling=desk.settling)
     signal = desk.on_outputs(multisine.signal(number, periods=seconds / PERIOD))
-    start = round(desk.settling * multisine.rate)
-    repeated = 0
-    while True:
-        kept = card.run(signal)[start : start + periods * multisine.samples].astype(float)
-        check_levels(kept, desk.sensors, cable=(desk.output, desk.input))
-        looped = kept[:, desk.input - 1]
-        gain = (
-            multisine.found(looped) / multisine.played(number)[:, desk.sources.index(desk.output)]
-        )
-        # The cable decides: drivers report losses that were none, and miss others.
-        same = is_whole(looped, samples=multisine.samples)
-        same = same and (before is None or is_as_late(gain, before))
-        if same or repeated == tries - 1:
-            return Run(kept, gain, same, repeated)
-        repeated += 1
-
-
-def blocks_lost() -> LinkError:
-    """The error for a run that lost blocks each time."""
-    return LinkError(
-        f"blocks of sound were lost in {TRIES} attempts of a run; end other programs, give "
-        "the sound server real-time priority, or choose larger blocks"
+    return play(
+        card,
+        signal,
+        settling=desk.settling,
+        seconds=PERIOD * periods,
+        is_whole=is_same,
+        tries=tries,
     )
 
 
@@ -167,26 +145,24 @@ def measure(
     """
     seconds = run_time(periods, settling=desk.settling)
     desk.check_times(seconds=seconds, slew=multisine.slew)
+    runs: list[Run] = []
     recorded: list[FloatArray] = []
-    first: ComplexArray | None = None
-    repeated, is_lost = 0, False
     for number in range(multisine.sources):
-        tries = 1 if is_lost else TRIES
-        run = play_run(desk, card, multisine, number, periods=periods, before=first, tries=tries)
-        first = run.loopback if first is None else first
-        repeated += run.repeated
-        is_lost = is_lost or not run.is_whole
-        recorded.append(run.recorded)
+        before = loopback_gain(desk, multisine, 0, recorded[0]) if recorded else None
+        tries = TRIES if all(run.is_whole for run in runs) else 1
+        runs.append(
+            play_run(desk, card, multisine, number, periods=periods, before=before, tries=tries)
+        )
+        recorded.append(runs[-1].recorded)
         show(recorded)
     found = estimate(multisine, recorded)
     # Another signal than the loop-back's, or another clock, looks like lost blocks; that is the
     # cause to be told.
-    check_wiring(found, desk.sensors, desk.eras, loopback=desk.input, output=desk.output)
-    check_clocks(multisine, recorded, desk.sensors, loopback=desk.input)
-    if is_lost:
-        raise blocks_lost()
-    check_coherence(found, recorded, desk.sensors, desk.eras, is_heard=is_heard)
-    looped, columns = found.values[:, desk.input - 1, desk.sources.index(desk.output)], desk.columns
+    check_wiring(found, desk)
+    check_clocks(multisine, recorded, desk)
+    whole = [run.whole for run in runs]
+    check_coherence(found, whole, desk, is_heard=is_heard)
+    looped, columns = found.values[:, desk.input - 1, desk.looped], desk.columns
     of_eras = found.values[:, columns, : len(desk.eras)]
     rms = np.sqrt((np.abs(of_eras) ** 2).mean(axis=(0, 2)))
     return Measured(
@@ -195,7 +171,7 @@ def measure(
         found.std[:, columns] / rms,
         latency(looped, multisine.frequencies),
         found.even[columns],
-        repeated,
+        sum(run.repeated for run in runs),
         looped,
     )
 
@@ -205,28 +181,6 @@ _TONES = 5
 _LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
 
 
-@dataclass(frozen=True)
-class Stepped:
-    """Multisine beside stepped tones, of responses above 5 % of the largest at their frequency.
-
-    level_db, phase_deg: root mean square and largest difference; frequencies (n,) [Hz].
-    """
-
-    frequencies: FloatArray
-    level_db: tuple[float, float]
-    phase_deg: tuple[float, float]
-
-    def as_json(self) -> dict[str, object]:
-        """For programs."""
-        return {
-            "frequencies_hz": self.frequencies.tolist(),
-            "level_rms_db": self.level_db[0],
-            "level_max_db": self.level_db[1],
-            "phase_rms_deg": self.phase_deg[0],
-            "phase_max_deg": self.phase_deg[1],
-        }
-
-
 def check_by_steps(
     desk: Desk,
     card: SoundCard,
@@ -234,8 +188,12 @@ def check_by_steps(
     *,
     level: float,
     progress: Progress = unseen,
-) -> Stepped:
-    """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks."""
+) -> dict[str, Any]:
+    """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks.
+
+    Return, for programs, the frequencies and the root mean square and largest difference of
+    responses above 5 % of the largest at their frequency.
+    """
     known = measured.responses
     rows = np.unique(np.linspace(0, len(known.frequencies) - 1, _TONES).round().astype(int))
     frequencies = known.frequencies[rows]
@@ -245,7 +203,18 @@ def check_by_steps(
             values[row, :, era] = _played(desk, card, era, frequency, level)
             progress(era * len(rows) + row + 1, len(desk.eras) * len(rows))
     found = desk.responses(frequencies, values, measured.looped[rows])
-    return _compared(frequencies, known.values[rows], found)
+    one = known.values[rows]
+    size = np.abs(one)
+    ratio = (found.values / one)[size > _LOUD * size.max(axis=(1, 2), keepdims=True)]
+    decibels = np.asarray(np.abs(20 * np.log10(np.abs(ratio))))
+    degrees = np.asarray(np.abs(np.degrees(np.angle(ratio))))
+    return {
+        "frequencies_hz": frequencies.tolist(),
+        "level_rms_db": float(np.sqrt((decibels**2).mean())),
+        "level_max_db": float(decibels.max()),
+        "phase_rms_deg": float(np.sqrt((degrees**2).mean())),
+        "phase_max_deg": float(degrees.max()),
+    }
 
 
 def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: float) -> ComplexArray:
@@ -254,19 +223,11 @@ def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: floa
     signal = tone.signal(0, periods=run_time(_PERIODS, settling=desk.settling) / PERIOD)
     sources = np.zeros((len(signal), len(desk.eras) + 1))
     sources[:, [era, -1]] = signal
-    heard = card.run(desk.on_outputs(sources)).astype(float)
-    start = round(desk.settling * card.rate)
-    kept = heard[start : start + _PERIODS * tone.samples]
-    if card.gaps or not is_whole(kept[:, desk.input - 1], samples=tone.samples):
-        raise LinkError("blocks of sound were lost between stepped tones; measure again")
-    return np.asarray(tone.found(kept)[0] / tone.played(0)[0])
-
-
-def _compared(frequencies: FloatArray, one: ComplexArray, other: Responses) -> Stepped:
-    size = np.abs(one)
-    ratio = (other.values / one)[size > _LOUD * size.max(axis=(1, 2), keepdims=True)]
-    level, phase = 20 * np.log10(np.abs(ratio)), np.degrees(np.angle(ratio))
-    both = [
-        (float(np.sqrt((each**2).mean())), float(np.abs(each).max())) for each in (level, phase)
-    ]
-    return Stepped(frequencies, both[0], both[1])
+    run = play(
+        card,
+        desk.on_outputs(sources),
+        settling=desk.settling,
+        seconds=_PERIODS * PERIOD,
+        is_whole=lambda kept: is_whole(kept[:, desk.input - 1], samples=tone.samples),
+    )
+    return np.asarray(tone.found(run.whole)[0] / tone.played(0)[0])

@@ -6,16 +6,20 @@ place, so that the rest can be measured another time.
 """
 
 import math
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import MeasuredValue, Responses, responses_of
+from model.calibration.responses import Responses, responses_of
 from model.calibration.responses_file import read_measured, write_responses
+from model.commands.options import Stopwatch
 from model.errors import InputError
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.measure import Measured, measure
@@ -29,29 +33,25 @@ _APART = 5e-3  # m; nearer places may sound alike
 _AT = 5e-4  # m; places of a file are those of the sensors within that
 _NOISY = 0.03  # of the response
 
-Ask = Callable[[str], str]
-"""Shows a person what to do and returns what was typed; "q" without an answer."""
-Tell = Callable[[str], None]
-"""Shows a person a line."""
-
-
-def setting_of(desk: Desk, multisine: Multisine) -> str:
-    """What must be the same at all places, in words of a file."""
-    return f"level {multisine.level:g}, rig {desk.rig.fingerprint[:8]}"
-
 
 @dataclass(eq=False)
 class PlacesFile:
-    """What is measured at places of a desk, and the file that keeps it.
+    """What is measured at places of a desk with a multisine, and the file that keeps it.
 
     values (f, eras) [1/s²] by the name of a place.
     """
 
     path: Path
     desk: Desk
-    frequencies: FloatArray
-    setting: str
+    multisine: Multisine
     values: dict[str, ComplexArray] = field(default_factory=dict)
+
+    @property
+    def setting(self) -> str:
+        """What must be the same at all places, in words of the file."""
+        grams = 1e3 * self.desk.sensors[0].mass
+        rig = self.desk.rig.fingerprint[:8]
+        return f"level {self.multisine.level:g}, sensor {grams:.6g} g, rig {rig}"
 
     @property
     def missing(self) -> list[WiredSensor]:
@@ -60,16 +60,13 @@ class PlacesFile:
 
     def read(self) -> None:
         """Go on from the file; raises InputError where it is of another measurement."""
-        measured = read_measured(self.path)
-        for each in measured:
-            self._check(each)
+        measured, played = read_measured(self.path), self.multisine.frequencies
+        settings = {each.setting for each in measured} - {self.setting}
+        if settings:
+            raise self._other("setting", self.setting, " and ".join(settings) or "none")
         found = responses_of(measured, self.desk.rig)
-        if (
-            found.skipped
-            or found.frequencies.shape != self.frequencies.shape
-            or not np.allclose(found.frequencies, self.frequencies, rtol=0, atol=1e-6)
-        ):
-            raise self._other("frequencies", _span(self.frequencies), _span(found.frequencies))
+        if found.skipped or not np.array_equal(found.frequencies.round(6), played.round(6)):
+            raise self._other("frequencies", _span(played), _span(found.frequencies))
         for at, values in zip(found.points.tolist(), found.values.transpose(2, 0, 1), strict=True):
             self.values[self._place_at(at).name] = values
 
@@ -85,25 +82,22 @@ class PlacesFile:
         return Responses(
             tuple(place.name for place in places),
             np.array([[place.x, place.y] for place in places]),
-            self.frequencies,
+            self.multisine.frequencies,
             np.stack([self.values[place.name] for place in places], axis=2),
             masses=np.array([place.mass for place in places]),
         )
-
-    def _check(self, each: MeasuredValue) -> None:
-        """Refuse a value of another setting, place or sensor."""
-        if each.setting != self.setting:
-            raise self._other("level and rig", self.setting, each.setting or "none stated")
-        place = self._place_at(each.point)
-        if not math.isclose(each.sensor_mass, place.mass, rel_tol=1e-6, abs_tol=1e-9):
-            grams = [f"{1e3 * mass:g} g" for mass in (place.mass, each.sensor_mass)]
-            raise self._other("the sensor's mass", *grams)
 
     def _place_at(self, at: Sequence[float]) -> WiredSensor:
         for place in self.desk.sensors:
             if math.dist((place.x, place.y), at) <= _AT:
                 return place
         raise self._other("places", "one at each line of --sensors", f"({at[0]:g}, {at[1]:g}) m")
+
+    def __str__(self) -> str:
+        """How far it is, in a line."""
+        count, total = len(self.values), len(self.desk.sensors)
+        text = f"{count} of {total} places are measured" + (f", in {self.path}" if count else "")
+        return f"{text}; go on with --resume" if 0 < count < total else text
 
     def _other(self, what: str, wanted: str, got: str) -> InputError:
         return InputError(
@@ -112,19 +106,72 @@ class PlacesFile:
         )
 
 
+def measure_by_moving(
+    desk: Desk,
+    opened: AbstractContextManager[tuple[SoundCard, Multisine]],
+    output: Path,
+    *,
+    periods: int,
+    is_resumed: bool,
+) -> tuple[list[str], dict[str, Any], bool]:
+    """Guide a person at a terminal through the places of a desk.
+
+    Return the report, and whether all places are measured. Raises InputError, LinkError,
+    KeyboardInterrupt, having said what is kept.
+    """
+    if output.exists() != is_resumed:
+        raise InputError(
+            f"{output}: a file must be there to go on from with --resume, got none; leave it out"
+            if is_resumed
+            else f"{output}: exists; go on with --resume, or choose another name"
+        )
+    with Stopwatch() as timed, opened as (card, multisine):
+        file = PlacesFile(output, desk, multisine)
+        if is_resumed:
+            file.read()
+            _tell(str(file))
+        try:
+            found = measure_places(file, card, periods=periods)
+        except KeyboardInterrupt:
+            card.close()  # silent before anything is said
+            _tell(f"\nstopped; {file}")
+            raise
+        except DeviceLost as problem:
+            raise LinkError(f"{problem}; check its cable; {file}") from problem
+    missing = [place.name for place in file.missing]
+    answer = {
+        "frequencies_hz": multisine.frequencies.tolist(),
+        "places": {"measured": [*found], "missing": missing},
+        "sensors": {name: each.quality(0) for name, each in found.items()},
+        "measure_time_s": timed.elapsed,
+        "files": [str(output)] if file.values else [],
+    }
+    return [str(file)], answer, not missing
+
+
+def _ask(text: str) -> str:
+    sys.stderr.write(text)
+    sys.stderr.flush()
+    return sys.stdin.readline() or "q"
+
+
+def _tell(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+
+
 def measure_places(
     file: PlacesFile,
     card: SoundCard,
-    multisine: Multisine,
     *,
     periods: int,
-    ask: Ask,
-    tell: Tell,
+    ask: Callable[[str], str] = _ask,
+    tell: Callable[[str], None] = _tell,
 ) -> dict[str, Measured]:
     """Guide a person through the missing places; returns what was measured now, by place.
 
-    A place that fails a check is reported with its remedy, and asked for again. Raises DeviceLost,
-    OSError; what was measured before is in the file then.
+    ask: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
+    that fails a check is reported with its remedy, and asked for again. Raises DeviceLost, OSError;
+    what was measured before is in the file then.
     """
     found: dict[str, Measured] = {}
     todo = file.missing
@@ -134,11 +181,10 @@ def measure_places(
         "kept"
     )
     while todo:
-        place = todo[0]
-        number = file.desk.sensors.index(place) + 1
+        place, places = todo[0], file.desk.sensors
         reply = ask(
             f"Put the sensor at {place.name}, x {1e3 * place.x:g} mm, y {1e3 * place.y:g} mm "
-            f"(place {number} of {len(file.desk.sensors)}), then Enter: "
+            f"(place {places.index(place) + 1} of {len(places)}), then Enter: "
         )
         match reply.strip().lower():
             case "q":
@@ -155,7 +201,7 @@ def measure_places(
                     measured = measure(
                         replace(file.desk, sensors=(place,)),
                         card,
-                        multisine,
+                        file.multisine,
                         periods=periods,
                         is_heard=bool(file.values),
                     )

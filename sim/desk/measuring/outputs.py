@@ -20,11 +20,9 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels
-from sim.desk.measuring.measure import run_time
 from sim.desk.measuring.multisine import Estimate, Multisine, estimate, ramped
-from sim.desk.measuring.single_run import settled
+from sim.desk.measuring.runs import play_on_one, run_time
 from sim.desk.measuring.sound_card import SoundCard
-from sim.sensors.sensor_file import WiredSensor
 
 TONE = 160.0
 """Usual frequency [Hz] of the tone: felt well, and soft in air."""
@@ -45,40 +43,38 @@ _MARGIN = 0.05  # of the mean correlation, over the next best assignment
 
 
 def tone(
-    desk: Desk, output: int, *, outputs: int, rate: float, level: float, frequency: float
+    desk: Desk, output: int, *, outputs: int, rate: float, level: float, frequency: float | None
 ) -> FloatArray:
-    """Samples (n, outputs) of three short bursts on one output, counted from 1; frequency [Hz].
+    """Samples (n, outputs) of three short bursts on one output, counted from 1.
 
-    Raises InputError for what the rig's limits do not allow.
+    frequency [Hz]: None for the usual one, or the nearest within the rig's limits. Raises
+    InputError for what these do not allow.
     """
+    limits, ramp = desk.rig.limits, BURST / 4
+    if frequency is None:
+        frequency = float(np.clip(TONE, limits.frequency_min, limits.frequency_max))
     desk.check_frequencies(np.array([frequency]), what="--frequency")
-    ramp = round(BURST / 4 * rate)
-    desk.check_times(seconds=BURST, slew=np.pi / 2 * level / (BURST / 4))
+    desk.check_times(seconds=BURST, slew=np.pi / 2 * level / ramp)
     times = np.arange(round(BURST * rate)) / rate
-    burst = ramped(level * np.sin(2 * np.pi * frequency * times)[:, None], ramp)
-    each = np.concatenate([burst, np.zeros((round(PAUSE * rate), 1))])
-    found = np.zeros((_BURSTS * len(each), outputs))
-    found[:, output - 1] = np.tile(each, (_BURSTS, 1))[:, 0]
-    return found
-
-
-def default_tone(rig: Rig) -> float:
-    """The usual frequency [Hz], or the nearest one within the rig's limits."""
-    return float(np.clip(TONE, rig.limits.frequency_min, rig.limits.frequency_max))
+    sine = level * np.sin(2 * np.pi * frequency * times)[:, None]
+    silence = np.zeros((round(PAUSE * rate), 1))
+    burst = np.concatenate([ramped(sine, round(ramp * rate)), silence])
+    return np.asarray(np.tile(burst, (_BURSTS, 1)) * np.eye(outputs)[output - 1])
 
 
 @dataclass(frozen=True)
 class Heard:
-    """What is known of an output, counted from 1; era: that it drives, "" for none.
+    """What is known of an output, counted from 1; era: that it drives, None for none.
 
-    level: relative to the median, and to the model; verdict: "" where nothing is wrong.
+    polarity, 1 or -1, and relative_level, to the median and to the model: None where nothing
+    listens; verdict: what is wrong, and its remedy.
     """
 
     output: int
-    era: str
-    is_reversed: bool = False
-    level: float = 1.0
-    verdict: str = ""
+    era: str | None = None
+    polarity: int | None = None
+    relative_level: float | None = None
+    verdict: str = "ok"
 
 
 def listen(
@@ -105,56 +101,47 @@ def listen(
     for era in desk.rig.eras:
         move(era.name)
         runs = [
-            settled(card, sines, output, outputs=outputs, periods=_PERIODS)[:, [beside - 1]]
+            play_on_one(card, sines, output, outputs=outputs, periods=_PERIODS)
             for output in range(1, outputs + 1)
         ]
-        sensor = WiredSensor(f"beside {era.name}", era.x, era.y, 1, 1.0)
-        check_levels(np.concatenate(runs), [sensor])
-        found.append([estimate(sines, [run]) for run in runs])
-    return judged(desk, sines.frequencies, found)
+        check_levels(np.concatenate(runs), {beside: f"sensor beside {era.name}"})
+        found.append([estimate(sines, [run[:, [beside - 1]]]) for run in runs])
+    return judged(desk.rig, sines.frequencies, found)
 
 
-def judged(desk: Desk, frequencies: FloatArray, found: Sequence[Sequence[Estimate]]) -> list[Heard]:
+def judged(rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[Estimate]]) -> list[Heard]:
     """What each output drives, by the responses beside each actuator at frequencies (f,) [Hz].
 
     found: by actuator and output. Raises InputError where outputs are not told apart.
     """
-    rig = desk.rig
     points = np.array([[era.x, era.y] for era in rig.eras])
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
     model = free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
-    by_output = list(zip(*found, strict=True))
-    audible = [n for n, each in enumerate(by_output) if _moves(each)]
-    if not audible:
+    values = np.array([[each.values[:, 0, 0] for each in place] for place in found])
+    noise = np.array([[each.std[:, 0] for each in place] for place in found])
+    moved = np.median(np.abs(values) / noise, axis=2).max(axis=0)  # (outputs,)
+    audible = np.flatnonzero(moved >= _MOVED)
+    if not audible.size:
         raise InputError("no output moves the plate: check amplifier, its supply and cables")
-    values = np.array(
-        [[place.values[:, 0, 0] for place in by_output[n]] for n in audible]
-    ).transpose(0, 2, 1)
+    values = values[:, audible].transpose(1, 2, 0)
     rows, eras, signs = matched(values, model, frequencies)
     levels = _size(values[rows]) / _size(model[eras])
-    levels = levels / np.median(levels)
-    heard = {
-        n: Heard(n + 1, "", level=0.0, verdict="dead: moves nothing; check its cable and amplifier")
-        for n in range(len(by_output))
-    }
-    for row, era, sign, level in zip(rows, eras, signs, levels, strict=True):
-        n, is_reversed = audible[row], bool(sign < 0)
-        verdict = _verdict(by_output[n][era], is_reversed=is_reversed, level=level)
-        heard[n] = Heard(n + 1, rig.eras[era].name, is_reversed, float(level), verdict)
-    return list(heard.values())
+    dead = "dead: moves nothing; check its cable and amplifier"
+    heard = [Heard(n + 1, relative_level=0.0, verdict=dead) for n in range(len(moved))]
+    for row, era, sign, level in zip(rows, eras, signs, levels / np.median(levels), strict=True):
+        n = int(audible[row])
+        verdict = _verdict(found[era][n], sign=sign, level=level)
+        heard[n] = Heard(n + 1, rig.eras[era].name, int(sign), float(level), verdict)
+    return heard
 
 
-def _moves(places: Sequence[Estimate]) -> bool:
-    return any(np.median(np.abs(each.values) / each.std[..., None]) >= _MOVED for each in places)
-
-
-def _verdict(beside: Estimate, *, is_reversed: bool, level: float) -> str:
-    """What is wrong with an output that moves the plate, "" for nothing."""
+def _verdict(beside: Estimate, *, sign: int, level: float) -> str:
+    """What is wrong with an output that moves the plate."""
     if beside.even[0] > _RATTLE or np.median(beside.coherence) < _COHERENT:
         return "loose: it rattles; fasten it"
     if level < _WEAK:
         return "loose, or its gain is low: fasten it, and check the amplifier's knob"
-    return "backwards: exchange its two wires" if is_reversed else ""
+    return "backwards: exchange its two wires" if sign < 0 else "ok"
 
 
 def matched(

@@ -17,9 +17,8 @@ from model.identification.measurement import (
 )
 from model.progress import Progress
 from model.rig.rig import Rig
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.loopback import converters
-from sim.desk.measuring.measure import Measured, Run, blocks_lost, measure, open_desk, play_run
+from sim.desk.measuring.desk import Desk, converters
+from sim.desk.measuring.measure import Measured, measure, open_desk, play_run
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import SoundCard
 from sim.sensors.sensor_file import read_sensors
@@ -63,9 +62,7 @@ def measure_through(
     for number, factor in enumerate((0.5, 1.0), start=1):
         again = replace(multisine, level=factor * multisine.level)
         run = play_run(desk, card, again, _REPEATED, periods=periods, before=found.looped)
-        if not run.is_whole:
-            raise blocks_lost()
-        repeats.append(_repeats(desk, found, again, run))
+        repeats.append(_repeats(desk, found, again, run.whole))
         progress(runs + number, runs + 2)
     measurement = replace(
         _measurement(desk, found),
@@ -97,11 +94,13 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
     return replace(plain, std=np.hypot(plain.std, noise))
 
 
-def _repeats(desk: Desk, found: Measured, multisine: Multisine, run: Run) -> tuple[Repeat, ...]:
+def _repeats(
+    desk: Desk, found: Measured, multisine: Multisine, recorded: FloatArray
+) -> tuple[Repeat, ...]:
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
     bases = multisine.played(_REPEATED)[:, : len(desk.full_levels)] * desk.full_levels  # (f, eras)
     first = np.einsum("fes,fe->fs", found.responses.values, bases)
-    heard = multisine.found(run.recorded)[:, desk.columns] / desk.sensitivities
+    heard = multisine.found(recorded)[:, desk.columns] / desk.sensitivities
     again = heard / converters(found.looped)[:, None]
     size = np.linalg.norm(bases, axis=1, keepdims=True)
     first, again = first / size, again / size

@@ -8,18 +8,54 @@ or its number from 1. What a file does not say is in its name: SENSOR-OUTPUT.csv
 
 import cmath
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
-from model.calibration.responses import MeasuredValue
+import numpy as np
+
+from model.calibration.responses import MeasuredValue, responses_of
+from model.calibration.responses_file import write_responses
+from model.counting import counted
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
 from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.stepped_recording import Tone, tones_of
+from sim.desk.measuring.stepped_recording import CLOSE, tones_of
 from sim.sensors.sensor_file import WiredSensor, are_places
 
 _OPTIONAL = ("output", "sensor", "magnitude", "magnitude_db", "phase_deg", "real", "imag")
 _ENDINGS = (".csv", ".wav")
+
+
+_Known = TypeVar("_Known")
+
+
+def measured_from(source: Path, desk: Desk, output: Path) -> tuple[list[str], dict[str, Any]]:
+    """Read files of a stepped sine, write responses, and return the report; raises InputError."""
+    found = responses_of(read_stepped(source, desk), desk.rig)
+    write_responses(output, found, desk.rig)
+    absent = [each.name for each in desk.sensors if each.name not in found.sensors]
+    lines = found.frequencies
+    count = found.values.size - found.count
+    rows = [
+        f"{source}: {counted(len(found.sensors), 'sensor')}, "
+        f"{counted(len(lines), 'frequency', plural='frequencies')} from {lines[0]:g} to "
+        f"{lines[-1]:g} Hz, {counted(found.count, 'value')}",
+    ]
+    if count:
+        rows.append(f"{counted(count, 'value')} missing, or not settled and left out")
+    if absent:
+        rows.append(f"without {', '.join(absent)}")
+    rows.append(f"wrote {output}")
+    return rows, {
+        "frequencies_hz": lines.tolist(),
+        "sensors": [*found.sensors],
+        "without": absent,
+        "values": found.count,
+        "values_missing": count,
+        "files": [str(output)],
+    }
 
 
 def read_stepped(source: Path, desk: Desk) -> list[MeasuredValue]:
@@ -33,7 +69,11 @@ def read_stepped(source: Path, desk: Desk) -> list[MeasuredValue]:
     for path in files:
         read = _of_recording if path.suffix.lower() == ".wav" else _of_lines
         found += read(path, desk)
-    return found
+    # Clocks of converters say nearly, and not quite, the same of one tone in several recordings.
+    order = np.unique([each.frequency for each in found])
+    groups = np.split(order, np.flatnonzero(np.diff(order) > CLOSE * order[1:]) + 1)
+    same = {frequency: float(group.mean()) for group in groups for frequency in group.tolist()}
+    return [replace(each, frequency=same[each.frequency]) for each in found]
 
 
 def _of_lines(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
@@ -78,13 +118,9 @@ def _of_recording(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
     if "-" in path.stem:
         names = [_era(desk, _in_name(path, 1, "output"), str(path))]
     for tone in tones_of(path, sensors, names):
-        for sensor, ratio in zip(sensors, tone.ratios, strict=True):
-            if ratio is not None:
-                yield _value(desk, tone.era, sensor, tone.frequency, ratio, _at(path, tone))
-
-
-def _at(path: Path, tone: Tone) -> str:
-    return f"{path} at {tone.start:.1f} s"
+        for sensor, ratio in zip(sensors, tone.ratios.tolist(), strict=True):
+            if not cmath.isnan(ratio):
+                yield _value(desk, tone.era, sensor, tone.frequency, ratio, tone.place)
 
 
 def _in_name(path: Path, number: int, what: str) -> str:
@@ -99,19 +135,18 @@ def _in_name(path: Path, number: int, what: str) -> str:
 
 
 def _sensor(desk: Desk, name: str, place: str) -> WiredSensor:
-    for sensor in desk.sensors:
-        if sensor.name == name:
-            return sensor
-    known = ", ".join(sensor.name for sensor in desk.sensors)
-    raise InputError(f"{place}: sensor must be one of --sensors, {known}, got {name!r}")
+    return _known(f"{place}: sensor", name, {sensor.name: sensor for sensor in desk.sensors})
 
 
 def _era(desk: Desk, output: str, place: str) -> str:
-    for name, number in desk.eras:
-        if output in (name, str(number)):
-            return name
-    known = ", ".join(f"{number} ({name})" for name, number in desk.eras)
-    raise InputError(f"{place}: output must be one of {known}, got {output!r}")
+    numbers = {str(number): name for name, number in desk.eras}
+    return _known(f"{place}: output", output, numbers | {name: name for name, _ in desk.eras})
+
+
+def _known(what: str, given: str, known: Mapping[str, _Known]) -> _Known:
+    if given not in known:
+        raise InputError(f"{what} must be one of {', '.join(known)}, got {given!r}")
+    return known[given]
 
 
 def _value(

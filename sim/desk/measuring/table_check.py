@@ -7,10 +7,9 @@ from contextlib import closing, contextmanager, suppress
 import numpy as np
 
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.errors import DriverError, LinkError
+from drivers.errors import DriverError
 from drivers.playing import contents
 from model.answer.answer import Layer
-from model.arrays import FloatArray
 from model.progress import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
@@ -24,6 +23,7 @@ from model.table.table import LocalizationTable
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels, is_whole
 from sim.desk.measuring.multisine import ramped
+from sim.desk.measuring.runs import Run, play
 from sim.desk.measuring.sound_card import SoundCard, open_card
 from sim.plant.fingers import fit_tones
 from sim.sensors.sensor_file import read_sensors
@@ -32,12 +32,11 @@ _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that 
 _WINDOW = 1.0  # s
 _RAMP = 0.04  # s
 _PLAYED = _SETTLING + _WINDOW + _RAMP  # s
-_TRIES = 3
 _MARK = 1000.0  # Hz; of the loop-back, by which lost blocks show
 _MARK_LEVEL = 0.3
 
-Recorder = Callable[[Promise], FloatArray]
-"""Plays a promise, and returns samples (n, inputs) of the plate that has settled."""
+Recorder = Callable[[Promise], Run]
+"""Plays a promise, and keeps samples (n, inputs) of the plate that has settled."""
 
 
 def check_table(
@@ -59,6 +58,7 @@ def check_table(
     if settings.url is None:
         desk.check_times(seconds=_PLAYED, slew=np.pi / 2 * level / _RAMP)
     by_name = {sensor.name: sensor for sensor in sensors}
+    named = desk.named_inputs
     places = {name: (sensor.x, sensor.y) for name, sensor in by_name.items()}
     found = []
     with _recorder(desk, settings, level) as (rate, record):
@@ -69,11 +69,13 @@ def check_table(
             frequencies = np.unique([tone.frequency for tone in excitation.values()])
             # A table may have been built of more; an amplifier's ledger refuses them, too.
             desk.check_frequencies(frequencies, what="frequencies of the table")
-            heard = record(promise)
+            run = record(promise)
             chosen = [by_name[name] for name in promise.sensors]
-            check_levels(heard, chosen)
+            inputs = [sensor.input for sensor in chosen]
+            cable = [desk.input] if settings.url is None else []
+            check_levels(run.recorded, {n: named[n] for n in [*inputs, *cable]})
             # All tones are fitted together, since their frequencies need not fit into the window.
-            samples = heard[:, [sensor.input - 1 for sensor in chosen]]
+            samples = run.whole[:, [n - 1 for n in inputs]]
             tones = fit_tones(np.arange(len(samples)) / rate, samples, frequencies.tolist())
             amplitudes = np.abs(tones / [sensor.sensitivity for sensor in chosen])
             found.append(measured_promise(table, promise, frequencies, amplitudes))
@@ -104,10 +106,8 @@ def _recorder(
             yield card.rate, lambda promise: _by_amplifier(card, amplifier, rig, promise)
 
 
-def _by_amplifier(
-    card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promise: Promise
-) -> FloatArray:
-    """Record what an amplifier plays."""
+def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promise: Promise) -> Run:
+    """Record what an amplifier plays, once."""
     seconds = _SETTLING + _WINDOW
     tones = tuple(
         contents.Tone(
@@ -123,18 +123,23 @@ def _by_amplifier(
             playing = thread.submit(
                 amplifier.play, [contents.Layer(0, tones, _RAMP)], duration=seconds + _SETTLING
             )
-            heard = card.run(np.zeros((round(seconds * card.rate), 0)))
+            run = play(
+                card,
+                np.zeros((round(seconds * card.rate), 0)),
+                settling=_SETTLING,
+                seconds=_WINDOW,
+                is_whole=lambda _kept: not card.gaps,
+                tries=1,
+            )
             playing.result()
         except BaseException:  # leaving waits for the thread, which feeds the watchdog
             with suppress(DriverError):
                 amplifier.disarm()
             raise
-    if card.gaps:
-        raise LinkError("blocks of sound were lost while a pattern played; verify again")
-    return heard[-round(_WINDOW * card.rate) :].astype(float)
+    return run
 
 
-def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> FloatArray:
+def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> Run:
     """Play a pattern from memory: a level is a sample, as of an amplifier whose output it is.
 
     level: that no output exceeds, the loop-back's included, since cables may be swapped.
@@ -147,13 +152,11 @@ def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> Float
             angle = 2 * np.pi * tone.frequency * times + tone.phase
             sources[:, number] = tone.amplitude / era.full_level * np.sin(angle)
     sources[:, -1] = min(_MARK_LEVEL, level) * np.sin(2 * np.pi * _MARK * times)
-    played = desk.on_outputs(ramped(sources, round(_RAMP * card.rate)))
-    start, count = (round(each * card.rate) for each in (_SETTLING, _WINDOW))
-    for _ in range(_TRIES):
-        heard = card.run(played)[start : start + count].astype(float)
-        if is_whole(heard[:, desk.input - 1], samples=count // 4):
-            return heard
-    raise LinkError(
-        f"blocks of sound were lost in {_TRIES} attempts, or no cable leads from output "
-        f"{desk.output} to input {desk.input}; check it, and end other programs"
+    quarter = round(_WINDOW * card.rate) // 4
+    return play(
+        card,
+        desk.on_outputs(ramped(sources, round(_RAMP * card.rate))),
+        settling=_SETTLING,
+        seconds=_WINDOW,
+        is_whole=lambda kept: is_whole(kept[:, desk.input - 1], samples=quarter),
     )

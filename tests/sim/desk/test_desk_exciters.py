@@ -20,7 +20,7 @@ from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
 from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.moved_sensor import PlacesFile, measure_places, setting_of
+from sim.desk.measuring.moved_sensor import PlacesFile, measure_places
 from sim.desk.measuring.multisine import Multisine
 from sim.sensors.sensor_file import WiredSensor
 
@@ -89,14 +89,14 @@ def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: P
     plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
     desk = Desk(lossy, sensors)
     sines = Multisine(np.arange(41.0, 300.0, 20.0), len(desk.eras) + 1, RATE, 0.3)
-    file = PlacesFile(tmp_path / "measured.csv", desk, sines.frequencies, setting_of(desk, sines))
+    file = PlacesFile(tmp_path / "measured.csv", desk, sines)
 
     def moved(text: str) -> str:
         plate.move_sensor(text.split("sensor at ")[1].split(",")[0])
         return ""
 
     card = DeskCard(plate, rate=RATE)
-    measure_places(file, card, sines, periods=2, ask=moved, tell=lambda text: None)
+    measure_places(file, card, periods=2, ask=moved, tell=lambda text: None)
     responses = responses_of(read_measured(file.path), lossy)
     full = np.array([era.full_level for era in lossy.eras])
     exact = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2) / full[:, None]

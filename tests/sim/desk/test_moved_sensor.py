@@ -20,7 +20,7 @@ from model.errors import InputError
 from model.identification.identify import identify
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.moved_sensor import PlacesFile, measure_places, setting_of
+from sim.desk.measuring.moved_sensor import PlacesFile, measure_places
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import DeviceLost
 from sim.sensors.sensor_file import WiredSensor, read_sensors
@@ -81,11 +81,7 @@ class Bench:
         lines = LINES if len(sensors) > len(SENSORS) else FREQUENCIES
         self.sines = Multisine(lines, len(self.desk.eras) + 1, RATE, LEVEL)
         self.path = path
-        self.file = self.opened(self.desk, self.sines)
-
-    def opened(self, desk: Desk, sines: Multisine) -> PlacesFile:
-        """The file, not read."""
-        return PlacesFile(self.path, desk, sines.frequencies, setting_of(desk, sines))
+        self.file = PlacesFile(path, self.desk, self.sines)
 
     def measure(self) -> list[str]:
         """Measure what is missing; returns the places that were measured."""
@@ -93,7 +89,6 @@ class Bench:
             *measure_places(
                 self.file,
                 self.card,
-                self.sines,
                 periods=2,
                 ask=self.person.ask,
                 tell=self.person.said.append,
@@ -149,11 +144,11 @@ def test_each_place_is_measured_under_the_sensors_mass(
 def test_measurement_that_was_stopped_goes_on(bench: Bench, ending: str) -> None:
     """Stopped by q, by Ctrl-C and by a pulled card: the rest is measured, and no place twice."""
     bench.path = bench.path.with_suffix(f".{ending}")
-    bench.file = bench.opened(bench.desk, bench.sines)
+    bench.file = PlacesFile(bench.path, bench.desk, bench.sines)
     bench.person.replies = ["", "q"]
     assert bench.measure() == ["P1"]
     bench.person.replies = ["", "Ctrl-C"]
-    bench.file = bench.opened(bench.desk, bench.sines)
+    bench.file = PlacesFile(bench.path, bench.desk, bench.sines)
     bench.file.read()
     with pytest.raises(KeyboardInterrupt):
         bench.measure()
@@ -163,7 +158,7 @@ def test_measurement_that_was_stopped_goes_on(bench: Bench, ending: str) -> None
         bench.measure()
     assert bench.path.read_bytes() == before
     bench.card.pulled = None
-    bench.file = bench.opened(bench.desk, bench.sines)
+    bench.file = PlacesFile(bench.path, bench.desk, bench.sines)
     bench.file.read()
     assert [place.name for place in bench.file.missing] == ["P3"]
     assert bench.measure() == ["P3"]
@@ -178,14 +173,14 @@ def test_files_of_another_measurement_are_not_gone_on_with(rig: Rig, bench: Benc
     heavy = tuple(replace(place, mass=1e-3) for place in SENSORS)
     aside = (replace(SENSORS[0], x=0.04), *SENSORS[1:])
     for desk, sines, cause in (
-        (bench.desk, replace(bench.sines, level=0.2), "level and rig must be level 0.2"),
-        (Desk(replace(rig, eras=eras), SENSORS), bench.sines, "level and rig"),
+        (bench.desk, replace(bench.sines, level=0.2), "setting must be level 0.2"),
+        (Desk(replace(rig, eras=eras), SENSORS), bench.sines, "sensor 5 g, rig .* got level 0.3"),
         (bench.desk, replace(bench.sines, frequencies=FREQUENCIES[:3]), "frequencies"),
-        (Desk(rig, heavy), bench.sines, "mass must be 1 g, got 5 g"),
+        (Desk(rig, heavy), bench.sines, "sensor 1 g, .* got level 0.3, sensor 5 g"),
         (Desk(rig, aside), bench.sines, "places"),
     ):
         with pytest.raises(InputError, match=cause):
-            bench.opened(desk, sines).read()
+            PlacesFile(bench.path, desk, sines).read()
 
 
 def test_place_is_repeated_or_skipped(bench: Bench) -> None:
@@ -250,7 +245,7 @@ def test_faint_sensor_is_told_from_a_loose_one(
 ) -> None:
     """As much noise as signal, of 0.3 % of full scale and of far more: louder, or fixed better."""
     bench = Bench(rig, truth, tmp_path / "measured.uff", noise=noise)
-    bench.sines = replace(bench.sines, level=level)
+    bench.file.multisine = replace(bench.sines, level=level)
     bench.person.replies = ["", "q"]
     bench.measure()
     assert remedy in bench.person.said[1]

@@ -172,10 +172,10 @@ class Validation(Generic[SectionT]):
             self._add_errors(error, section, below=path)
             return None
 
-    def field(self, path: tuple[str, ...], section: type[Section]) -> Any:
+    def field(self, path: KeyPath, section: type[Section]) -> Any:
         """One field of a section if it is valid on its own; else None."""
         try:
-            return _field_reader(section, path[-1]).validate_python(self._document.value(path))
+            return _field_reader(section, str(path[-1])).validate_python(self._document.value(path))
         except (KeyError, ValidationError):
             return None
 

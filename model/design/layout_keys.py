@@ -7,7 +7,7 @@ from typing import Any
 from model.arrays import FloatArray
 from model.config.sections import section_by_kind
 from model.design.problem import DesignProblem
-from model.rig.actuators import KINDS, kind_of
+from model.rig.actuators import KINDS
 from model.rig.rig import Channel, Rig
 
 MAX_CHANNELS = 4
@@ -63,8 +63,7 @@ def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
 
 def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that one replaces in an actuator of the section's kind."""
-    own = section_by_kind([kind.section for kind in KINDS.values()], section)
-    return kind_of(own).instead.get(key, ())
+    return section_by_kind([*KINDS.values()], section).instead.get(key, ())
 
 
 def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:

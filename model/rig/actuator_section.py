@@ -1,15 +1,28 @@
-"""Keys that actuators of every kind have below `eras` in a rig file."""
+"""Keys that actuators of every kind have below `eras` in a rig file, and what each kind adds."""
 
-from typing import Annotated
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field
 
 from model.config.sections import Section
 from model.rig.key_types import GAINS, Foot, GainRow, Identifier, Place
+from model.structure.actuators import Actuator
+from model.structure.plate import Plate
 
 
 class ActuatorSection(Section):
-    """What actuators of every kind have."""
+    """What actuators of every kind have; each kind extends it by its own."""
+
+    keys: ClassVar[Mapping[str, str]]
+    """By field of the actuator that a fit changes."""
+
+    instead: ClassVar[Mapping[str, tuple[str, ...]]]
+    """Keys that some of them replace: these are always written, whatever else of a rig changes."""
+
+    is_electrical: ClassVar[bool] = False
+    """Whether its full level is a voltage, so that an amplifier which drives it is an output."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -42,3 +55,15 @@ class ActuatorSection(Section):
 
     Limits: rows by ascending frequency
     """
+
+    @abstractmethod
+    def made(self, name: str, plate: Plate, count: int) -> Actuator:
+        """The actuator of a name on a plate; count: of the rig's actuators."""
+
+    @classmethod
+    @abstractmethod
+    def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """What keys require of each other: problems by key.
+
+        given: keys of a file with the values of those that are valid by themselves, else None.
+        """

@@ -1,13 +1,13 @@
 """Checks of a rig across its sections."""
 
 import math
-from typing import Any
+from collections.abc import Mapping, Set
+from typing import Any, NamedTuple
 
 from model.config.document import KeyPath, key_name
-from model.config.sections import Validation, section_by_kind
+from model.config.sections import Section, Validation, section_by_kind
 from model.errors import InputError
-from model.rig.actuator_section import ActuatorSection
-from model.rig.actuators import KINDS, kind_of
+from model.rig.actuators import KINDS
 from model.rig.era_section import stiff_mount_problems
 from model.rig.meshes import mesh_of
 from model.rig.parts import laminate_of, plate_of
@@ -26,6 +26,17 @@ from model.structure.plate import Plate
 from registry.suggestions import did_you_mean
 
 
+class Way(NamedTuple):
+    """One of two ways to state something: keys that it needs, and further ones of it alone."""
+
+    needed: Set[str]
+    further: Set[str] = frozenset()
+
+
+_WHOLE, _LAYERED = Way({"thickness", "material"}, {"grain"}), Way({"layers"}, {"bond"})
+_ISOTROPIC, _ORTHOTROPIC = Way(ISOTROPIC, {"by_frequency"}), Way(ORTHOTROPIC)
+
+
 def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
     """Add problems between sections that are valid by themselves."""
     limits = validation.field(("limits", "frequency"), LimitsSection)
@@ -33,67 +44,51 @@ def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> Non
     plate = _check_plate(validation, frequency_max=high)
     if plate is not None and not mesh_given:
         _check_mesh(validation, plate, frequency_max=high)
-    names = tuple(validation.mapping(("eras",)))
-    for name in names:
-        _check_era(validation, name)
-    _check_places(validation, names, plate)
-    _check_wiring(validation, names)
+    eras = {}
+    for name, keys in validation.mapping(("eras",)).items():
+        section = section_by_kind([*KINDS.values()], keys)
+        eras[name] = given = _given(validation, ("eras", name), section)
+        for key, problem in section.problems(given) if given else ():
+            validation.add(("eras", name, key), problem)
+    _check_places(validation, eras, plate)
+    _check_wiring(validation, eras)
     for name in validation.mapping(("masses",)):
-        _check_on_plate(validation, ("masses", name), MassSection, plate, what="mass")
-        _check_point_or_edges(validation, ("masses", name), "mass", "mass_per_length")
+        _check_attached(validation, ("masses", name), MassSection, plate)
     for name in validation.mapping(("supports",)):
-        _check_support(validation, name, plate)
+        given = _check_attached(validation, ("supports", name), SupportSection, plate)
+        for key, problem in stiff_mount_problems(given):
+            validation.add(("supports", name, key), problem)
 
 
-def _check_support(validation: Validation[RigSection], name: str, plate: Plate | None) -> None:
-    """Check what keys of a support require of each other."""
-    path = ("supports", name)
-    _check_on_plate(validation, path, SupportSection, plate, what="support")
-    given = _given(validation, path)
-    stiffness = None if "kind" in given and "along" not in given else "stiffness"
-    _check_point_or_edges(validation, path, stiffness, "stiffness_per_length")
-    if {"along", "kind"} <= given:
-        validation.add((*path, "kind"), "is of a foot; remove it, and give stiffness_per_length")
-    stiffness = validation.field((*path, "stiffness"), SupportSection)
-    for key, problem in stiff_mount_problems(_given(validation, path), stiffness):
-        validation.add((*path, key), problem)
+def _check_attached(
+    validation: Validation[RigSection],
+    path: tuple[str, str],
+    section: type[MassSection | SupportSection],
+    plate: Plate | None,
+) -> dict[str, Any]:
+    """Check that a mass or support is on the plate, at a point or along the edges; its keys."""
+    given = _given(validation, path, section)
+    _check_on_plate(validation, path, given.get("at"), plate)
+    per_length = "mass_per_length" if section is MassSection else "stiffness_per_length"
+    own = set() if "kind" in given else {per_length.removesuffix("_per_length")}
+    at_point, at_edges = Way({"at", *own}, {"foot", "kind"}), Way({"along", per_length})
+    if given:
+        ways = (at_edges, at_point) if "along" in given else (at_point, at_edges)
+        _check_way(validation, path, *ways)
+    return given
 
 
-def _check_point_or_edges(
-    validation: Validation[RigSection], path: tuple[str, ...], of_point: str | None, of_edges: str
-) -> None:
-    """Check that what is attached is at a point, or along the edges, each with its own key."""
-    given = _given(validation, path)
-    if not validation.mapping(path):
-        return
-    if "along" not in given and "at" not in given:
-        validation.add((*path, "at"), "missing; add it, or along: edges")
-        return
-    edges = "along" in given
-    needed, others = (of_edges, {"at", of_point, "foot"}) if edges else (of_point, {of_edges})
-    if needed is not None and needed not in given:
-        validation.add((*path, needed), "missing; add it")
-    for key in sorted(each for each in others if each in given):
-        word = "is not of what is along: edges" if edges else "is of what is along: edges"
-        validation.add((*path, key), f"{word}; remove it")
-
-
-def _check_era(validation: Validation[RigSection], name: str) -> None:
-    """Check what keys of an ERA require of each other."""
-    section, path = _section(validation, name), ("eras", name)
-
-    def read(key: str) -> Any:
-        return validation.field((*path, key), section)
-
-    given = _given(validation, path)
-    for key, problem in kind_of(section).problems(given, read) if given else ():
-        validation.add((*path, key), problem)
-
-
-def _section(validation: Validation[RigSection], name: str) -> type[ActuatorSection]:
-    """The section of an ERA, or of another kind of actuator."""
-    sections = [kind.section for kind in KINDS.values()]
-    return section_by_kind(sections, validation.mapping(("eras", name)))
+def _check_way(validation: Validation[RigSection], path: KeyPath, this: Way, other: Way) -> bool:
+    """Check that a section has all keys of the way that it takes, and none of the other."""
+    given = _given(validation, path).keys()
+    missing, too_many = this.needed - given, given & (other.needed | other.further)
+    for key in sorted(missing):
+        instead = ", ".join(sorted(other.needed))
+        validation.add((*path, key), f"missing; add it, or {instead} instead")
+    for key in sorted(too_many):
+        beside = min(this.needed & given, default="the others")
+        validation.add((*path, key), f"must not be given with {beside}; remove it")
+    return not (missing or too_many)
 
 
 def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
@@ -101,29 +96,21 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
     given = _given(validation, ("plate",))
     if not given:
         return None
-    if "layers" in given:
-        for key in sorted({"thickness", "material"} & given):
-            validation.add(("plate", key), "must not be given with layers; remove one of the two")
-        if "grain" in given:
-            validation.add(("plate", "grain"), "is for a plate without layers; remove it")
-    else:
-        for key in ("thickness", "material"):
-            if key not in given:
-                validation.add(("plate", key), "missing; add it, or layers for a laminate")
-        if "bond" in given:
-            validation.add(("plate", "bond"), "is for layers only; remove it")
-    paths = [("plate", "material"), *_layer_materials(validation)]
-    good = [_check_material(validation, path) for path in paths]
-    if not all(good):
-        return None
+    is_layered = "layers" in given
+    ways = (_LAYERED, _WHOLE) if is_layered else (_WHOLE, _LAYERED)
+    _check_way(validation, ("plate",), *ways)
+    layers = validation.mapping(("plate",)).get("layers")
+    count = len(layers) if isinstance(layers, list) else 0
+    paths = [("plate", "layers", number, "material") for number in range(count)]
+    good = [_check_material(validation, path) for path in (("plate", "material"), *paths)]
     section = validation.part(("plate",), PlateSection)
-    if section is None or (section.layers is None and not {"thickness", "material"} <= given):
+    if section is None or not (all(good) and ways[0].needed <= given.keys()):
         return None
     try:
         laminate = laminate_of(section)
         plate = plate_of(section, frequency_max=frequency_max)
     except InputError as error:
-        key = "material" if "layers" not in given else "bond" if "bond" in given else "layers"
+        key = "material" if not is_layered else "bond" if "bond" in given else "layers"
         validation.add(("plate", key), str(error))
         return None
     thickness = plate.thickness if laminate is None else laminate.thickness
@@ -136,29 +123,12 @@ def _check_plate(validation: Validation[RigSection], *, frequency_max: float) ->
     return plate
 
 
-def _layer_materials(validation: Validation[RigSection]) -> list[KeyPath]:
-    """Where the materials of layers stand."""
-    layers = validation.mapping(("plate",)).get("layers")
-    count = len(layers) if isinstance(layers, list) else 0
-    return [("plate", "layers", number, "material") for number in range(count)]
-
-
 def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
     """Check that a material by numbers has those of one of both kinds, and only these."""
-    given = _given(validation, path)
-    if not given:
-        return True
-    if "by_frequency" in given and given & ORTHOTROPIC:
-        validation.add((*path, "by_frequency"), "is of an isotropic material only; remove it")
-    kind, other = ISOTROPIC, ORTHOTROPIC
-    if len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0):
-        kind, other = other, kind
-    for key in sorted(kind - given):
-        others = "E1, E2, G12, G13, G23, nu12" if kind is ISOTROPIC else "E and nu"
-        validation.add((*path, key), f"missing; add it, or {others} instead")
-    for key in sorted(other & given):
-        validation.add((*path, key), f"must not be given with {min(kind & given)}; remove it")
-    return not (kind - given or other & given)
+    given = _given(validation, path).keys()
+    has_grain = len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0)
+    ways = (_ORTHOTROPIC, _ISOTROPIC) if has_grain else (_ISOTROPIC, _ORTHOTROPIC)
+    return not given or _check_way(validation, path, *ways)
 
 
 def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_max: float) -> None:
@@ -188,13 +158,12 @@ def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_m
 
 
 def _check_places(
-    validation: Validation[RigSection], names: tuple[str, ...], plate: Plate | None
+    validation: Validation[RigSection], eras: Mapping[str, Mapping[str, Any]], plate: Plate | None
 ) -> None:
     placed: dict[str, tuple[float, float]] = {}
-    for name in names:
-        place = _check_on_plate(
-            validation, ("eras", name), _section(validation, name), plate, what="ERA"
-        )
+    for name, given in eras.items():
+        place = given.get("at")
+        _check_on_plate(validation, ("eras", name), place, plate)
         if place is None:
             continue
         for other, taken in placed.items():
@@ -208,39 +177,32 @@ def _check_places(
 
 def _check_on_plate(
     validation: Validation[RigSection],
-    path: tuple[str, ...],
-    section: type[ActuatorSection | MassSection | SupportSection],
+    path: tuple[str, str],
+    place: tuple[float, float] | None,
     plate: Plate | None,
-    *,
-    what: str,
-) -> tuple[float, float] | None:
-    """Check the place of an ERA or a mass; the place, None if it is invalid by itself."""
-    place: tuple[float, float] | None = validation.field((*path, "at"), section)
+) -> None:
+    """Check the place of what is attached to a plate, where both are known."""
     if place is None or plate is None:
-        return place
-    x, y = place
-    if not (
-        -SAME_POINT <= x <= plate.length + SAME_POINT
-        and -SAME_POINT <= y <= plate.width + SAME_POINT
-    ):
+        return
+    (x, y), length, width = place, plate.length, plate.width
+    d = SAME_POINT
+    if not (-d <= x <= length + d and -d <= y <= width + d):
         validation.add(
             (*path, "at"),
-            f"must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) m, got "
-            f"({x:g}, {y:g}) m; move the {what}",
+            f"must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got ({x:g}, {y:g}) "
+            "m; move it",
         )
-    return place
 
 
-def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) -> None:
+def _check_wiring(
+    validation: Validation[RigSection], eras: Mapping[str, Mapping[str, Any]]
+) -> None:
     amplifiers = validation.mapping(("amplifiers",))
     wired: dict[tuple[str, int], str] = {}
-    if names and not any("amplifier" in _given(validation, ("eras", name)) for name in names):
+    if eras and not any("amplifier" in given for given in eras.values()):
         validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
-    for name in names:
-        section = _section(validation, name)
-        amplifier, channel = (
-            validation.field(("eras", name, key), section) for key in ("amplifier", "channel")
-        )
+    for name, given in eras.items():
+        amplifier, channel = given.get("amplifier"), given.get("channel")
         if amplifier is not None and amplifier not in amplifiers:
             known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
             validation.add(
@@ -259,6 +221,13 @@ def _check_wiring(validation: Validation[RigSection], names: tuple[str, ...]) ->
             )
 
 
-def _given(validation: Validation[RigSection], path: KeyPath) -> set[str]:
-    """Keys of a section that are not empty."""
-    return {key for key, value in validation.mapping(path).items() if value is not None}
+def _given(
+    validation: Validation[RigSection], path: KeyPath, section: type[Section] = Section
+) -> dict[str, Any]:
+    """Keys of a section that are not empty, with the values of those that are valid, else None."""
+    own = validation.mapping(path)
+    return {
+        key: validation.field((*path, key), section)
+        for key, value in own.items()
+        if value is not None
+    }

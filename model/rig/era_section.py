@@ -1,8 +1,8 @@
 """ERAs in a rig file: their keys, and the ERA that a section is."""
 
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from model.config.sections import Quantity
 from model.config.units import DAMPING, LENGTH, MASS, RATIO, STIFFNESS
@@ -48,34 +48,36 @@ class EraSection(ActuatorSection):
     stroke: Annotated[float, Quantity(LENGTH, above=0, at_most=0.01)] = 100e-6
     """Amplitude of its base at level 1, where its gain is 1."""
 
+    keys: ClassVar = {each: each for each in ("stiffness", "damping", "bolt_mass", "gains")}
+    instead: ClassVar = {"damping": ("damping_ratio",)}
 
-def era_of(name: str, section: EraSection, plate: Plate, era_count: int) -> Era:
-    """An ERA; era_count: of the rig, for the damping from a ratio."""
-    damping = section.damping
-    if damping is None:
-        damping = damping_from_ratio(
-            section.damping_ratio,
-            stiffness=section.stiffness,
-            plate_mass=plate.mass,
-            era_count=era_count,
-        )
-    x, y = place_on(plate, section.at)
-    same = section.model_dump(include=_SAME)
-    return Era(name, x, y, damping=damping, gains=gains_of(section.gains), **same)
+    def made(self, name: str, plate: Plate, count: int) -> Era:
+        """An ERA; its damping from a ratio depends on plate and count."""
+        damping = self.damping
+        if damping is None:
+            damping = damping_from_ratio(
+                self.damping_ratio,
+                stiffness=self.stiffness,
+                plate_mass=plate.mass,
+                era_count=count,
+            )
+        at, same = place_on(plate, self.at), self.model_dump(include=_SAME)
+        return Era(name, *at, damping=damping, gains=gains_of(self.gains), **same)
+
+    @classmethod
+    def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Damping in two ways, half of a wiring, and a stiff mount without a size."""
+        if {"damping", "damping_ratio"} <= given.keys():
+            yield "damping", "must not be given with damping_ratio; remove one of the two"
+        for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
+            if other in given and key not in given:
+                yield key, f"missing; add it, or remove {other} too for an ERA that only supports"
+        yield from stiff_mount_problems(given)
 
 
-def era_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
-    """What keys of an ERA require of each other: problems by key."""
-    if {"damping", "damping_ratio"} <= given:
-        yield "damping", "must not be given with damping_ratio; remove one of the two"
-    for key, other in (("amplifier", "channel"), ("channel", "amplifier")):
-        if other in given and key not in given:
-            yield key, f"missing; add it, or remove {other} too for an ERA that only supports"
-    yield from stiff_mount_problems(given, read("stiffness"))
-
-
-def stiff_mount_problems(given: Set[str], stiffness: float | None) -> Iterator[tuple[str, str]]:
-    """The problem of a stiff mount [N/m] without a size, by key; none of others."""
+def stiff_mount_problems(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The problem of a stiff mount without a size, by key; none of others. given: as `problems`."""
+    stiffness = given.get("stiffness")
     if stiffness is not None and stiffness >= STIFF_MOUNT and "foot" not in given:
         yield (
             "foot",

@@ -7,10 +7,8 @@ clip and of what heats the coil by its rated power, (R_e + R_g) sqrt(2 P / R_e).
 """
 
 import math
-from collections.abc import Callable, Iterator, Set
-from typing import Annotated, Any, Literal
-
-from pydantic import AfterValidator
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from model.config.sections import Quantity
 from model.config.units import (
@@ -27,21 +25,12 @@ from model.config.units import (
     VOLTAGE,
 )
 from model.rig.actuator_section import ActuatorSection
-from model.rig.key_types import gains_of, place_on
+from model.rig.key_types import gains_of, one_of, place_on
 from model.structure.exciter import Exciter
-from model.structure.exciter_types import EXCITER_TYPES, SheetValue
+from model.structure.exciter_types import EXCITER_TYPES
 from model.structure.plate import Plate
-from registry.suggestions import did_you_mean
 
-
-def check_type(name: str) -> str:
-    """The name of a type of exciters; raises ValueError for an unknown one."""
-    if name not in EXCITER_TYPES:
-        raise ValueError(
-            f"unknown type of exciter {name}; {did_you_mean(name, EXCITER_TYPES)}known are "
-            f"{', '.join(EXCITER_TYPES)}; leave it out and give the values of another"
-        )
-    return name
+_OTHER = "; leave it out and give the values of another"
 
 
 class ExciterSection(ActuatorSection):
@@ -53,7 +42,7 @@ class ExciterSection(ActuatorSection):
     kind: Literal["exciter"]
     """`exciter`."""
 
-    type: Annotated[str, AfterValidator(check_type)] | None = None
+    type: Annotated[str, one_of(EXCITER_TYPES, "type of exciter", _OTHER)] | None = None
     """A type that is sold, whose values are taken where no key gives them.
 
     Limits: a name [below](#exciters)
@@ -135,8 +124,80 @@ class ExciterSection(ActuatorSection):
     magnet: Literal["free", "held"] = "free"
     """Whether a frame holds the magnet."""
 
+    keys: ClassVar = {
+        **{"stiffness": "stiffness", "damping": "damping", "magnet_mass": "weight"},
+        **{each: each for each in ("coil_mass", "force_factor", "gains")},
+    }
+    instead: ClassVar = {"stiffness": ("resonance", "resonance_is"), "damping": ("q",)}
+    is_electrical = True
 
-_NEEDED = ("coil_mass", "weight", "force_factor", "resistance", "power")
+    @property
+    def of_type(self) -> dict[str, float]:
+        """Values of its type by key, none without a type."""
+        return _of_type(self.type)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values by key, those of the type where the section gives none."""
+        unknown = dict.fromkeys(ExciterSection.model_fields) | {"resonance_is": "free"}
+        return unknown | self.of_type | self.model_dump(exclude_none=True)
+
+    def made(self, name: str, plate: Plate, count: int) -> Exciter:
+        """An exciter; nothing of it depends on the count."""
+        values = self.values
+        stiffness, damping = self.stiffness, self.damping
+        moving = values["coil_mass"] if values["resonance_is"] == "free" else values["weight"]
+        if stiffness is None:
+            stiffness = moving * (2 * math.pi * values["resonance"]) ** 2
+        if damping is None:
+            damping = math.sqrt(stiffness * moving) / values["q"]
+        resistance, source = values["resistance"], self.source_resistance
+        heated = (resistance + source) * math.sqrt(2 * values["power"] / resistance)
+        return Exciter(
+            name,
+            *place_on(plate, self.at),
+            stiffness=stiffness,
+            damping=damping,
+            magnet_mass=values["weight"],
+            coil_mass=values["coil_mass"],
+            force_factor=values["force_factor"],
+            resistance=resistance,
+            voltage=min(heated, self.clip or math.inf),
+            source_resistance=source,
+            inductance=values["inductance"] or 0.0,
+            excursion=values["excursion"] or math.inf,
+            held=self.magnet == "held",
+            gains=gains_of(self.gains),
+            foot=self.foot,
+        )
+
+    @classmethod
+    def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """What is missing or stated in two ways, a resonance of what, and too much power."""
+        name, power = given.get("type"), given.get("power")
+        # Of a type that is misspelt, nothing is known to be missing.
+        unknown = "type" in given and name is None
+        known = given.keys() | _of_type(name).keys()
+        for key in () if unknown else _NEEDED:
+            if key not in known and _INSTEAD.get(key) not in given:
+                yield key, "missing; add it, or a type that has it"
+        for key in ("amplifier", "channel"):
+            if key not in given:
+                yield key, "missing; add it: an exciter is driven, and supports nothing by itself"
+        for key, other in _INSTEAD.items():
+            if {key, other} <= given.keys():
+                yield other, f"must not be given with {key}; remove one of the two"
+        if "resonance" in given and "resonance_is" not in given:
+            yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
+        if {"stiffness", "resonance_is"} <= given.keys():
+            yield "resonance_is", "must not be given with stiffness; remove it"
+        most = _of_type(name).get("power", math.inf)
+        if power is not None and power > most:
+            yield "power", f"must be at most {most:g} W, which a {name} bears, got {power:g} W"
+
+
+_NEEDED = ("coil_mass", "weight", "force_factor", "resistance", "power", "resonance", "q")
+_INSTEAD = {"resonance": "stiffness", "q": "damping"}
 
 _EITHER = (
     "free, of the light coil against the magnet, as on most data sheets, or mounted, of the magnet "
@@ -144,99 +205,6 @@ _EITHER = (
 )
 
 
-def exciter_of(name: str, section: ExciterSection, plate: Plate, era_count: int) -> Exciter:
-    """An exciter; era_count: of the rig, on which nothing of it depends."""
-    values = _values(section)
-    stiffness, damping = section.stiffness, section.damping
-    moving = values["coil_mass"] if values["resonance_is"] == "free" else values["weight"]
-    if stiffness is None:
-        stiffness = moving * (2 * math.pi * values["resonance"]) ** 2
-    if damping is None:
-        damping = math.sqrt(stiffness * moving) / values["q"]
-    resistance, source = values["resistance"], section.source_resistance
-    heated = (resistance + source) * math.sqrt(2 * values["power"] / resistance)
-    x, y = place_on(plate, section.at)
-    return Exciter(
-        name,
-        x,
-        y,
-        stiffness=stiffness,
-        damping=damping,
-        magnet_mass=values["weight"],
-        coil_mass=values["coil_mass"],
-        force_factor=values["force_factor"],
-        resistance=resistance,
-        voltage=min(heated, section.clip or math.inf),
-        source_resistance=source,
-        inductance=values["inductance"] or 0.0,
-        excursion=values["excursion"] or math.inf,
-        held=section.magnet == "held",
-        gains=gains_of(section.gains),
-        foot=section.foot,
-    )
-
-
-def exciter_problems(given: Set[str], read: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
-    """What keys of an exciter require of each other: problems by key."""
-    name = read("type")
-    # Of a type that is misspelt, nothing is known to be missing.
-    unknown = "type" in given and name is None
-    of_type = _of_type(name)
-    for key in ("amplifier", "channel"):
-        if key not in given:
-            yield key, "missing; add it: an exciter is driven, and supports nothing by itself"
-    for key in _NEEDED:
-        if not unknown and key not in given and key not in of_type:
-            yield key, "missing; add it, or a type that has it"
-    for key, instead in (("stiffness", "resonance"), ("damping", "q")):
-        if {key, instead} <= given:
-            yield key, f"must not be given with {instead}; remove one of the two"
-        elif not unknown and not {key, instead} & given and instead not in of_type:
-            yield instead, "missing; add it, or a type that has it"
-    if "resonance" in given and "resonance_is" not in given:
-        yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
-    rated, power = of_type.get("power"), read("power")
-    if rated is not None and isinstance(power, float) and power > rated.value:
-        bears = f"{rated.value:g} W, which a {read('type')} bears"
-        yield "power", f"must be at most {bears}, got {power:g} W; lower it"
-    if {"stiffness", "resonance_is"} <= given:
-        yield "resonance_is", "is of a resonance, got it with stiffness; remove it"
-
-
-_LIGHT, _HIGH = 0.3, 100.0  # share of the coil in the magnet's mass; Hz
-
-
-def misread_resonance(section: ExciterSection) -> str | None:
-    """A warning for a resonance that is said to be the mounted one, and hardly can be."""
-    values = _values(section)
-    f, coil, weight = values["resonance"], values["coil_mass"], values["weight"]
-    if section.stiffness or values["resonance_is"] != "mounted":
-        return None
-    if f <= _HIGH or coil >= _LIGHT * weight:
-        return None
-    return (
-        f"{f:g} Hz is high for a magnet of {1e3 * weight:.3g} g, and probably that of the coil of "
-        f"{1e3 * coil:.3g} g on a data sheet; with resonance_is: free the glued magnet resonates "
-        f"at {f * math.sqrt(coil / weight):.0f} Hz"
-    )
-
-
-def rated_power(section: ExciterSection) -> float:
-    """What the coil bears [W]: as its type says, or else the file."""
-    rated = _of_type(section.type).get("power")
-    return float(_values(section)["power"] if rated is None else rated.value)
-
-
-def _of_type(name: str | None) -> dict[str, SheetValue]:
-    return {} if name is None else {**EXCITER_TYPES[name].values}
-
-
-def _values(section: ExciterSection) -> dict[str, Any]:
-    """Values by key, those of the type where the section gives none."""
-    known = {key: each.value for key, each in _of_type(section.type).items()}
-    return {
-        **dict.fromkeys(ExciterSection.model_fields),
-        "resonance_is": "free",
-        **known,
-        **section.model_dump(exclude_none=True),
-    }
+def _of_type(name: str | None) -> dict[str, float]:
+    found = {} if name is None else EXCITER_TYPES[name].values
+    return {key: each.value for key, each in found.items()}

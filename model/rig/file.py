@@ -8,7 +8,6 @@ from model.config.document import Document, parse_document, read_document
 from model.config.kinds import check_is_rig
 from model.config.sections import Validation
 from model.errors import InputError
-from model.rig.actuators import kind_of
 from model.rig.checks import check_across
 from model.rig.meshes import mesh_of
 from model.rig.parts import (
@@ -52,15 +51,14 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     everything = {
-        name: kind_of(era).make(name, era, plate, len(section.eras))
-        for name, era in section.eras.items()
+        name: era.made(name, plate, len(section.eras)) for name, era in section.eras.items()
     }
     wiring = {
         name: Channel(era.amplifier, era.channel)
         for name, era in section.eras.items()
         if era.amplifier is not None and era.channel is not None
     }
-    electrical = {era.amplifier for era in section.eras.values() if kind_of(era).is_electrical}
+    electrical = {era.amplifier for era in section.eras.values() if era.is_electrical}
     supports = {name: era for name, era in everything.items() if name not in wiring}
     return Rig(
         plate=plate,

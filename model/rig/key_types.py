@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Annotated
 
@@ -59,14 +59,18 @@ def _rows(
     return AfterValidator(checked)
 
 
-def check_threshold(name: str) -> str:
-    """The name of a set of thresholds; raises ValueError for an unknown one."""
-    if name not in THRESHOLDS:
-        raise ValueError(
-            f"unknown set of thresholds {name}; {did_you_mean(name, THRESHOLDS)}known are "
-            f"{', '.join(THRESHOLDS)}"
-        )
-    return name
+def one_of(known: Collection[str], what: str, remedy: str = "") -> AfterValidator:
+    """Check of text that is one of the known names of something."""
+
+    def checked(name: str) -> str:
+        if name not in known:
+            raise ValueError(
+                f"unknown {what} {name}; {did_you_mean(name, known)}known are {', '.join(known)}"
+                f"{remedy}"
+            )
+        return name
+
+    return AfterValidator(checked)
 
 
 GAINS = _rows(
@@ -85,6 +89,7 @@ MODES = _rows(
 )
 GainRow = Annotated[tuple[float, float, float], Strict(strict=False)]  # a list in the file
 ModeRow = Annotated[tuple[float, float], Strict(strict=False)]
+ThresholdSet = Annotated[str, one_of(THRESHOLDS, "set of thresholds")]
 Identifier = Annotated[str, AfterValidator(_identifier)]
 Side = Annotated[float, Quantity(LENGTH, above=0, at_most=100)]
 Coordinate = Annotated[float, Quantity(LENGTH, at_least=-100, at_most=100)]

@@ -8,7 +8,7 @@ import cmath
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
@@ -53,9 +53,8 @@ def _check(document: Document) -> CheckedFile:
         raise ConfigError(document.source, problems)
     note = rig.uncertainty.note
     line, lost, more = clock_costs(rig, _urls(document))
-    warnings = [*exciter_notes(document, rig), *_thick_notes(rig), *warnings]
-    costs = [*lost, *gain_notes(rig), *_air_costs(rig)]
-    costs += [*_layer_costs(rig), *_point_costs(rig), *_edge_costs(rig)]
+    warnings = [*exciter_notes(rig), *warnings]
+    costs = [*lost, *gain_notes(rig), *_plate_notes(rig), *_mount_notes(rig)]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
@@ -71,64 +70,51 @@ RIG = ConfigKind(
 _THICK = 0.02  # m; of one material
 
 
-def _thick_notes(rig: Rig) -> list[str]:
-    """A warning of a plate of one material that is too thick to vibrate as they mostly do."""
-    thickness = rig.plate.thickness
-    if rig.laminate is not None or thickness <= _THICK:
-        return []
-    return [
-        f"plate.thickness: {1e3 * thickness:g} mm is thick for a plate that is to be felt; check "
-        "its unit, mm or cm"
-    ]
+def _plate_notes(rig: Rig) -> Iterator[str]:
+    """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
+    plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
+    if rig.laminate is None and plate.thickness > _THICK:
+        yield (
+            f"plate.thickness: {1e3 * plate.thickness:g} mm is thick for a plate that is to be "
+            "felt; check its unit, mm or cm"
+        )
+    if plate.air_gap is not None and (error := plate.air_gap.coupling_error(low)):
+        off = "half of it or more: take no answer from it" if error > 0.1 else f"{100 * error:g} %"
+        yield (
+            f"plate.air_gap: in {1e3 * plate.air_gap.depth:g} mm friction of the air couples the "
+            f"modes at {low:g} Hz, which is left out: the response may be off by {off}"
+        )
+    slide = math.inf if plate.laminate is None else slide_frequency(plate.laminate, high)
+    if high >= slide / _FAR_FROM_SLIDING:
+        yield (
+            f"plate.layers: at {slide:.3g} Hz they slide to and fro by themselves, and change "
+            "their thickness little above, which is left out: take no answer from it above "
+            f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
+        )
 
 
-def _air_costs(rig: Rig) -> list[str]:
-    gap, low = rig.plate.air_gap, rig.limits.frequency_min
-    error = 0.0 if gap is None else gap.coupling_error(low)
-    if gap is None or not error:
-        return []
-    off = "half of it or more: take no answer from it" if error > 0.1 else f"{100 * error:g} %"
-    return [
-        f"plate.air_gap: in {1e3 * gap.depth:g} mm friction of the air couples the modes at "
-        f"{low:g} Hz, which is left out: the response may be off by {off}"
-    ]
-
-
-def _layer_costs(rig: Rig) -> list[str]:
-    """What very soft or thick layers cost that slide within the frequencies."""
-    laminate, high = rig.plate.laminate, rig.limits.frequency_max
-    if laminate is None:
-        return []
-    slide = slide_frequency(laminate, high)
-    if high < slide / _FAR_FROM_SLIDING:
-        return []
-    return [
-        f"plate.layers: at {slide:.3g} Hz they slide to and fro by themselves, and change their "
-        "thickness little above, which is left out: take no answer from it above "
-        f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
-    ]
-
-
-def _point_costs(rig: Rig) -> list[str]:
-    """What stiff mounts cost that the rig says are points."""
-    plate = rig.plate
-    decade = math.log(10) / (2 * math.pi * plate.shear_rigidity)
-    mounts = [
-        *((era.name, era.support.stiffness, era.foot) for era in rig.eras),
-        *(
-            (name, load.stiffness, load.foot)
-            for name, load in zip(
-                rig.supports, rig.masses[len(rig.masses) - len(rig.supports) :], strict=True
+def _mount_notes(rig: Rig) -> Iterator[str]:
+    """Yield what stiff mounts cost that are points, and few points of an edge with many waves."""
+    decade = math.log(10) / (2 * math.pi * rig.plate.shear_rigidity)
+    mounts = {era.name: era.support for era in rig.eras} | dict(
+        zip(rig.supports, rig.masses[len(rig.masses) - len(rig.supports) :], strict=True)
+    )
+    for name, mount in mounts.items():
+        if mount.stiffness >= STIFF_MOUNT and not mount.foot:
+            yield (
+                f"eras.{name}.foot: the dent under a point of {mount.stiffness:g} N/m has no "
+                f"limit, a tenfold smaller one adds at least {100 * decade * mount.stiffness:.1f} "
+                "% of the mount's own compliance; give its radius, and see `era plate convergence`"
             )
-        ),
-    ]
-    return [
-        f"eras.{name}.foot: the dent under a point of {stiffness:g} N/m has no limit, a tenfold "
-        f"smaller one adds at least {100 * decade * stiffness:.1f} % of the mount's own "
-        "compliance; give its radius, and see `era plate convergence`"
-        for name, stiffness, foot in mounts
-        if stiffness >= STIFF_MOUNT and not foot
-    ]
+    high = rig.limits.frequency_max
+    needed = least_points(rig.plate, high)
+    for kind in ("masses", "supports"):
+        for name, keys in _attached(rig, kind).items():
+            if "along" in keys and (count := keys.get("points", DEFAULT_POINTS)) < needed:
+                yield (
+                    f"{kind}.{name}.points: {count} on each edge are few at {high:g} Hz; give "
+                    f"{needed}"
+                )
 
 
 def _summary(rig: Rig) -> str:
@@ -158,18 +144,6 @@ def _attached(rig: Rig, kind: str) -> dict[str, Any]:
     """Masses or supports of the rig's file."""
     keys: Any = {} if rig.document is None else rig.document.data.get(kind)
     return dict(keys or {})
-
-
-def _edge_costs(rig: Rig) -> list[str]:
-    """What few points of an edge cost where it has many waves."""
-    high = rig.limits.frequency_max
-    needed = least_points(rig.plate, high)
-    return [
-        f"{kind}.{name}.points: {count} on each edge are few at {high:g} Hz; give {needed}"
-        for kind in ("masses", "supports")
-        for name, keys in _attached(rig, kind).items()
-        if "along" in keys and (count := keys.get("points", DEFAULT_POINTS)) < needed
-    ]
 
 
 _MAX_ANGLE = math.radians(20.5)  # between two rows

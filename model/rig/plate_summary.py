@@ -1,13 +1,15 @@
-"""Numbers of a rig's plate: materials, rigidity, bending wavelengths."""
+"""Numbers of a rig's plate and its exciters: materials, rigidity, bending wavelengths, types."""
 
 import math
 from typing import Any
 
-from model.config.sections import Quantity
-from model.rig.exciter_checks import exciters_of
-from model.rig.exciter_summary import summary_of, types_of
+from model.config.sections import Quantity, quantities
+from model.rig.exciter_checks import exciters_of, sections_of
+from model.rig.exciter_section import ExciterSection
 from model.rig.rig import Rig
 from model.rig.sections import PlateSection
+from model.structure.exciter import Exciter
+from model.structure.exciter_types import EXCITER_TYPES
 from model.structure.laminate_section import (
     bending,
     freely_sliding,
@@ -67,8 +69,8 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
             if each.stiffness
         ],
         "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
-        "exciters": [summary_of(one) for one in exciters_of(rig)],
-        "exciter_types": types_of(rig),
+        "exciters": [_exciter(one) for one in exciters_of(rig)],
+        "exciter_types": _types(rig),
     }
 
 
@@ -129,3 +131,35 @@ def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
         "rigidity_freely_sliding_n_m": freely_sliding(laminate.layers).rigidity,
         **({"rigidity_by_frequency_n_m": by_frequency} if laminate.bond is Bond.FULL else {}),
     }
+
+
+def _exciter(one: Exciter) -> dict[str, Any]:
+    """An exciter by itself."""
+    return {
+        "name": one.name,
+        "magnet": "held" if one.held else "free",
+        "magnet_resonance_hz": one.magnet_frequency,
+        "q": one.quality,
+        "force_at_1_w_n": one.force_factor * math.sqrt(2 / one.resistance),
+        "full_level_v": one.voltage * one.largest_gain,
+        "full_level_force_n": one.largest_force,
+        "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
+    }
+
+
+def _types(rig: Rig) -> dict[str, dict[str, Any]]:
+    """Types of a rig's exciters by name: what to know of each, and what no source gives of it.
+
+    assumed: by key the lowest and the highest value that is likely, unless every exciter of the
+    type states its own.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for section in sections_of(rig).values():
+        if section.type is not None:
+            known = EXCITER_TYPES[section.type]
+            entry = found.setdefault(section.type, {"note": known.note, "assumed": {}})
+            for key, between in known.assumed.items():
+                (quantity,) = quantities(ExciterSection.model_fields[key])
+                if getattr(section, key) is None:
+                    entry["assumed"][quantity.dimension.key(key)] = list(between)
+    return found

@@ -2,11 +2,10 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, TypeAlias
 
-import numpy as np
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from model.config.document import Document, KeyPath, parse_document
@@ -15,15 +14,11 @@ from model.errors import InputError
 from model.rig.actuators import KINDS
 from model.rig.file import rig_of
 from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
 from model.structure.materials import known_material
 from model.structure.plate import Material
 
-_Written: TypeAlias = "float | tuple[Any, ...] | Material | Uncertainty"
-
 _PER_LINE = 4
-_SAME = 1e-4  # relative; of phases and of what modes deviate, absolute
-_SAME_PLACE = 1e-6  # m
+_SAME, _NONE = 1e-4, 1e-6  # relative; and what counts as nothing of every quantity
 
 # ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
 _ROWS_OF = "rows-of-"
@@ -41,7 +36,7 @@ def rewritten_text(
     mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
     InputError where the text, read as a rig, has other values.
     """
-    rows: list[list[str]] = []
+    rows: list[Rows] = []
 
     def change(data: CommentedMap) -> None:
         own = _values(before, document)
@@ -49,23 +44,30 @@ def rewritten_text(
             if value != own[path] or path in _restated(after):
                 _put(data, path, value, rows)
         for era in after.eras:
-            _drop_replaced(data["eras"][era.name], KINDS[type(era)].instead)
+            entry = data["eras"][era.name]
+            for key, others in KINDS[type(era)].instead.items():
+                for other in others if key in entry else ():
+                    entry.pop(other, None)
         for mass in after.masses[len(before.masses) :]:
             masses = data.setdefault("masses", CommentedMap())
-            masses[_free_name(masses)] = _flow(
-                {"at": _sequence([mass.x, mass.y]), "mass": _rounded(mass.mass)}
-            )
+            numbers = range(1, len(masses) + 2)
+            name = next(name for n in numbers if (name := f"found{n}") not in masses)
+            masses[name] = _flow({"at": [mass.x, mass.y], "mass": mass.mass})
 
     def rows_text(match: re.Match[str]) -> str:
-        return match["start"] + _rows_text(rows[int(match["number"])], indent=match["indent"])
+        """Rows in brackets, a few on each line."""
+        texts = [str(_rounded(row)) for row in rows[int(match["number"])]]
+        lines = [texts[at : at + _PER_LINE] for at in range(0, len(texts), _PER_LINE)]
+        joined = f",\n{match['indent']}    ".join(map(", ".join, lines))
+        return f"{match['start']}[\n{match['indent']}    {joined}]"
 
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
     back = rig_of(parse_document(document.source, text), mesh=mesh)
     read, expected = ([*_numbers(each, document)] for each in (back, after))
     if len(read) != len(expected) or not all(
-        math.isclose(one, other, rel_tol=_SAME, abs_tol=none)
-        for (one, _), (other, none) in zip(read, expected, strict=True)
+        math.isclose(one, other, rel_tol=_SAME, abs_tol=_NONE)
+        for one, other in zip(read, expected, strict=True)
     ):
         raise InputError(
             f"{document.source}: values read back must be those written; write plate and ERAs as "
@@ -74,26 +76,32 @@ def rewritten_text(
     return text
 
 
-def _values(rig: Rig, document: Document) -> dict[KeyPath, _Written]:
-    """Values of a rig that a fit may change, by where its file has them."""
+Rows: TypeAlias = list[list[float]]
+
+
+def _values(rig: Rig, document: Document) -> dict[KeyPath, Any]:
+    """Values of a rig that a fit may change, by where its file has them, as it states them."""
     plate, layers = rig.plate, rig.laminate.layers if rig.laminate else ()
-    found: dict[KeyPath, _Written] = {("uncertainty",): rig.uncertainty}
+    found: dict[KeyPath, Any] = {("uncertainty",): asdict(rig.uncertainty)}
     # New keys come first in their block.
     stated: Any = document.data["plate"]
-    if "layers" in stated:
-        for number, layer in enumerate(layers):
-            found["plate", "layers", number, "material"] = layer.material
-            found["plate", "layers", number, "thickness"] = layer.thickness
-    else:
-        whole = layers[0] if layers else plate  # a single layer of what depends on frequency
-        found["plate", "material"], found["plate", "thickness"] = whole.material, whole.thickness
+    whole = layers[0] if layers else plate  # a single layer of what depends on frequency
+    for number, part in enumerate(layers) if "layers" in stated else ((None, whole),):
+        path = ("plate",) if number is None else ("plate", "layers", number)
+        found[*path, "material"] = _material(
+            part.material, is_across=stated.get("grain") == "width"
+        )
+        found[*path, "thickness"] = part.thickness
     found["plate", "loss_factor"] = plate.loss_factor
     found["plate", "loss_exponent"] = plate.loss_exponent
-    found["plate", "modes"] = plate.mode_deviations
+    found["plate", "modes"] = [
+        [math.exp(shift / 2), math.exp(loss)] for shift, loss in plate.mode_deviations
+    ]
     for era in rig.eras:
-        found["eras", era.name, "at"] = (era.x, era.y)
+        found["eras", era.name, "at"] = [era.x, era.y]
         for field, key in KINDS[type(era)].keys.items():
             found["eras", era.name, key] = getattr(era, field)
+        found["eras", era.name, "gains"] = [[f, size, math.degrees(a)] for f, size, a in era.gains]
     supports: Any = document.data.get("supports", {})
     feet = [name for name, keys in supports.items() if "at" in keys]
     for name, number in zip(feet, rig.feet, strict=True):
@@ -101,132 +109,74 @@ def _values(rig: Rig, document: Document) -> dict[KeyPath, _Written]:
     return found
 
 
+def _material(material: Material, *, is_across: bool) -> dict[str, Any]:
+    """Numbers of a material as a file states them, whose grain may run across the plate."""
+    along = material.turned() if is_across else material
+    ratio = "nu" if material.orthotropy is None else "nu12"
+    return {"name": material.name, **along.moduli, "rho": material.rho, ratio: along.nu}
+
+
 def _restated(rig: Rig) -> set[KeyPath]:
     """Where values are that are written in any case: others of the file would change them."""
-    kinds = [(era.name, KINDS[type(era)]) for era in rig.eras]
-    own = {("eras", name, key) for name, kind in kinds for key in kind.restated}
+    own = {("eras", era.name, key) for era in rig.eras for key in KINDS[type(era)].instead}
     return {("plate", "loss_factor"), *own}
 
 
-def _drop_replaced(entry: CommentedMap, instead: Mapping[str, tuple[str, ...]]) -> None:
-    """Remove keys in whose place others have been written."""
-    for key, others in instead.items():
-        for other in others if key in entry else ():
-            entry.pop(other, None)
-
-
-def _numbers(rig: Rig, document: Document) -> Iterator[tuple[float, float]]:
-    """Values of a rig that are written, each with what counts as none of its quantity."""
-    for path, value in _values(rig, document).items():
-        match value:
-            case Material():
-                yield from ((each, 0.0) for each in value.moduli.values())
-            case Uncertainty():
-                yield from ((each, 0.0) for each in asdict(value).values())
-            case tuple() if path[-1] == "at":
-                yield from ((each, _SAME_PLACE) for each in value)
-            case tuple() if path[-1] == "modes":
-                yield from ((each, _SAME) for pair in value for each in pair)
-            case tuple():
-                for _, size, phase in value:
-                    yield from ((size, 0.0), (math.cos(phase), _SAME), (math.sin(phase), _SAME))
-            case _:
-                yield value, 0.0
+def _numbers(rig: Rig, document: Document) -> Iterator[float]:
+    """Yield all numbers of a rig that are written."""
     # A file's own masses come before its supports, and those that were found after both.
-    for mass in sorted(rig.masses, key=lambda each: (each.stiffness, round(each.x, 5), each.y)):
-        yield from ((mass.x, _SAME_PLACE), (mass.y, _SAME_PLACE), (mass.mass, 0.0))
+    masses = sorted(rig.masses, key=lambda each: (each.stiffness, round(each.x, 5), each.y))
+    parts: list[Any] = [_values(rig, document), [(each.x, each.y, each.mass) for each in masses]]
+    while parts:
+        match parts.pop():
+            case int() | float() as number:
+                yield number
+            case Mapping() as values:
+                parts += values.values()
+            case list() | tuple() as values:
+                parts += values
 
 
-def _put(data: CommentedMap, path: KeyPath, value: _Written, rows: list[list[str]]) -> None:
+def _put(data: CommentedMap, path: KeyPath, value: Any, rows: list[Rows]) -> None:
     """Set a value in the data of a file; rows of numbers are added to those given."""
     entry, key = data, path[-1]
     for part in path[:-1]:
         entry = entry[part]
-    if key == "damping":
-        # With another stiffness a ratio would be another damping.
-        _rename(entry, "damping_ratio", "damping")
-    match value:
-        case Material():
-            _set_material(entry, value)
-        case Uncertainty():
-            entry[key] = _flow({name: _rounded(each) for name, each in asdict(value).items()})
-        case tuple() if key == "at":
-            _set(entry, key, _sequence(value))
-        case tuple():
-            text = _mode_rows if key == "modes" else _gain_rows
-            rows.append(text(value))
-            _set(entry, key, f"{_ROWS_OF}{len(rows) - 1}")
-        case _:
-            _set(entry, key, _rounded(value))
-
-
-def _mode_rows(deviations: Sequence[tuple[float, float]]) -> list[str]:
-    """Rows of natural frequency and loss factor, relative to the plate's theory."""
-    return [f"[{math.exp(shift / 2):.7g}, {math.exp(loss):.5g}]" for shift, loss in deviations]
-
-
-def _gain_rows(gains: Sequence[tuple[float, float, float]]) -> list[str]:
-    """Rows of frequency [Hz], magnitude and phase [degrees]."""
-    return [f"[{f:.9g}, {size:.5g}, {np.degrees(phase):.6g}]" for f, size, phase in gains]
-
-
-def _rows_text(rows: Sequence[str], *, indent: str) -> str:
-    """Rows in brackets, a few on each line."""
-    joined = f",\n{indent}    ".join(
-        ", ".join(rows[at : at + _PER_LINE]) for at in range(0, len(rows), _PER_LINE)
-    )
-    return f"[\n{indent}    {joined}]"
-
-
-def _set_material(entry: CommentedMap, material: Material) -> None:
-    """Set the moduli of a plate's or layer's material, writing out a named material."""
-    along_grain = material.turned() if entry.get("grain") == "width" else material
-    moduli = {key: f"{each / 1e9:.7g} GPa" for key, each in along_grain.moduli.items()}
-    given = entry["material"]
-    if isinstance(given, CommentedMap):
-        given.update(moduli)
-        return
-    ratio = "nu" if material.orthotropy is None else "nu12"
-    numbers = {"name": material.name, **moduli, "rho": material.rho, ratio: along_grain.nu}
-    if rows := known_material(given).by_frequency:
-        numbers["by_frequency"] = [list(map(_rounded, row)) for row in rows]
-    entry["material"] = _flow(numbers)
-
-
-def _free_name(masses: CommentedMap) -> str:
-    """A name that no mass of the file has."""
-    numbers = range(1, len(masses) + 2)
-    return next(name for number in numbers if (name := f"found{number}") not in masses)
-
-
-def _rename(mapping: CommentedMap, old: str, new: str) -> None:
-    """Rename a key in its place."""
-    if old in mapping:
-        position = list(mapping).index(old)
-        mapping.insert(position, new, mapping.pop(old))
-
-
-def _set(mapping: CommentedMap, key: str | int, value: object) -> None:
-    """Set a key of a mapping; a new one comes first in a block, where it separates no comment."""
-    if key in mapping or mapping.fa.flow_style():
-        mapping[key] = value
+    if key in ("gains", "modes"):
+        rows.append(value)
+        value = f"{_ROWS_OF}{len(rows) - 1}"
+    if key == "material":
+        given = entry[key]
+        texts = {name: f"{value[name] / 1e9:.7g} GPa" for name in value if name[0] in "EG"}
+        if isinstance(given, CommentedMap):
+            given.update(texts)
+            return
+        by_frequency = known_material(given).by_frequency
+        value |= texts | ({"by_frequency": by_frequency} if by_frequency else {})
+    # A new key comes first in a block, where it separates no comment.
+    if key in entry or entry.fa.flow_style():
+        entry[key] = _flow(value)
     else:
-        mapping.insert(0, key, value)
+        entry.insert(0, key, _flow(value))
 
 
-def _flow(values: Mapping[str, Any]) -> CommentedMap:
-    """A mapping on one line."""
-    mapping = CommentedMap(values)
-    mapping.fa.set_flow_style()
-    return mapping
+def _flow(value: Any) -> Any:
+    """A value of a file on one line, its numbers rounded."""
+    rounded = _rounded(value)
+    if not isinstance(rounded, dict | list):
+        return rounded
+    found = CommentedMap(rounded) if isinstance(rounded, dict) else CommentedSeq(rounded)
+    found.fa.set_flow_style()
+    return found
 
 
-def _sequence(values: Sequence[float]) -> CommentedSeq:
-    """Numbers on one line."""
-    sequence = CommentedSeq(map(_rounded, values))
-    sequence.fa.set_flow_style()
-    return sequence
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
+def _rounded(value: Any) -> Any:
+    """A value with six digits of each of its numbers."""
+    match value:
+        case float():
+            return float(f"{value:.6g}")
+        case Mapping():
+            return {key: _rounded(each) for key, each in value.items()}
+        case list() | tuple():
+            return [*map(_rounded, value)]
+    return value

@@ -44,8 +44,8 @@ from model.rig.key_types import (
     Place,
     Side,
     Thickness,
+    ThresholdSet,
     check_ascending,
-    check_threshold,
     check_url,
 )
 from model.rig.uncertainty import BOUNDS, Uncertainty
@@ -540,7 +540,7 @@ class RigSection(Section):
     Limits: a mapping, or `none`
     """
 
-    threshold: Annotated[str, AfterValidator(check_threshold)] = DEFAULT_THRESHOLD
+    threshold: ThresholdSet = DEFAULT_THRESHOLD
     """Set of detection thresholds to which levels in dB SL refer, see
     [people](../concepts/people.md#detection-thresholds).
 
@@ -548,7 +548,7 @@ class RigSection(Section):
     """
 
     promised_thresholds: Annotated[
-        list[Annotated[str, AfterValidator(check_threshold)]],
+        list[ThresholdSet],
         Field(min_length=1, default_factory=lambda: [*THRESHOLDS]),
     ]
     """Sets beside that of `threshold` by which promises hold: the one that says least counts. All

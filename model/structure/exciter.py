@@ -173,10 +173,6 @@ class Exciter(MeasuredGains):
         """Force Bl V / R [N] at full level, gain included, well above f_m, without L."""
         return self.in_time.by_drive * self.voltage * self.largest_gain
 
-    def heat_by(self, volts: float) -> float:
-        """Mean power [W] in the coil by an amplitude of the voltage [V], held still."""
-        return (volts / self.loop_resistance) ** 2 * self.resistance / 2
-
     def excursion_by(self, omega: FloatArray, moved: ComplexArray) -> ComplexArray:
         """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
         share = self._share(np.asarray(omega))

@@ -127,7 +127,7 @@ def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
 
 _SECTIONS: tuple[type[Section], ...] = (
     *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection, FingertipSection),
-    *(kind.section for kind in KINDS.values()),
+    *KINDS.values(),
 )
 _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
     "voltage": "voltage_v"

@@ -101,8 +101,7 @@ def test_what_is_wrong_is_found_at_its_key() -> None:
 
 def warned(keys: str, frequency: str) -> list[str]:
     """Warnings of a board."""
-    document = parse_document("board.yaml", exciter_rig_text(keys, frequency=frequency))
-    return exciter_notes(document, parse_rig("board.yaml", document.text))
+    return [*exciter_notes(exciter_rig(keys, frequency=frequency))]
 
 
 def test_check_warns_near_the_resonance_of_the_magnets_and_of_one_that_is_misread() -> None:

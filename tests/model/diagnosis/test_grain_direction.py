@@ -1,0 +1,99 @@
+"""Which side a board's grain runs along: boards of a weekend, drawn as their parts deviate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import controller.cli.identify
+from benchmarks.weekend.chain import FOLDER, BuiltBoard
+from controller.cli.commands import app
+from model.calibration.responses import Responses
+from model.calibration.responses_file import write_responses
+from model.diagnosis.consistency import check_consistency
+from model.diagnosis.diagnosis_report import as_json, verdict_rows
+from model.diagnosis.grain_direction import check_grain
+from model.diagnosis.verdict import diagnose
+from model.errors import InputError
+from model.identification.measurement import MeasuredPlate
+from model.rig.file import load_rig
+from model.rig.rig import Rig
+
+TONES = np.arange(91.0, 300.0, 20.0)
+
+
+def measured(rig: Rig, seed: int) -> Responses:
+    """What one moved sensor reads of a board whose parts deviate, at every place or at four."""
+    found = BuiltBoard.drawn(rig, seed).measured(TONES, seed)
+    return found if seed % 2 else found.without(np.arange(12) % 3 > 0)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The board of the page, grain along its length."""
+    return load_rig(FOLDER / "rig.yaml")
+
+
+@pytest.fixture(scope="module")
+def across(rig: Rig) -> Rig:
+    """The same cut the other way."""
+    return rig.replaced(plate={"grain": "width"})
+
+
+@pytest.fixture(scope="module")
+def turned(across: Rig) -> Responses:
+    """Measured on a board that is cut the other way."""
+    return measured(across, 1)
+
+
+def test_boards_cut_as_their_file_says_are_not_accused(rig: Rig) -> None:
+    """Twenty whose parts deviate as bought ones do, half of them by four of the twelve places."""
+    for seed in range(20):
+        check_grain(rig, measured(rig, seed))
+
+
+def test_boards_cut_the_other_way_are_accused_of_that_alone(rig: Rig, across: Rig) -> None:
+    """Ten, before anything is fitted in full."""
+    for seed in range(10):
+        with pytest.raises(InputError, match=r"^plate\.grain must be width, got length: "):
+            check_consistency(rig, measured(across, seed))
+
+
+def test_the_other_side_is_named_and_wiring_is_judged_on_the_board_itself(
+    across: Rig, rig: Rig
+) -> None:
+    """The file says width, the board has length, and two plugs are exchanged: both are said."""
+    found = measured(rig, 3)
+    verdict = diagnose(across, replace(found, values=found.values[:, [0, 2, 1, 3]]))
+    first, second = verdict_rows(verdict)[:2]
+    assert first.startswith("GRAIN: plate.grain must be length, got width: ")
+    assert second.startswith("SWAPPED: channel 1 of amplifier card (ERA NW in the rig)")
+    assert not verdict.is_well
+    assert as_json(verdict)["plate"]["grain"]["found"] == "length"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "calibrate {rig} {file} -o {made}",
+        "rig identify {rig} --measured {file} -o {made}",
+        "rig identify {rig} --yes -o {made}",
+        "rig check {rig} --measured {file}",
+    ],
+)
+def test_commands_say_so_and_write_no_rig(
+    command: str, turned: Responses, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a file, and of what amplifiers would have measured."""
+    here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
+    monkeypatch.setattr(controller.cli.identify, "measured_by_amplifiers", lambda *_, **__: here)
+    file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
+    write_responses(file, turned, rig)
+    typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)
+    result = CliRunner().invoke(app, typed.split())
+    assert result.exit_code != 0
+    shown = result.output + str(result.exception)
+    assert "plate.grain must be width, got length" in shown
+    assert not made.exists()

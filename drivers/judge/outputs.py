@@ -120,6 +120,7 @@ class ExpectedOutputs:
         start, end = when[0], when[1] + (SAMPLE if is_prompt else LATE)
         if self._unclear is not None and self._plays.is_ambiguous((start, end), layers):
             self._unclear(_AMBIGUOUS)
+        shortened_by = self._plays.shortened_by((start, end), layers)
         channels = range(self.playback.channels)
         self._before = [*map(self.playback.settled, channels)]
         for one in layers:
@@ -135,6 +136,7 @@ class ExpectedOutputs:
             elif not one.renew and not one.after:
                 fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
                 self._unknown[number] = min(self._unknown[number], fade)
+            self._unknown[number] = max(self._unknown[number], shortened_by)
         self._plays.commit(layers, token, (start, end))
         self.began, self.cause = when, f"set {token} of layers {[one.layer for one in layers]}"
         self._has_floor, self.is_exact = True, self.is_exact and is_exact

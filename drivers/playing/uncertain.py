@@ -45,28 +45,53 @@ class UncertainPlayback:
 
         layers: of a set; None: all fall silent along a ramp [s].
         """
+        if self.shortened_by(when, layers, ramp) > -math.inf:
+            return True
         changed = dict.fromkeys(range(LAYERS_MAX), False)
-        sooner = dict.fromkeys(changed, ramp)  # of what falls silent: its end, from now on
         if layers is not None:
             changed = {one.layer: one.after for one in layers}
-            sooner = {one.layer: self._ends_after(one) for one in layers}
         # Of all layers: what is due is taken to have happened before what is to happen, or after.
         ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
         ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
-        by_then = self.playback.copied()
-        while (due := by_then.next_due) <= when[0]:
-            by_then.advance(due)
+        by_then = self._by(when[0])
         waiting = {one.layer for one in by_then.waiting}
         for voice in chain.from_iterable(by_then.all_voices):
-            way, half = voice.transition, max(voice.transition.half, self.half[voice.layer])
+            way = voice.transition
             is_followed = voice.layer in waiting or changed.get(voice.layer, False)
             is_due = not way.last or (is_followed and bool(way.knots))
-            left = sooner.get(voice.layer, 0.0)
-            if left and not way.last and way.step and (layers is None or not voice.has_ended):
-                ends.append((way.end - left, half))  # it goes on, or ends sooner
             if not voice.has_ended and voice.layer in changed and is_due:
-                ends.append((way.end, half))
+                ends.append((way.end, self._half_of(voice)))
         return any(when[0] - half <= end <= when[1] + half for end, half in ends)
+
+    def shortened_by(
+        self, when: Interval, layers: Sequence[LayerSet] | None, ramp: float = 0.0
+    ) -> float:
+        """Return by when [s] what leads to silence has ended that a ramp may shorten, or not.
+
+        As its own end and that of the ramp are too close; minus infinity: there is none. layers,
+        ramp: see `is_ambiguous`.
+        """
+        left = dict.fromkeys(range(LAYERS_MAX), ramp)
+        if layers is not None:
+            left = {one.layer: self._ends_after(one) for one in layers}
+        latest = -math.inf
+        for voice in chain.from_iterable(self._by(when[0]).all_voices):
+            way, half, after = voice.transition, self._half_of(voice), left.get(voice.layer, 0.0)
+            goes_on = way.last or not way.step or (layers is not None and voice.has_ended)
+            if after and not goes_on and when[0] - half <= way.end - after <= when[1] + half:
+                latest = max(latest, way.end + half, when[1] + after)
+        return latest
+
+    def _by(self, time: float) -> Playback:
+        """Return what plays with all carried out that is due by a time."""
+        by_then = self.playback.copied()
+        while (due := by_then.next_due) <= time:
+            by_then.advance(due)
+        return by_then
+
+    def _half_of(self, voice: Voice) -> float:
+        """Return by how much what a voice plays may end sooner or later."""
+        return max(voice.transition.half, self.half[voice.layer])
 
     def _ends_after(self, one: LayerSet) -> float:
         """Return how long after a set a layer is silent that falls silent by it [s]."""

@@ -143,7 +143,8 @@ def on_amplifiers(rig: Rig, names: Sequence[str]) -> Rig:
         era: Channel(names[number % count], number // count)
         for number, era in enumerate(rig.wiring)
     }
-    return replace(rig, wiring=wiring, amplifiers=dict.fromkeys(names, "sim://"))
+    amplifiers, outputs = dict.fromkeys(names, "sim://"), frozenset(names if rig.outputs else ())
+    return replace(rig, wiring=wiring, amplifiers=amplifiers, outputs=outputs)
 
 
 def on_two_amplifiers(rig: Rig) -> Rig:

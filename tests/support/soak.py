@@ -22,17 +22,19 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
 from soak_chain import Outcome, Trace, run_plan  # noqa: E402
-from soak_plan import KINDS, make_plan  # noqa: E402
+from soak_plan import KINDS, PLATES, make_plan  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
 gc.freeze()  # what is loaded stays
 gc.set_threshold(100_000)  # a run leaves few cycles
 
 
-def run_seed(job: tuple[int, bool], wire: str | None = None) -> tuple[Outcome, bool]:
-    """Run a seed, on one kind of wire where one is named; whether it is short stands beside."""
+def run_seed(
+    job: tuple[int, bool], wire: str | None = None, plate: str | None = None
+) -> tuple[Outcome, bool]:
+    """Run a seed, on one kind of wire or plate if it is named; whether it is short is beside."""
     seed, short = job
-    return run_plan(make_plan(seed, wire, short=short)), short
+    return run_plan(make_plan(seed, wire, plate, short=short)), short
 
 
 def report(found: Iterable[tuple[Outcome, bool]], *, minutes: float, again: str) -> int:
@@ -75,6 +77,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first of each")
     parser.add_argument("--minutes", type=float, default=math.inf, help="of real time at most")
     parser.add_argument("--wire", choices=tuple(KINDS), help="on this kind of wire only")
+    parser.add_argument("--plate", choices=PLATES, help="this plate only")
     parser.add_argument("--short", action="store_true", help="with --seed: the short one")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--seed", type=int, help="run only this one, and print its plan's hash")
@@ -87,8 +90,9 @@ def main() -> int:
     jobs.sort(key=lambda job: job[0] / counts[job[1]])  # evenly mixed
     jobs = [(options.first + number, short) for number, short in jobs]
     again = "python tests/support/soak.py" + f" --wire {options.wire}" * bool(options.wire)
+    again += f" --plate {options.plate}" * bool(options.plate)
     with get_context("spawn").Pool(options.workers) as pool:
-        found = pool.imap_unordered(partial(run_seed, wire=options.wire), jobs)
+        found = pool.imap_unordered(partial(run_seed, wire=options.wire, plate=options.plate), jobs)
         status = report(found, minutes=options.minutes, again=again)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     _print(f"processor time            {used.ru_utime + used.ru_stime:.1f} s")
@@ -98,12 +102,12 @@ def main() -> int:
 
 def _run_one(options: argparse.Namespace) -> int:
     """Run one seed."""
-    plan = make_plan(options.seed, options.wire, short=options.short)
+    plan = make_plan(options.seed, options.wire, options.plate, short=options.short)
     with options.trace.open("w") if options.trace else nullcontext() as file:
         trace = Trace(file)
         outcome = run_plan(plan, trace=trace)
     ends = f"{len(outcome.violations)} violations, trace {trace.digest}"
-    _print(*outcome.violations, f"seed {outcome.seed} on {plan.wire}: {ends}")
+    _print(*outcome.violations, f"seed {outcome.seed} on {plan.wire}, {plan.plate}: {ends}")
     return 1 if outcome.violations else 0
 
 

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, TextIO
 
 from chain import Chain
@@ -19,17 +18,14 @@ from controller.play.observer import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.judge.watching.config import TimeLimits
-from model.answer.timing import Timing
-from model.rig.rig import Rig
-from paper_plate import make_paper_rig
 from plate_witness import PlateTimes
 from registry import clock
-from rig_on_wire import after_each, on_amplifiers
+from rig_on_wire import after_each
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line_kinds import LINE_KINDS, PROMPT
-from small_table import small_table
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
+from soak_plates import soak_rig, soak_source, soak_table, soak_timing
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual
 
 _RELEASE = 0.020  # s; from the last finger up to zero
@@ -86,6 +82,7 @@ class Trace:
 def run_plan(plan: Plan, *, trace: Trace | None = None) -> Outcome:
     """Run a plan to its end; trace: of all that happens, if it is kept."""
     counts: Counter[str] = Counter(f"on {line.kind}" for line in plan.lines)
+    counts[f"of {plan.plate}"] += 1
     violations: list[str] = []
     with _errors_in(violations):
         try:
@@ -99,7 +96,7 @@ async def _run(
     plan: Plan, trace: Trace | None, counts: Counter[str], violations: list[str]
 ) -> None:
     """Run a plan from the start of the far ends to their end."""
-    rig = _rig(plan.amplifiers)
+    rig = soak_rig(plan.plate, NAMES[: plan.amplifiers] if plan.amplifiers > 1 else ())
     wires = {
         name: Wire(
             line.kind,
@@ -112,11 +109,16 @@ async def _run(
         )
         for number, (name, line) in enumerate(zip(rig.amplifiers, 3 * plan.lines, strict=False))
     }
-    options: dict[str, Any] = {"timing": _timing(), "judged": _judged(plan), "seed": plan.seed}
+    options: dict[str, Any] = {
+        "timing": soak_timing(plan.plate),
+        "intent_source": soak_source(plan.plate),
+        "judged": _judged(plan),
+        "seed": plan.seed,
+    }
     if plan.amplifiers > 1:
         crystals = draw_imperfections(rig, seed=plan.seed).crystals
         options["imperfections"] = Imperfections(crystals=crystals)
-    async with Soak.on(wires, rig, small_table(), **options) as soak:
+    async with Soak.on(wires, rig, soak_table(plan.plate), **options) as soak:
         soak.plate_judge.violations = violations
         soak.plan, soak.trace, soak.counts = plan, trace, counts
         await soak.play()
@@ -126,17 +128,6 @@ async def _run(
     if left:
         names = sorted(str(task.get_coro()) for task in left)
         soak.plate_judge.violate(f"{len(left)} tasks are left: {names}")
-
-
-@cache
-def _timing() -> Timing:
-    return Timing(small_table())
-
-
-@cache
-def _rig(amplifiers: int) -> Rig:
-    rig = make_paper_rig(12, 9)
-    return rig if amplifiers == 1 else on_amplifiers(rig, NAMES[:amplifiers])
 
 
 def _judged(plan: Plan) -> Mapping[str, Any]:
@@ -216,7 +207,7 @@ class Soak(Chain):
             link_changed=self._link_changed,
             alive=lambda: None,
         )
-        super().make_host(connected=supervisor.connected)
+        super().make_host(connected=supervisor.connected, **more)
         loop = self.controller.cycle.observers
         supervisor.observe(loop)
         loop.pattern_applied.append(self._applied)
@@ -357,7 +348,7 @@ class Soak(Chain):
             task.cancel()
         await asyncio.gather(*work, return_exceptions=True)
         await self.controller.release()
-        self.make_host()
+        self.make_host(intent_source=soak_source(self.plan.plate))
         await self.open()
 
     async def end(self) -> None:

@@ -33,6 +33,9 @@ LINES: Mapping[str, Sequence[str]] = {
 }
 """The kinds of line behind them, where there are several amplifiers."""
 
+PLATES = ("eras", "exciters")
+"""The plates: that of the founding paper, and a board on exciters with a layout."""
+
 SOURCES = ("panel", "table", "page")
 BEGIN = 0.5  # s; all wires are open by then
 SETTLED = 7.0  # s; maximum recovery time after a fault: a pause before a reopening, of 5 s at most
@@ -109,7 +112,7 @@ Action: TypeAlias = TouchSequence | OperatorAction | FaultInjection
 
 @dataclass(frozen=True)
 class Plan:
-    """Lines, one for each amplifier or one for all, and actions in order of time."""
+    """Lines, one for each amplifier or one for all, actions in order of time; plate: by name."""
 
     seed: int
     lines: tuple[Line, ...]
@@ -117,6 +120,7 @@ class Plan:
     actions: tuple[Action, ...]
     lasts: float
     busy: float  # s; without the time in which the plate is untouched
+    plate: str = PLATES[0]
 
     @property
     def wire(self) -> str:
@@ -138,8 +142,10 @@ class Plan:
         return spans
 
 
-def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Plan:
-    """The plan of a seed; wire: its kind, None for any; short: one scene of seconds."""
+def make_plan(
+    seed: int, wire: str | None = None, plate: str | None = None, *, short: bool = False
+) -> Plan:
+    """The plan of a seed; wire, plate: its kind, None for any; short: one scene of seconds."""
     rng = random.Random(seed)
     amplifiers = rng.choice((1, 1, 2, 3))
     lines = []
@@ -161,7 +167,8 @@ def make_plan(seed: int, wire: str | None = None, *, short: bool = False) -> Pla
             actions.append(OperatorAction(time, "disarm"))
             time += math.exp(rng.uniform(*map(math.log, PAUSES)))
     ordered = tuple(sorted(actions, key=lambda action: action.at))
-    return Plan(seed, tuple(lines), amplifiers, ordered, time, busy)
+    plate = plate or rng.choices(PLATES, (2, 1))[0]
+    return Plan(seed, tuple(lines), amplifiers, ordered, time, busy, plate)
 
 
 def _calm(rng: random.Random, begin: float, length: float, amplifiers: int) -> list[Action]:

@@ -133,14 +133,16 @@ def test_layer_may_have_ended_just_before_all_falls_silent() -> None:
     assert found == ["silent"]
 
 
+@pytest.mark.parametrize("by_a_set", [False, True])
 @pytest.mark.parametrize(("begins", "is_known"), [(1.01, True), (1.02, False), (1.03, True)])
-def test_ending_that_a_ramp_may_shorten_or_not_is_unknown_until_both_are_over(
-    begins: float, is_known: bool
+def test_way_to_silence_that_a_ramp_may_shorten_or_not_is_unknown_until_both_are_over(
+    begins: float, is_known: bool, by_a_set: bool
 ) -> None:
-    """By hand: an ending of 40 ms begins within 1.000 to 1.002 s, a ramp of 20 ms 2.5 ms later.
+    """By hand: an ending or an onset to 0 of 40 ms begins within 1.000 to 1.002 s.
 
-    Ramps from 1.01 s on arrive before the ending, those from 1.03 s on behind it; one from 1.02 s
-    on arrives within 1.0400 to 1.0425 s, and the ending within 1.040 to 1.042 s.
+    A ramp of 20 ms begins within 2.5 ms, of a silence or of a set. From 1.01 s on it arrives before
+    the way, from 1.03 s on behind it; from 1.02 s on within 1.0400 to 1.0425 s, and the way within
+    1.040 to 1.042 s.
     """
     found: list[str] = []
 
@@ -149,14 +151,20 @@ def test_ending_that_a_ramp_may_shorten_or_not_is_unknown_until_both_are_over(
 
     began = 0.0, 0.0
     outputs = ExpectedOutputs({}, report=report, unclear=None, slack=0.0, cause="", began=began)
-    ended = Command(0, 2200, 5000, 0, ending=Envelope(100, ((5000, 0),) * 3))
-    outputs.play([LayerSet(0, 0, 0, (ended,))], 1, (0.0, 0.0), is_exact=True)
-    outputs.play([LayerSet(0, 20, 0, ())], 2, (1.0, 1.0), is_exact=True)
-    outputs.silence((begins, begins + 0.0005), 0.02, "Silence")
+    way, when = Envelope(100, ((5000, 0),) * 3), (begins, begins + 0.0005)
+    if by_a_set:
+        rises = Command(0, 2200, 0, 0, onset=way)
+        outputs.play([LayerSet(0, 0, 0, (rises,))], 1, (1.0, 1.0), is_exact=True)
+        outputs.play([LayerSet(0, 20, 0, ())], 2, when, is_exact=True)
+    else:
+        ends = Command(0, 2200, 5000, 0, ending=way)
+        outputs.play([LayerSet(0, 0, 0, (ends,))], 1, (0.0, 0.0), is_exact=True)
+        outputs.play([LayerSet(0, 20, 0, ())], 2, (1.0, 1.0), is_exact=True)
+        outputs.silence(when, 0.02, "Silence")
     assert bool(outputs.sure((begins + 0.003, begins + 0.003))) is is_known
     assert outputs.sure((1.06, 1.06))
     outputs.check_levels([0.1], (1.06, 1.06), report)
-    assert found == ["silent"]
+    assert found == ["plays" if by_a_set else "silent"]
 
 
 def test_tones_that_may_cancel_leave_those_of_other_frequencies_what_they_play() -> None:

@@ -60,6 +60,19 @@ def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
     return tuple(found)
 
 
+def place_error(problem: CalibrationProblem, fit: Fit, before: float) -> float:
+    """Root mean square of what the rig of a fit has places of ERAs off by, along a side [m].
+
+    About the place that it keeps where the fit does not clearly have another one; before: of places
+    that the data determine less than their prior does.
+    """
+    space = problem.plate.model.space
+    kept, error = (space.values(x, "place") for x in (np.where(clear(fit), 0.0, fit.z), fit.error))
+    by_data = error < math.sqrt(0.5) * KINDS["place"].std
+    of_each = np.where(by_data, np.hypot(np.hypot(kept, error), KINDS["place"].theory), before)
+    return float(np.sqrt(np.mean(of_each**2)))
+
+
 def predicted_by(
     rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: Fit
 ) -> tuple[ComplexArray, ComplexArray]:
@@ -172,6 +185,7 @@ def uncertainty_of(
         "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
+    fitted["place"] = _rounded(place_error(problem, fit, before.place))
     feet = problem.plate.model.space.values(fit.error, "supports")
     if feet.any():
         fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(feet**2)), _MODEL_ERROR))

@@ -1,7 +1,7 @@
 """Conversion of the sections of a rig file to values of the model."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 from model.rig.key_types import place_on
@@ -100,8 +100,13 @@ def _layer_of(section: LayerSection) -> LaminateLayer:
 
 def masses_of(section: MassSection, plate: Plate) -> tuple[PointLoad, ...]:
     """A mass on the plate, or those of a frame along its edges."""
-    return _loads_of(
-        section, plate, {"mass": section.mass or 0.0}, {"mass": section.mass_per_length or 0.0}
+    if section.at is not None:
+        x, y = place_on(plate, section.at)
+        return (PointLoad(x, y, mass=section.mass or 0.0, foot=section.foot),)
+    per_length = section.mass_per_length or 0.0
+    return tuple(
+        PointLoad(x, y, mass=per_length * length, foot=EDGE_FOOT)
+        for x, y, length in edge_points(plate, section.points)
     )
 
 
@@ -110,29 +115,22 @@ def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
     damping, loss_factor = section.damping or 0.0, section.loss_factor
     if loss_factor is None:
         loss_factor = FOOT_LOSS if section.damping is None else 0.0
-    stiffness = section.stiffness or FEET[section.kind or "foam"]
-    edge, per_length = 2 * (plate.length + plate.width), section.stiffness_per_length or 0.0
-    found = _loads_of(
-        section,
-        plate,
-        {"stiffness": stiffness, "damping": damping},
-        {"stiffness": per_length, "damping": damping / edge},
-    )
-    is_foot = section.at is not None
-    return tuple(replace(each, loss_factor=loss_factor, is_foot=is_foot) for each in found)
-
-
-def _loads_of(
-    section: MassSection | SupportSection,
-    plate: Plate,
-    at_point: Mapping[str, float],
-    per_length: Mapping[str, float],
-) -> tuple[PointLoad, ...]:
-    """What is attached at a point, or at points along the edges."""
+    spring = PointLoad(0.0, 0.0, damping=damping, loss_factor=loss_factor)
     if section.at is not None:
-        return (PointLoad(*place_on(plate, section.at), foot=section.foot, **at_point),)
+        stiffness = section.stiffness or FEET[section.kind or "foam"]
+        x, y = place_on(plate, section.at)
+        foot = replace(spring, x=x, y=y, foot=section.foot)
+        return (replace(foot, stiffness=stiffness, is_foot=True),)
+    edge, per_length = 2 * (plate.length + plate.width), section.stiffness_per_length or 0.0
     return tuple(
-        PointLoad(x, y, foot=EDGE_FOOT, **{key: each * length for key, each in per_length.items()})
+        replace(
+            spring,
+            x=x,
+            y=y,
+            stiffness=per_length * length,
+            damping=damping * length / edge,
+            foot=EDGE_FOOT,
+        )
         for x, y, length in edge_points(plate, section.points)
     )
 

@@ -60,7 +60,7 @@ def test_promises_of_exciters_whose_places_are_off_are_kept_on_nine_of_ten_plate
     """
     known = replace(Uncertainty.none(), gain=0.01, place=0.001)
     rig = replace(load_rig(WEEKEND), uncertainty=known)
-    table = build_table(rig, frequencies=np.arange(90.0, 301.0, 30.0), drive_mode="phased")
+    table = build_table(rig, frequencies=np.arange(100.0, 301.0, 25.0), drive_mode="phased")
     rng, kept = np.random.default_rng(3), []
     for _ in range(24):
         target, quiet = random_contacts(rng, 2, (0.4, 0.3), margin=0.02).tolist()

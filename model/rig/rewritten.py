@@ -94,9 +94,7 @@ def _values(rig: Rig, document: Document) -> dict[KeyPath, _Written]:
         found["eras", era.name, "at"] = (era.x, era.y)
         for field, key in KINDS[type(era)].keys.items():
             found["eras", era.name, key] = getattr(era, field)
-    supports: Any = document.data.get("supports", {})
-    feet = [name for name, keys in supports.items() if "at" in keys]
-    for name, number in zip(feet, rig.feet, strict=True):
+    for name, number in zip(rig.foot_names, rig.feet, strict=True):
         found["supports", name, "stiffness"] = rig.masses[number].stiffness
     return found
 

@@ -109,10 +109,7 @@ class SensedPlate:
         """
         by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
         return np.array(
-            [
-                math.inf if row in by_sheet else LEAST_TOLD if row.foot else 1.0
-                for row in self.rows
-            ]
+            [math.inf if row in by_sheet else LEAST_TOLD if row.foot else 1.0 for row in self.rows]
         )
 
     @cached_property

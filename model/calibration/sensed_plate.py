@@ -103,7 +103,7 @@ class SensedPlate:
 
     @cached_property
     def largest_errors(self) -> FloatArray:
-        """Standard errors of the fitted values (n,), in deviations, beyond which none is identified.
+        """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
 
         Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
         """

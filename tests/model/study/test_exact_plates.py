@@ -1,8 +1,8 @@
 """Plates within the uncertainty, by the direct solver, and what answers promise of them."""
 
 import math
-from functools import cache
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,6 +34,7 @@ ON_FEET = replace(
 
 @cache
 def table_on_feet():
+    """The table of that rig."""
     return build_table(ON_FEET, frequencies=FREQUENCIES)
 
 

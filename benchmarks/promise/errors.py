@@ -58,9 +58,7 @@ def main() -> None:
                 places = random_contacts(rng, 2, table.plate, margin=0.013)
                 fingers = [Finger(at, Stimulus(14.0)) for at in places]
                 found = answer(table, fingers, drive_mode="phased", min_contrast_db=-np.inf)
-                plates = draw_plates(
-                    rng, known, count=options.plates, of=table, contact_count=2
-                )
+                plates = draw_plates(rng, known, count=options.plates, of=table, contact_count=2)
                 contrasts = np.array([each.promised_contrast_db for each in found.fingers])
                 kept.append(contrasts_on(table, found, plates) >= contrasts[:, None])
                 promised.append(contrasts.min())

@@ -3,8 +3,8 @@
     python -m benchmarks.weekend.chain [--boards 10] [--touches 20] [--workers 2] [--report]
     python -m benchmarks.weekend.chain --measured examples/weekend/measured.uff
 
-Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives and board drawn
-within the rig's uncertainty, force factors and magnets by 10 %, feet by 30 %. The sensor of
+Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives, board and feet
+drawn within the rig's uncertainty, force factors and magnets by 10 %. The sensor of
 examples/weekend/places.csv reads its responses there, with noise; `era calibrate` fits the rig. Of
 a table of the rig as bought, of the one fitted, and of the board as it is, exactly known but for
 the loads of fingers, the same random touches are answered, and felt on the board in the steady
@@ -46,7 +46,7 @@ from sim.plant.imperfections import draw_imperfections
 from sim.sensors.sensor_file import read_sensors
 
 FOLDER = ROOT / "examples" / "weekend"
-FORCE_FACTOR, MAGNET, FEET = 0.1, 0.1, 0.3
+FORCE_FACTOR, MAGNET = 0.1, 0.1
 """Beside the rig's uncertainty, standard deviations of what that does not have, relative."""
 NOISE = 2e-3  # of a sensor's root mean square, each part
 COUNTED_DB = 25.0
@@ -76,11 +76,7 @@ class BuiltBoard:
             for each, gain in zip(real.eras, drawn.factors(rig), strict=True)
             if isinstance(each, Exciter)
         )
-        feet = tuple(
-            replace(each, stiffness=each.stiffness * float(np.exp(FEET * rng.standard_normal())))
-            for each in real.masses
-        )
-        real = replace(real, eras=eras, masses=feet)
+        real = replace(real, eras=eras)
         free = solve_free_plate(real.plate, real.mesh, frequency_max=real.limits.frequency_max)
         return cls(real, free)
 

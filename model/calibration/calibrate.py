@@ -155,7 +155,7 @@ def _identified(problem: CalibrationProblem, start: Fit) -> tuple[CalibrationPro
     fit = solve(problem, start)
     while True:
         numbers = problem.plate.numbers
-        excess = np.where(problem.free & ~problem.plate.held, fit.error[numbers], 0)
+        excess = np.where(problem.free, fit.error[numbers] / problem.plate.largest_errors, 0)
         # Values of a plate that does not fit are meaningless.
         if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
             return problem, fit

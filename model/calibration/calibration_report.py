@@ -83,6 +83,7 @@ def as_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             {
                 "name": fitted.parameter.name,
                 "era": fitted.parameter.era or None,
+                "foot": fitted.parameter.foot or None,
                 "kind": fitted.parameter.kind,
                 "unit": fitted.parameter.unit,
                 "before": fitted.before,

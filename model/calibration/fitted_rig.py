@@ -186,9 +186,13 @@ def uncertainty_of(
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
     fitted["place"] = _rounded(place_error(problem, fit, before.place))
-    feet = problem.plate.model.space.values(fit.error, "supports")
-    if feet.any():
-        fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(feet**2)), _MODEL_ERROR))
+    feet = [
+        float(error) / one.value if one.is_identified else before.supports
+        for one, error in zip(parameters, errors, strict=True)
+        if one.parameter.foot
+    ]
+    if feet:
+        fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(np.square(feet))), _MODEL_ERROR))
     if known["modulus"]:
         fitted |= Uncertainty.of_frequency(_rounded(rms("modulus") / 2))
     return Uncertainty.clipped(**asdict(before) | fitted)

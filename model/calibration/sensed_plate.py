@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import KINDS, VALUE_UNITS, space_by_sheets
+from model.identification.parameters import KINDS, LEAST_TOLD, VALUE_UNITS, space_by_sheets
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -34,16 +34,20 @@ _KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 class Parameter:
     """A value of a rig, such as is fitted: kind, and ERA, "" for the plate.
 
-    field: of the ERA, which an exciter may have another one of the kind; by default the kind.
+    field: of the ERA, which an exciter may have another one of the kind; by default the kind. foot:
+    its name, "" for what is of no foot.
     """
 
     kind: str
     era: str
     field: str = ""
+    foot: str = ""
 
     @property
     def name(self) -> str:
         """Name in reports."""
+        if self.foot:
+            return f"foot {self.foot} stiffness"
         return f"{self.era or 'plate'} {self.field or self.kind}"
 
     @property
@@ -54,13 +58,15 @@ class Parameter:
     @property
     def is_factor(self) -> bool:
         """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
-        return self.kind in ("modulus", "stiffness", "magnet_mass")
+        return self.kind in ("modulus", "stiffness", "magnet_mass", "supports")
 
     def of(self, rig: Rig) -> float:
         """The value in a rig."""
         if self.era:
             era = rig.era(self.era)
             return float(getattr(era, era.fields[self.kind]))
+        if self.foot:
+            return rig.masses[rig.feet[rig.foot_names.index(self.foot)]].stiffness
         return (
             rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
         )
@@ -79,20 +85,32 @@ class SensedPlate:
 
     @cached_property
     def rows(self) -> tuple[Parameter, ...]:
-        """The fitted values: modulus and loss factor, then those of every ERA, (n,)."""
+        """The fitted values: modulus and loss factor, those of every ERA, of every foot, (n,)."""
         of_eras = (
             Parameter(kind, era.name, era.fields[kind])
             for era in self.rig.eras
             for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
             if kind in era.fields
         )
-        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras)
+        names = self.rig.foot_names if self.rig.uncertainty.supports else ()
+        feet = (Parameter("supports", "", foot=name) for name in names)
+        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras, *feet)
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
-        """Which fitted values (n,) a prior holds: an exciter's coil and magnet, by its sheet."""
+        """Which fitted values (n,) a prior holds."""
+        return self.largest_errors != 1
+
+    @cached_property
+    def largest_errors(self) -> FloatArray:
+        """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
+
+        Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
+        """
         by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
-        return np.array([row in by_sheet for row in self.rows])
+        return np.array(
+            [math.inf if row in by_sheet else LEAST_TOLD if row.foot else 1.0 for row in self.rows]
+        )
 
     @cached_property
     def of_exciters(self) -> tuple[Parameter, ...]:
@@ -108,11 +126,12 @@ class SensedPlate:
     @cached_property
     def numbers(self) -> IntArray:
         """Where each fitted value is in the space, (n,)."""
-        names, groups = [era.name for era in self.rig.eras], self.model.space.groups
+        names, groups = ["", *(era.name for era in self.rig.eras)], self.model.space.groups
+        feet = ["", *self.rig.foot_names]
         return np.array(
             [
                 groups[_KINDS.get(row.kind, row.kind)].start
-                + (names.index(row.era) if row.era else 0)
+                + max(names.index(row.era) + feet.index(row.foot) - 1, 0)
                 for row in self.rows
             ]
         )
@@ -142,9 +161,8 @@ class SensedPlate:
         """The rig with the fitted values of z."""
         own = np.zeros(len(z))
         own[self.numbers] = z[self.numbers]
-        for kind in ("force_factor", "supports"):
-            beside = self.model.space.groups[kind]
-            own[beside] = z[beside]  # with the damping that was found beside them
+        beside = self.model.space.groups["force_factor"]
+        own[beside] = z[beside]  # with the damping that was found beside it
         values = Values.of(self.rig, self.model.space, own)
         return rig_with(self.rig, values, self.rig.uncertainty)
 
@@ -167,6 +185,7 @@ class SensedPlate:
             "stiffness": math.hypot(stated.stiffness, stated.thickness),
             "magnet_mass": math.hypot(stated.stiffness, stated.thickness),
             "damping": math.hypot(factor, KINDS["damping_each"].std),
+            "supports": stated.supports,
         }
         own = np.array([row.of(self.rig) for row in self.rows])
         of_rig = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]

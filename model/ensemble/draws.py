@@ -41,10 +41,10 @@ class Draws:
     """Parameters of d plates from the thinnest to the thickest, in standard deviations.
 
     loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA and of
-    masses up to the last foot, nothing of others, load of each finger; gains (a, d): relative change of each ERA's, complex; errors (k,
-    d): of discretisation at each finger, complex of mean square 1; harmonics (n, d): second
-    harmonic of each ERA, complex, relative to its motion; node (d,): which of the thicknesses each
-    has.
+    masses up to the last foot, nothing of others, load of each finger; gains (a, d): relative
+    change of each ERA's, complex; errors (k, d): of discretisation at each finger, complex of mean
+    square 1; harmonics (n, d): second harmonic of each ERA, complex, relative to its motion; node
+    (d,): which of the thicknesses each has.
     """
 
     loss: Float32Array
@@ -73,10 +73,11 @@ def draw(
 ) -> Draws:
     """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
 
-    to_feet: of the masses, up to the last foot that deviates; gain, phase [rad]: standard deviations of each ERA's; common_gain: of all together; harmonic:
-    root mean square of each ERA's. Of each thickness as many plates, or one less. All answers of a
-    plate share its common gain: half of the plates have it COMMON standard deviations low, the
-    others high, so that a plate whose own is no farther off keeps nine of ten levels.
+    to_feet: of the masses, up to the last foot that deviates; gain, phase [rad]: standard
+    deviations of each ERA's; common_gain: of all together; harmonic: root mean square of each
+    ERA's. Of each thickness as many plates, or one less. All answers of a plate share its common
+    gain: half of the plates have it COMMON standard deviations low, the others high, so that a
+    plate whose own is no farther off keeps nine of ten levels.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count

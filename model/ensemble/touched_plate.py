@@ -13,9 +13,10 @@ thickness each. The expected power of weights w at a fingertip is w^H R w to fir
 with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j by how much
 each ERA at full stroke deforms it. Each change d is one by a standard deviation, s_j that of the
 stiffness: the ERAs' damping c together, stiffness of each ERA and foot and load of each finger j on
-their own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects locally.
-For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it, exactly; the
-modulus counts along with it (`attached_plate`). The loss factor changes next to nothing.
+their own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects
+locally. For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it,
+exactly; the modulus counts along with it (`attached_plate`). The loss factor changes next to
+nothing.
 
 `model.ensemble.touched_by_kernel` runs the same in C.
 """

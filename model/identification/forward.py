@@ -11,7 +11,7 @@ A sensor of mass m_s loads the plate only while it measures: one that is moved f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np

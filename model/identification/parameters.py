@@ -82,10 +82,10 @@ KINDS = {
     "sensor_phase": Kind(math.radians(5), *_PHASE),
     # By data sheets: of the plate's mass that an ERA carries.
     "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
-    # Of an ERA, on each axis.
     # Of exciters.
     "magnet_mass": Kind(_BUILT.stiffness, bound=math.log(10.0)),
     "force_factor": Kind(_BUILT.stiffness, drift=0.01),
+    # Of an ERA, on each axis.
     "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
     "masses": Kind(2e-3, *_WEIGHT),
     "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
@@ -118,6 +118,9 @@ FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss
 COIL_DEVIATES = 0.2
 """Standard deviation of the mass of an exciter's coil by its sheet, relative: assumed."""
 
+LEAST_TOLD = math.sqrt(0.5)
+"""Standard error of what a prior holds, in its deviations, beyond which data tell less than it."""
+
 VALUE_UNITS = {
     "length": "m",
     "width": "m",
@@ -128,6 +131,7 @@ VALUE_UNITS = {
     "damping": "N s/m",
     "bolt_mass": "kg",
     "magnet_mass": "kg",
+    "supports": "N/m",
 }
 """Units of the values of a rig that parameters change."""
 
@@ -316,7 +320,7 @@ def space_of(
     add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
     of_mode = KINDS["mode_losses"].std * lossy
     add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
-    feet = [f"stiffness of foot {n}" for n in range(1, len(rig.feet) + 1)]
+    feet = [f"stiffness of foot {name}" for name in rig.foot_names]
     add("supports", feet, uncertainty.supports)
     add("fingers", [])
     has_form = form_of is not None

@@ -102,9 +102,7 @@ def _values(rig: Rig, document: Document) -> dict[KeyPath, Any]:
         for field, key in KINDS[type(era)].keys.items():
             found["eras", era.name, key] = getattr(era, field)
         found["eras", era.name, "gains"] = [[f, size, math.degrees(a)] for f, size, a in era.gains]
-    supports: Any = document.data.get("supports", {})
-    feet = [name for name, keys in supports.items() if "at" in keys]
-    for name, number in zip(feet, rig.feet, strict=True):
+    for name, number in zip(rig.foot_names, rig.feet, strict=True):
         found["supports", name, "stiffness"] = rig.masses[number].stiffness
     return found
 

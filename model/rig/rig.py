@@ -133,6 +133,13 @@ class Rig:
         return feet_of(self.masses)
 
     @property
+    def foot_names(self) -> tuple[str, ...]:
+        """Names of the feet in its file, without one their numbers from 1."""
+        stated: Any = self.document.data.get("supports", {}) if self.document else {}
+        named = [name for name, keys in stated.items() if "at" in keys]
+        return tuple(named or [str(number) for number in range(1, 1 + len(self.feet))])
+
+    @property
     def largest_stiffness(self) -> float:
         """That of the stiffest spring of an actuator [N/m], for the accuracy of a mesh."""
         return max(era.in_time.stiffness for era in self.eras)

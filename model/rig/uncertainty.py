@@ -21,7 +21,16 @@ BOUNDS = {
 }
 """What a rig may state of each parameter: exactly known, and the most."""
 
-_RELATIVE = ("gain", "thickness", "modulus", "stiffness", "supports", "common_gain", "field", "harmonic")
+_RELATIVE = (
+    "gain",
+    "thickness",
+    "modulus",
+    "stiffness",
+    "supports",
+    "common_gain",
+    "field",
+    "harmonic",
+)
 
 MAX_UNCERTAINTY = 1000.0
 """Of any of them, also in a study of plates beyond BOUNDS."""

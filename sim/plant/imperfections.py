@@ -181,8 +181,8 @@ class Imperfections:
 def draw_imperfections(rig: Rig, *, seed: int = 0) -> Imperfections:
     """Draw the plate, ERAs, channels and fingers of a rig within its uncertainty, all normal.
 
-    Feet log-normal. Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved on another mesh
-    than the rig's, as accurate as `mesh: auto`.
+    Feet log-normal. Crystals are within 50 ppm, and drift by 1 ppm/s at first. The plate is solved
+    on another mesh than the rig's, as accurate as `mesh: auto`.
     """
     rng = np.random.default_rng(seed)
     std = rig.uncertainty

@@ -78,7 +78,9 @@ def measured(
     rng = np.random.default_rng(seed)
     matrices = assemble(truth.plate, truth.mesh)
     strokes = np.array([era.stroke for era in truth.eras])[:, None]
-    values = direct_acceleration(matrices, truth.eras, frequencies, POINTS) / strokes
+    values = (
+        direct_acceleration(matrices, truth.eras, frequencies, POINTS, loads=truth.masses) / strokes
+    )
     heard = noise_like(values, noise, rng)
     for name, scale in (scales or {}).items():
         values[:, :, NAMES.index(name)] *= scale

@@ -1,8 +1,8 @@
 """Plates within the uncertainty, by the direct solver, and what answers promise of them."""
 
 import math
-from functools import cache
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,6 +34,7 @@ ON_FEET = replace(
 
 @cache
 def table_on_feet():
+    """The table of that rig."""
     return build_table(ON_FEET, frequencies=FREQUENCIES)
 
 
@@ -179,9 +180,7 @@ def test_error_power_is_the_error_of_the_direct_field():
 def test_draw_plates_has_the_spreads_of_the_uncertainty():
     """Normal numbers: of the logarithm for damping, loss, load and feet."""
     known = replace(Uncertainty(), supports=0.3)
-    plates = draw_plates(
-        np.random.default_rng(0), known, of=ON_FEET, count=4000, contact_count=2
-    )
+    plates = draw_plates(np.random.default_rng(0), known, of=ON_FEET, count=4000, contact_count=2)
     expected_stds = [
         (np.abs(plates.gain), 0.05),
         (np.degrees(np.angle(plates.gain)), 5.0),
@@ -209,9 +208,7 @@ def test_promises_are_kept_on_nine_of_ten_plates(mode):
         count = 1 + number % 3
         placed = Placement((places[0],), tuple(places[1 : 1 + count]))
         layer, promise = only(table, placed, drive_mode=mode)
-        plates = draw_plates(
-            rng, table.uncertainty, of=table, count=200, contact_count=1 + count
-        )
+        plates = draw_plates(rng, table.uncertainty, of=table, count=200, contact_count=1 + count)
         felt = felt_on(table, placed, layer.excitation, plates)
         contrasts = 20 * np.log10(felt.contrast)
         level_kept.append(20 * np.log10(felt.level) >= promise.promised_level_db_sl)

@@ -11,9 +11,9 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from sim.desk.measuring.multisine import PERIOD, Estimate, Multisine
-from sim.sensors.sensor_file import WiredSensor
 
 SILENT = 1e-5
 """Of full scale, rms: what an input without a signal stays below."""

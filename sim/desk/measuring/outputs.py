@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -24,7 +25,6 @@ from sim.desk.measuring.measure import run_time
 from sim.desk.measuring.multisine import Estimate, Multisine, estimate, ramped
 from sim.desk.measuring.single_run import settled
 from sim.desk.measuring.sound_card import SoundCard
-from sim.sensors.sensor_file import WiredSensor
 
 TONE = 160.0
 """Usual frequency [Hz] of the tone: felt well, and soft in air."""

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from model.calibration.responses import MeasuredValue
+from model.calibration.sensor_file import WiredSensor, are_places
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import Tone, tones_of
-from sim.sensors.sensor_file import WiredSensor, are_places
 
 _OPTIONAL = ("output", "sensor", "magnitude", "magnitude_db", "phase_deg", "real", "imag")
 _ENDINGS = (".csv", ".wav")

@@ -17,11 +17,11 @@ from scipy import signal
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.files.uff import read_bytes
 from model.files.wav_file import samples_of
 from sim.desk.measuring.loopback import SILENT, check_levels
-from sim.sensors.sensor_file import WiredSensor
 
 _FRAME = 0.05  # s
 _HIGHEST = 1500.0  # Hz, of a tone

@@ -11,6 +11,7 @@ from drivers.errors import DriverError, LinkError
 from drivers.playing import contents
 from model.answer.answer import Layer
 from model.arrays import FloatArray
+from model.calibration.sensor_file import read_sensors
 from model.progress import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
@@ -26,7 +27,6 @@ from sim.desk.measuring.loopback import check_levels, is_whole
 from sim.desk.measuring.multisine import ramped
 from sim.desk.measuring.sound_card import SoundCard, open_card
 from sim.plant.fingers import fit_tones
-from sim.sensors.sensor_file import read_sensors
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
 _WINDOW = 1.0  # s

@@ -192,7 +192,6 @@ def _check_outliers(problem: CalibrationProblem, fit: Fit) -> None:
 
 def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
     """Raise InputError for gains that no drive has: in these a fit hides what is another plate."""
-    count = problem.values.shape[2]
     for number, era in enumerate(problem.plate.rig.eras):
         measured = np.isfinite(fit.gains_error[:, number])
         sizes, errors = (x[measured, number] for x in (np.abs(fit.gains), fit.gains_error))
@@ -203,7 +202,7 @@ def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
                 f"gains of ERA {era.name} must be within a factor of {_MAX_GAIN:g} of their median "
                 f"over frequency, got {relative.min():.2g} to {relative.max():.2g} of it, as no "
                 "drive has them; check that it is this plate, its material and the places of "
-                f"sensors, and measure at more places than {count}"
+                "sensors, and measure at more places"
             )
 
 

@@ -78,9 +78,9 @@ def desk_plate(
     from benchmarks.desk_plate.jack_plate import JackPlate
     from benchmarks.desk_plate.sensing import Converters
     from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
+    from model.calibration.sensor_file import read_sensors
     from model.rig.file import load_rig
     from sim.desk.libjack import JackClient
-    from sim.sensors.sensor_file import read_sensors
 
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate, may_move=True)

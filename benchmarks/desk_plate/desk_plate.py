@@ -10,11 +10,11 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
+from model.calibration.sensor_file import WiredSensor, are_places
 from model.errors import InputError
 from model.finger.fingertip import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
 from sim.desk.measuring.desk import Desk
-from sim.sensors.sensor_file import WiredSensor, are_places
 
 _LOOPED = 0.9  # of what a cable from an output to an input brings back
 

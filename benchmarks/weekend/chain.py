@@ -31,6 +31,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses
+from model.calibration.sensor_file import read_sensors
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.finger.fingertip import fingertips_on
@@ -43,7 +44,6 @@ from model.structure.exciter import Exciter
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from sim.plant.imperfections import draw_imperfections
-from sim.sensors.sensor_file import read_sensors
 
 FOLDER = ROOT / "examples" / "weekend"
 FORCE_FACTOR, MAGNET = 0.1, 0.1

@@ -225,13 +225,13 @@ def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
-    """Raise InputError for a finger off the plate; what: the finger's name."""
+    """Raise InputError for places [m] off the plate; what: the name of what is there."""
     length, width = plate.length, plate.width
     for x, y in places:
         if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
             raise InputError(
-                f"{what} ({x:g}, {y:g}) m must be on the plate, from (0, 0) to "
-                f"({length:g}, {width:g}) m{in_metres(x, y, length=length, width=width)}"
+                f"{what} must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got "
+                f"({x:g}, {y:g}) m{in_metres(x, y, length=length, width=width)}"
             )
 
 

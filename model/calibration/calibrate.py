@@ -29,7 +29,12 @@ from model.calibration.fitted_rig import (
     standard_error,
     uncertainty_of,
 )
-from model.calibration.responses import Responses, Screening, check_enough_sensors
+from model.calibration.responses import (
+    LEAST_SENSORS,
+    Responses,
+    Screening,
+    check_enough_sensors,
+)
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.variable_projection import row_rms
 from model.choice import best_of
@@ -44,12 +49,13 @@ from model.rig.rig import Rig
 def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutSensors | None:
     """Fit without some of the live sensors of known scale, and predict their responses.
 
-    Predicted by the rig as its file has it, without other form errors.
+    Predicted by the rig as its file has it, without other form errors. None where too few are left
+    to fit.
     """
     count = len(live.sensors)
     candidates = np.flatnonzero(~problem.free_scales | problem.free_scales.all())
-    wanted = round(count / SHARE)
-    if count < SHARE or len(candidates) <= wanted:
+    wanted = max(round(count / SHARE), 1)
+    if count - wanted < LEAST_SENSORS or len(candidates) <= wanted:
         return None
     evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
     unseen = np.zeros(count, dtype=bool)
@@ -93,6 +99,7 @@ def relative_error(
 
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
+_MAX_GAIN = 5.0  # of a drive at a frequency relative to its median, either way
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
 
@@ -107,8 +114,8 @@ def calibrate(
     """Fit a rig to responses measured on it, as `check_consistency` has found them.
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
-    the fits done and all. Raises InputError if fewer than three sensors have a signal, and for a
-    plate of another size.
+    the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
+    of another size, and for gains that no drive has.
     """
     dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
     while True:
@@ -138,6 +145,7 @@ def calibrate(
         found = _with_median_scale_one(problem, found)
     progress(2, 3)
     _check_sides(problem, found)
+    _check_gains(problem, found)
     _check_outliers(problem, found)
     report = _report(
         problem,
@@ -180,6 +188,22 @@ def _check_outliers(problem: CalibrationProblem, fit: Fit) -> None:
             f"{count} ({100 * out / count:.0f} %); check that it is this plate, names and places "
             "of sensors and ERAs, and loose contacts"
         )
+
+
+def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
+    """Raise InputError for gains that no drive has: in these a fit hides what is another plate."""
+    for number, era in enumerate(problem.plate.rig.eras):
+        measured = np.isfinite(fit.gains_error[:, number])
+        sizes, errors = (x[measured, number] for x in (np.abs(fit.gains), fit.gains_error))
+        relative = sizes / np.median(sizes) if len(sizes) else sizes
+        clear = np.abs(np.log(relative)) - _SIGNIFICANCE * errors / sizes
+        if (clear > math.log(_MAX_GAIN)).any():
+            raise InputError(
+                f"gains of ERA {era.name} must be within a factor of {_MAX_GAIN:g} of their median "
+                f"over frequency, got {relative.min():.2g} to {relative.max():.2g} of it, as no "
+                "drive has them; check that it is this plate, its material and the places of "
+                "sensors, and measure at more places"
+            )
 
 
 def _check_sides(problem: CalibrationProblem, fit: Fit) -> None:

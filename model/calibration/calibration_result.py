@@ -114,5 +114,5 @@ class Calibration:
 
     @property
     def is_good(self) -> bool:
-        """Whether the fit is acceptable."""
-        return bool((self.held_out.after if self.held_out else self.error) <= MAX_FIT_ERROR)
+        """Whether the fit predicts what it was not shown; by few sensors it says nothing."""
+        return self.held_out is not None and self.held_out.after <= MAX_FIT_ERROR

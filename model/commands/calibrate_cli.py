@@ -17,6 +17,12 @@ _NO_FIT = (
 )
 
 
+_UNCHECKED = (
+    "the fit must be checked by a sensor that it was not shown; no rig is written. Few responses "
+    "are explained by a wrong plate as well: measure at {least} places or more, better at eight"
+)
+
+
 def calibrate(
     rig_file: RigArgument,
     measured_file: Annotated[
@@ -40,7 +46,7 @@ def calibrate(
     """
     from model.calibration import calibration_report
     from model.calibration.calibrate import calibrate as fit
-    from model.calibration.responses import responses_of
+    from model.calibration.responses import LEAST_SENSORS, responses_of
     from model.calibration.responses_file import read_measured
     from model.config.document import read_document
     from model.diagnosis.consistency import check_consistency
@@ -78,6 +84,7 @@ def calibrate(
         f"from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
         f"{counted(responses.count, 'value')}"
     )
+    refusal = _NO_FIT if calibration.held_out else _UNCHECKED.format(least=LEAST_SENSORS + 1)
     finish(
         [heading, "", *rows, *calibration_report.gain_rows(calibration), "", *notes],
         calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
@@ -85,5 +92,5 @@ def calibrate(
         else None,
         files=files,
         elapsed=timed.elapsed,
-        refusal=None if calibration.is_good else _NO_FIT,
+        refusal=None if calibration.is_good else refusal,
     )

@@ -39,21 +39,13 @@ def template(
 
     Print at 100 %: the ruler on it must measure 100 mm.
     """
-    from model.answer.fingers import check_on_plate
+    from model.calibration.sensor_file import read_places
     from model.figures.template import Template, write_template
-    from model.files.csv_file import read_lines
     from model.rig.file import load_rig
 
     check_picture(output)
     rig = load_rig(rig_file)
-    wired = ("input", "mv_per_m_s2", "gain", "full_scale_v", "mass_g")
-    columns = ("sensor", "x_m", "y_m")
-    lines = read_lines(sensors_file, columns, optional=wired) if sensors_file else []
-    sensors = {}
-    for each in lines:
-        name, at = each.cells["sensor"], (each.number("x_m"), each.number("y_m"))
-        check_on_plate(f"{each.place}: sensor {name}", [at], rig.plate)
-        sensors[name] = at
+    sensors = read_places(sensors_file, rig.plate) if sensors_file else {}
     drawn = Template(rig, sensors, is_below=side is Side.BELOW)
     pages = write_template(output, drawn)
     length, width = drawn.board

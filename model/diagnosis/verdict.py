@@ -27,6 +27,7 @@ from model.diagnosis.diagnosis_screening import (
     off_scale,
     usable_sensors,
 )
+from model.diagnosis.glue import behind_glue
 from model.diagnosis.grain_direction import TurnedGrain, turned_grain
 from model.diagnosis.plate_match import (
     FALSE_ALARM,
@@ -261,6 +262,10 @@ def diagnose(
     )
     if not matches:
         channels = tuple(_loose(each, rig, match, explanations) for each in channels)
+    on_glue = behind_glue(fitted, values, drives)
+    channels = tuple(
+        _as_loose(each) if off else each for each, off in zip(channels, on_glue, strict=True)
+    )
     return Verdict(
         channels,
         matches,
@@ -367,8 +372,13 @@ def _loose(
         shares += [row.of(match.rig) / row.of(rig) for row in acts]
     if min(shares, default=1.0) > LOOSE:
         return channel
-    states = ("loose", *(each for each in channel.states if each not in ("well", "weak")))
-    return replace(channel, states=states)
+    return _as_loose(channel)
+
+
+def _as_loose(channel: ChannelVerdict) -> ChannelVerdict:
+    """The same, loose, which makes it weak as well."""
+    others = (each for each in channel.states if each not in ("well", "weak", "loose"))
+    return replace(channel, states=("loose", *others))
 
 
 def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:

@@ -107,8 +107,8 @@ class Rig:
     @property
     def grain(self) -> str:
         """The side along which its keys say that the grain of a board runs."""
-        keys = self.document.data.get("plate", {}) if self.document else {}
-        return str(keys.get("grain", "length"))
+        keys: Mapping[str, Any] = self.document.data if self.document else {}
+        return str(keys.get("plate", {}).get("grain", "length"))
 
     @cached_property
     def full_levels(self) -> dict[str, float]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from model.answer.fingers import check_on_plate
 from model.errors import InputError
 from model.structure.attachments import PointLoad
 from sim.control.context import SimulationContext
@@ -22,7 +23,7 @@ from sim.control.requests import (
     read,
 )
 from sim.plant.accelerometer import Accelerometer
-from sim.plant.fingers import Position, check_on_plate, measure_vibration
+from sim.plant.fingers import Position, measure_vibration
 from sim.plant.imperfections import PlateErrors
 from sim.sensors.recording import Recording
 
@@ -170,8 +171,7 @@ def _changed(context: SimulationContext, change: PlateChange) -> PlateErrors:
     stiffness = {
         name: first.stiffness.get(name, 1.0) * change.stiffness.get(name, 1.0) for name in names
     }
-    for x, y, _ in change.masses:
-        check_on_plate("a mass", (x, y), rig.plate)
+    check_on_plate("a mass", [(x, y) for x, y, _ in change.masses], rig.plate)
     return replace(
         first,
         modulus=first.modulus * change.modulus,

@@ -94,12 +94,12 @@ def measure(
     input, one sensor is moved from line to line: the terminal says where to. The file is for era
     calibrate, and for era rig identify --measured.
     """
+    from model.calibration.sensor_file import are_places, read_sensors
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
     from sim.desk.measuring.desk import Desk
     from sim.desk.measuring.measure import open_desk
-    from sim.sensors.sensor_file import are_places, read_sensors
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")

@@ -3,7 +3,6 @@
 Samples are kept for ten seconds. The load of a finger on the plate is in `sim.plant.loaded_plates`.
 """
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +10,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from model.answer.fingers import check_on_plate
 from model.arrays import ComplexArray, FloatArray
-from model.config.points import in_metres
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import felt_part
 from model.reduction.reduced_plate import ReducedPlate
-from model.structure.plate import Plate
 
 KEPT = 10.0  # s
 MAX_FINGERS = 32  # four people with eight fingers each
@@ -54,17 +52,6 @@ class Record:
     accelerations: FloatArray
 
 
-def check_on_plate(what: str, position: Position, plate: Plate) -> None:
-    """Raise InputError for a position [m] off the plate."""
-    x, y = position
-    if not (math.isfinite(x) and math.isfinite(y) and plate.contains(x, y)):
-        raise InputError(
-            f"{what} must be on the plate, (0, 0) to ({plate.length:g}, {plate.width:g}) m, "
-            f"got ({x:g}, {y:g}) m"
-            f"{in_metres(x, y, length=plate.length, width=plate.width)}"
-        )
-
-
 class Fingers:
     """Fingers on a reduced plate by id, and their accelerations in the last ten seconds."""
 
@@ -93,7 +80,7 @@ class Fingers:
                 f"number of fingers must be at most {MAX_FINGERS}, got {len(positions)}"
             )
         for name, position in positions.items():
-            check_on_plate(f"finger {name}", position, self._reduced.plate)
+            check_on_plate(f"finger {name}", [position], self._reduced.plate)
 
     def record(self, times: FloatArray, accelerations: FloatArray) -> None:
         """Keep samples at the points of the layout: times (n,) [s], accelerations (n, p) [m/s²]."""

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from model.answer.fingers import check_on_plate
 from model.arrays import FloatArray
 from model.errors import InputError
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer, positions, readings
-from sim.plant.fingers import KEPT, check_on_plate
+from sim.plant.fingers import KEPT
 from sim.sensors.recording import Recording, check_recordable, max_values, write_recording
 
 MAX_SENSORS = 64  # ten seconds of readings take 50 MB
@@ -43,7 +44,7 @@ class Accelerometers:
         if len(set(names)) < len(names):
             raise InputError(f"names of sensors must be unique, got {', '.join(names)}")
         for sensor in sensors:
-            check_on_plate(f"sensor {sensor.name}", (sensor.x, sensor.y), self._bench.rig.plate)
+            check_on_plate(f"sensor {sensor.name}", [(sensor.x, sensor.y)], self._bench.rig.plate)
         self.sensors = tuple(sensors)
         self._bench.place_sensors(sensors)
         self._pieces.clear()

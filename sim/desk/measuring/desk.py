@@ -8,13 +8,13 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.transients.time_response import plate_in_time
 from sim.desk.measuring.multisine import PERIOD
-from sim.sensors.sensor_file import WiredSensor
 
 MIN_SETTLING = 1.0
 """Time [s] of a run before what counts, at least: a plate with a usual loss factor has settled."""

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import numpy as np
 
 from model.arrays import FloatArray
+from model.calibration.sensor_file import WiredSensor
 from sim.desk.measuring.measure import Show
 from sim.desk.measuring.multisine import Multisine
-from sim.sensors.sensor_file import WiredSensor
 
 STEPS = "▁▂▃▄▅▆▇█"
 _RANGE = 60.0  # dB from the highest step to the lowest

@@ -19,13 +19,13 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses, responses_of
 from model.calibration.responses_file import read_measured, write_responses
+from model.calibration.sensor_file import WiredSensor
 from model.commands.options import Stopwatch
 from model.errors import InputError
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.measure import Measured, measure
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import DeviceLost, SoundCard
-from sim.sensors.sensor_file import WiredSensor
 
 _SAME = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray
+from model.calibration.sensor_file import read_sensors
 from model.choice import best_first
 from model.identification.forward import Sensor
 from model.identification.measurement import (
@@ -21,7 +22,6 @@ from sim.desk.measuring.desk import Desk, converters
 from sim.desk.measuring.measure import Measured, measure, open_desk, play_run
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import SoundCard
-from sim.sensors.sensor_file import read_sensors
 
 _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
 _COMPARED = 2  # lines of it

@@ -17,12 +17,12 @@ import numpy as np
 
 from model.calibration.responses import MeasuredValue, responses_of
 from model.calibration.responses_file import write_responses
+from model.calibration.sensor_file import WiredSensor, are_places
 from model.counting import counted
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import CLOSE, tones_of
-from sim.sensors.sensor_file import WiredSensor, are_places
 
 _OPTIONAL = ("output", "sensor", "magnitude", "magnitude_db", "phase_deg", "real", "imag")
 _ENDINGS = (".csv", ".wav")

@@ -17,11 +17,11 @@ from scipy import signal
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.files.uff import read_bytes
 from model.files.wav_file import samples_of
 from sim.desk.measuring.loopback import SILENT, check_levels
-from sim.sensors.sensor_file import WiredSensor
 
 CLOSE = 2e-4
 """Of a frequency: nearer ones are the same, played for several ERAs."""

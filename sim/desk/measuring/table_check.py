@@ -10,6 +10,7 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import contents
 from model.answer.answer import Layer
+from model.calibration.sensor_file import read_sensors
 from model.progress import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
@@ -26,7 +27,6 @@ from sim.desk.measuring.multisine import ramped
 from sim.desk.measuring.runs import Run, play
 from sim.desk.measuring.sound_card import SoundCard, open_card
 from sim.plant.fingers import fit_tones
-from sim.sensors.sensor_file import read_sensors
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later
 _WINDOW = 1.0  # s

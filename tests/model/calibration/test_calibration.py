@@ -147,6 +147,25 @@ def test_calibrate_keeps_what_is_not_identified(rig):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(("count", "held_out"), [(3, 0), (4, 1)])
+def test_calibrate_is_good_only_where_a_sensor_is_left_to_check_it(rig, truth, count, held_out):
+    """Of four places one is predicted from three; three leave none, as two tell nothing."""
+    full = measured(truth)
+    few = full.without(~np.isin(NAMES, ["P1", "P4", "P7", "P9"][:count]))
+    found = calibrated(rig, few)
+    assert len(found.held_out.sensors if found.held_out else ()) == held_out
+    assert found.is_good == bool(held_out)
+
+
+def test_calibrate_refuses_gains_that_no_drive_has(rig, truth):
+    """Eight times the response at one frequency of one ERA, at all sensors alike."""
+    full = measured(truth)
+    values = full.values.copy()
+    values[5, 1] *= 8
+    with pytest.raises(InputError, match=r"gains of ERA SE .* factor of 5 .* to [78]\.\d of it"):
+        calibrated(rig, replace(full, values=values))
+
+
 def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     """Every sensor's scale relative to their median, also of one mounted upside down."""
     found = calibrated(rig, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)

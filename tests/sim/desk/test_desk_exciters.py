@@ -14,6 +14,7 @@ from desk_card import DeskCard
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
 from model.calibration.sensed_plate import sensed_plate
+from model.calibration.sensor_file import WiredSensor
 from model.identification.identify import identify
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -22,7 +23,6 @@ from model.structure.attachments import PointLoad
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.moved_sensor import PlacesFile, measure_places
 from sim.desk.measuring.multisine import Multisine
-from sim.sensors.sensor_file import WiredSensor
 
 BOARD = """
 plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,

@@ -14,6 +14,7 @@ from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray
+from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.errors import InputError
 from model.identification.identify import identify
 from model.identification.measurement import MeasuredPlate
@@ -22,7 +23,6 @@ from model.structure.attachments import fingertip_loads
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.plate_measurement import measure_through
-from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 RATE = 48_000.0
 POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])

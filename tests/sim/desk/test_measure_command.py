@@ -13,9 +13,9 @@ from benchmarks.desk_plate.truth import draw_truth
 from controller.cli.main import run
 from desk_card import DeskCard
 from model.arrays import Float32Array, FloatArray
+from model.calibration.sensor_file import read_sensors
 from model.rig.file import load_rig
 from sim.desk.measuring.sound_card import DeviceLost
-from sim.sensors.sensor_file import read_sensors
 
 RATE = 8_000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"

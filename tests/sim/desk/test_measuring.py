@@ -12,6 +12,7 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.rig.file import parse_rig
 from model.rig.rig import Rig
@@ -22,7 +23,6 @@ from sim.desk.measuring.measure import Measured, check_by_steps, measure
 from sim.desk.measuring.multisine import Multisine, default_frequencies
 from sim.desk.measuring.sound_card import SoundCard
 from sim.desk.soft_amp.library import address_of
-from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8_000.0
 DELAY = 73

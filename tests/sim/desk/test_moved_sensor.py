@@ -16,6 +16,7 @@ from desk_card import DeskCard
 from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
+from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.errors import InputError
 from model.identification.identify import identify
 from model.rig.rig import Rig
@@ -23,7 +24,6 @@ from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.moved_sensor import PlacesFile, measure_places
 from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.sound_card import DeviceLost
-from sim.sensors.sensor_file import WiredSensor, read_sensors
 
 RATE, LEVEL, GRAMS = 8_000.0, 0.3, 5.0
 PLACES = {"P1": (0.03, 0.05), "P2": (0.20, 0.11), "P3": (0.29, 0.20)}

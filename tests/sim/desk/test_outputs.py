@@ -16,6 +16,7 @@ from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
+from model.calibration.sensor_file import WiredSensor
 from model.config.document import read_document
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
@@ -24,7 +25,6 @@ from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, matched, tone
 from sim.desk.outputs_cli import outputs
-from sim.sensors.sensor_file import WiredSensor
 
 RATE = 8000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"

@@ -9,11 +9,11 @@ from scipy.io import wavfile
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses, responses_of
+from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_file import read_stepped
-from sim.sensors.sensor_file import WiredSensor
 
 RATE = 12_000
 TONES = (61.0, 151.5, 311.0)

@@ -20,6 +20,7 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
 from drivers.playing.contents import Layer
 from model.arrays import Float32Array, FloatArray
+from model.calibration.sensor_file import read_sensors
 from model.cli import app
 from model.errors import InputError
 from model.finger.perception import detection_threshold
@@ -34,7 +35,6 @@ from model.table.table import LocalizationTable
 from model.vibration.excitation import tone_fields
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard
-from sim.sensors.sensor_file import read_sensors
 
 RATE = 8_000.0
 LEVEL = 0.5

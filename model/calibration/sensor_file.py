@@ -1,20 +1,23 @@
 """The file of a desk's accelerometers: a place, an input of the sound card, and a sensitivity each.
 
-CSV with the columns below, in any order; those of OPTIONAL may be left out. Where all lines name
-one input, that is one sensor, which is moved from place to place.
+CSV with the columns below, in any order; those of OPTIONAL may be left out, and all but PLACES
+where only places are read. Where all lines name one input, that is one sensor, which is moved from
+place to place.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from model.answer.fingers import check_on_plate
+from model.arrays import Point
 from model.calibration.responses_file import sensor_mass
 from model.errors import InputError
 from model.files.csv_file import Line, read_lines
 from model.structure.plate import Plate
-from sim.plant.fingers import check_on_plate
 
-COLUMNS = ("sensor", "x_m", "y_m", "input", "mv_per_m_s2")
+PLACES = ("sensor", "x_m", "y_m")
+COLUMNS = (*PLACES, "input", "mv_per_m_s2")
 OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
 
 
@@ -32,6 +35,15 @@ class WiredSensor:
     input: int
     sensitivity: float
     mass: float = 0.0
+
+
+def read_places(path: Path, plate: Plate) -> dict[str, Point]:
+    """Read places [m] of sensors on a plate by name; raises InputError with file and line."""
+    places: dict[str, Point] = {}
+    for line in read_lines(path, PLACES, optional=(*COLUMNS[len(PLACES) :], *OPTIONAL)):
+        name, at = _place(line, places, plate)
+        places[name] = at
+    return places
 
 
 def read_sensors(
@@ -60,14 +72,22 @@ def are_places(sensors: Sequence[WiredSensor]) -> bool:
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 
 
+def _place(line: Line, before: Collection[str], plate: Plate) -> tuple[str, Point]:
+    """Name and place of a sensor, which the ones before do not have; raises InputError."""
+    name = line.cells["sensor"]
+    if not name or name in before:
+        raise InputError(f"{line.place}: sensor must be a name that no other has, got {name!r}")
+    at = line.number("x_m"), line.number("y_m")
+    check_on_plate(f"{line.place}: sensor {name}", [at], plate)
+    return name, at
+
+
 def _sensor(
     line: Line, before: Sequence[WiredSensor], plate: Plate, *, mass: float | None, moves: bool
 ) -> WiredSensor:
-    place, name = line.place, line.cells["sensor"]
-    if not name or any(name == other.name for other in before):
-        raise InputError(f"{place}: sensor must be a name that no other has, got {name!r}")
-    x, y, channel, sensitivity = map(line.number, ("x_m", "y_m", "input", "mv_per_m_s2"))
-    check_on_plate(f"{place}: sensor {name}", (x, y), plate)
+    place = line.place
+    name, (x, y) = _place(line, [other.name for other in before], plate)
+    channel, sensitivity = map(line.number, ("input", "mv_per_m_s2"))
     is_taken = not moves and any(channel == other.input for other in before)
     if channel != int(channel) or channel < 1 or is_taken:
         raise InputError(

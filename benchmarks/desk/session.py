@@ -22,7 +22,7 @@ RATE, BLOCK = 48_000, 128
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
 _COMMAND = 900.0  # s
-_AGAIN, _REPEATS = "is not kept", 12  # said of a place; at most
+_TRIES = 2  # of a place
 
 Place = tuple[float, float]
 
@@ -76,7 +76,7 @@ class Desk:
     def measure_by_moving(self, *arguments: object) -> int:
         """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError.
 
-        Return how often a place was not kept, and measured again.
+        Return how often a place was not kept: it is measured again once, and then skipped.
         """
         with subprocess.Popen(
             [str(ERA), "measure", *map(str, arguments)],
@@ -94,12 +94,14 @@ class Desk:
             while letter := process.stderr.read(1):
                 said += letter
                 if said.endswith("then Enter: "):
-                    self._change({"sensor": said.rpartition("sensor at ")[2].split(",")[0]})
-                    process.stdin.write("q\n" if said.count(_AGAIN) > _REPEATS else "\n")
+                    place = said.rpartition("sensor at ")[2].split(",")[0]
+                    self._change({"sensor": place})
+                    is_refused = said.count(f"{place} is not kept") >= _TRIES
+                    process.stdin.write("s\n" if is_refused else "\n")
                     process.stdin.flush()
-        if process.returncode or said.count(_AGAIN) > _REPEATS:
+        if process.returncode:
             raise RuntimeError(f"era measure: status {process.returncode}: {said}")
-        return said.count(_AGAIN)
+        return said.count(" is not kept: ")
 
     def _change(self, what: Mapping[str, object]) -> None:
         self._say(what)

@@ -57,7 +57,7 @@ _SETTLING, _WINDOW = 0.5, 0.4  # s
 
 @dataclass(frozen=True)
 class Played:
-    """A board through JACK: what came of it, seconds of its measurement, places measured again.
+    """A board through JACK: what came of it, seconds of its measurement, places it did not keep.
 
     xruns: blocks that the server lost.
     """
@@ -171,7 +171,7 @@ def summary(found: Sequence[Played]) -> str:
     return (
         f"{table([each.outcome for each in found])}\n\n"
         f"Measured in {min(seconds):.0f} to {max(seconds):.0f} s a board; "
-        f"{sum(each.repeated for each in found)} places measured again; "
+        f"{sum(each.repeated for each in found)} places not kept at once; "
         f"{sum(each.xruns for each in found)} blocks lost by the server."
     )
 
@@ -196,6 +196,8 @@ def main() -> None:
         print(summary(found[-1:]), flush=True)
         RESULTS.parent.mkdir(exist_ok=True)
         RESULTS.write_text(json.dumps([asdict(each) for each in found]), "utf-8")
+    if not found:
+        sys.exit(1)
     text = summary(found)
     print(f"\n{text}")
     if options.report:

@@ -37,6 +37,7 @@ class Desk:
     ) -> None:
         self.folder, self.environment = folder, dict(environment)
         self._plate = plate
+        self._said = self._answered = 0
 
     def run(self, *arguments: object, status: int | None = 0) -> dict[str, Any]:
         """Run an `era` command with --json; None: any exit status. Raises RuntimeError."""
@@ -111,12 +112,16 @@ class Desk:
         assert self._plate.stdin is not None
         self._plate.stdin.write(json.dumps(what) + "\n")
         self._plate.stdin.flush()
+        self._said += 1
 
     def _answer(self) -> None:
-        """Wait until the plate has done what was said; raises RuntimeError where it has ended."""
+        """Wait until the plate has done all that was said; raises RuntimeError if it has ended."""
         assert self._plate.stdout is not None
-        if not self._plate.stdout.readline():
-            raise RuntimeError(f"the plate ended: {(self.folder / 'desk.log').read_text('utf-8')}")
+        while self._answered < self._said:
+            if not self._plate.stdout.readline():
+                log = (self.folder / "desk.log").read_text("utf-8", "replace")
+                raise RuntimeError(f"the plate ended: {log}")
+            self._answered += 1
 
     @property
     def truth(self) -> dict[str, Any]:
@@ -131,11 +136,12 @@ def desk(
     *,
     seed: int,
     mesh: str = "8x6 Q3",
+    block: int = BLOCK,
     rig: str | None = None,
     sensors: str | None = None,
     options: Sequence[str] = (),
 ) -> Iterator[Desk]:
-    """A desk with a plate of its own; seed: of its deviations.
+    """A desk with a plate of its own; seed: of its deviations; block: frames of the server's.
 
     rig, sensors: content of other files than the example's; options: further ones of the plate.
     """
@@ -150,7 +156,7 @@ def desk(
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
     given = (EXAMPLES / "sensors.csv").read_text("utf-8") if sensors is None else sensors
     (folder / "sensors.csv").write_text(given, "utf-8")
-    server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
+    server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(block), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     plate += options
     with contextlib.ExitStack() as stack:

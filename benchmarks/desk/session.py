@@ -22,7 +22,7 @@ RATE, BLOCK = 48_000, 128
 _START = 60.0  # s; on a busy machine
 _END = 20.0  # s
 _COMMAND = 900.0  # s
-_AGAIN, _REPEATS = "is not kept", 12  # said of a place; at most
+_TRIES = 2  # of a place
 
 Place = tuple[float, float]
 
@@ -37,6 +37,7 @@ class Desk:
     ) -> None:
         self.folder, self.environment = folder, dict(environment)
         self._plate = plate
+        self._said = self._answered = 0
 
     def run(self, *arguments: object, status: int | None = 0) -> dict[str, Any]:
         """Run an `era` command with --json; None: any exit status. Raises RuntimeError."""
@@ -76,7 +77,7 @@ class Desk:
     def measure_by_moving(self, *arguments: object) -> int:
         """Run `era measure` with one sensor, which is moved as it says; raises RuntimeError.
 
-        Return how often a place was not kept, and measured again.
+        Return how often a place was not kept: it is measured again once, and then skipped.
         """
         with subprocess.Popen(
             [str(ERA), "measure", *map(str, arguments)],
@@ -94,12 +95,14 @@ class Desk:
             while letter := process.stderr.read(1):
                 said += letter
                 if said.endswith("then Enter: "):
-                    self._change({"sensor": said.rpartition("sensor at ")[2].split(",")[0]})
-                    process.stdin.write("q\n" if said.count(_AGAIN) > _REPEATS else "\n")
+                    place = said.rpartition("sensor at ")[2].split(",")[0]
+                    self._change({"sensor": place})
+                    is_refused = said.count(f"{place} is not kept") >= _TRIES
+                    process.stdin.write("s\n" if is_refused else "\n")
                     process.stdin.flush()
-        if process.returncode or said.count(_AGAIN) > _REPEATS:
+        if process.returncode:
             raise RuntimeError(f"era measure: status {process.returncode}: {said}")
-        return said.count(_AGAIN)
+        return said.count(" is not kept: ")
 
     def _change(self, what: Mapping[str, object]) -> None:
         self._say(what)
@@ -109,12 +112,16 @@ class Desk:
         assert self._plate.stdin is not None
         self._plate.stdin.write(json.dumps(what) + "\n")
         self._plate.stdin.flush()
+        self._said += 1
 
     def _answer(self) -> None:
-        """Wait until the plate has done what was said; raises RuntimeError where it has ended."""
+        """Wait until the plate has done all that was said; raises RuntimeError if it has ended."""
         assert self._plate.stdout is not None
-        if not self._plate.stdout.readline():
-            raise RuntimeError(f"the plate ended: {(self.folder / 'desk.log').read_text('utf-8')}")
+        while self._answered < self._said:
+            if not self._plate.stdout.readline():
+                log = (self.folder / "desk.log").read_text("utf-8", "replace")
+                raise RuntimeError(f"the plate ended: {log}")
+            self._answered += 1
 
     @property
     def truth(self) -> dict[str, Any]:
@@ -129,11 +136,12 @@ def desk(
     *,
     seed: int,
     mesh: str = "8x6 Q3",
+    block: int = BLOCK,
     rig: str | None = None,
     sensors: str | None = None,
     options: Sequence[str] = (),
 ) -> Iterator[Desk]:
-    """A desk with a plate of its own; seed: of its deviations.
+    """A desk with a plate of its own; seed: of its deviations; block: frames of the server's.
 
     rig, sensors: content of other files than the example's; options: further ones of the plate.
     """
@@ -148,7 +156,7 @@ def desk(
     (folder / "rig.yaml").write_text(text.replace("/tmp/plate", str(link)), "utf-8")
     given = (EXAMPLES / "sensors.csv").read_text("utf-8") if sensors is None else sensors
     (folder / "sensors.csv").write_text(given, "utf-8")
-    server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(BLOCK), "-r", str(RATE)]
+    server = ["jackd", "-n", name, "-S", "-r", "-d", "dummy", "-p", str(block), "-r", str(RATE)]
     plate = [*PLATE, "--seed", seed, "--mesh", mesh, "--truth", "truth.json", "--until-eof"]
     plate += options
     with contextlib.ExitStack() as stack:

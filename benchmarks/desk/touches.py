@@ -40,7 +40,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
     places = {row["sensor"]: (float(row["x_m"]), float(row["y_m"])) for row in rows}
     inputs = {row["sensor"]: int(row["input"]) - 1 for row in rows}
     found = []
-    with playing(desk, level_db_sl=30) as era:
+    with playing(desk, level_db_sl=30) as era, era.armed("desk", lease_s=60):
         card = open_card("jack:desk", outputs=0, inputs=max(inputs.values()) + 1, limit=0)
         for names in sets:
             target, *quiet = (places[name] for name in names)
@@ -70,7 +70,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
 
 @contextlib.contextmanager
 def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
-    """Software amplifier and daemon, which play what is calibrated and in the table, armed."""
+    """Software amplifier and daemon, which play what is calibrated and in the table once armed."""
     socket = desk.folder / "era.sock"
     config = (
         f"rig: calibrated.yaml\ntable: table.npz\nsocket: era.sock\nlevel_db_sl: {level_db_sl}\n"
@@ -87,7 +87,6 @@ def playing(desk: Desk, *, level_db_sl: float) -> Iterator[Client]:
         running(stack, daemon, desk.folder, desk.environment, log)
         era = stack.enter_context(connected(socket))
         until_ready(era)
-        stack.enter_context(era.armed("desk", lease_s=60))
         yield era
 
 

@@ -15,14 +15,14 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.desk.session import Desk, desk
-from benchmarks.desk.touches import REPEAT, hold, playing, sizes
+from benchmarks.desk.touches import REPEAT, hold, playing, sizes, until_ready
 from benchmarks.desk_plate.lifted_blocks import SAMPLES
 from benchmarks.desk_plate.truth import as_built
 from benchmarks.page import write_parts
@@ -42,6 +42,7 @@ from benchmarks.weekend.chain import (
     table,
 )
 from controller.api.client import Client
+from controller.api.client_protocol import LeaseLost
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
 from model.finger.fingertip import fingertips_on
@@ -49,6 +50,8 @@ from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
 
 RESULTS = ROOT / "out" / "weekend_through_jack.json"
+BLOCK = 512
+"""Frames: the most that an amplifier may take, for a machine that does other things, too."""
 MESH = "13x11 Legendre"
 """Of the board in time: not that of the rig."""
 _LEVEL = 0.2  # of a measurement: more clips the sensor
@@ -57,14 +60,15 @@ _SETTLING, _WINDOW = 0.5, 0.4  # s
 
 @dataclass(frozen=True)
 class Played:
-    """A board through JACK: what came of it, seconds of its measurement, places measured again.
+    """A board through JACK: what came of it, seconds of its measurement, places it did not keep.
 
-    xruns: blocks that the server lost.
+    lost: touches that the daemon broke off, and which were repeated; xruns: of the server.
     """
 
     outcome: Outcome
     measure_s: float
     repeated: int
+    lost: int
     xruns: int
 
 
@@ -83,6 +87,7 @@ def played(number: int, count: int) -> Played:
             folder,
             seed=number,
             mesh=MESH,
+            block=BLOCK,
             rig=(FOLDER / "rig.yaml").read_text("utf-8"),
             sensors=(FOLDER / "places.csv").read_text("utf-8"),
             options=["--y-cable", "--built", "built.yaml"],
@@ -99,14 +104,20 @@ def played(number: int, count: int) -> Played:
                 "table", "build", "calibrated.yaml", "-o", "table.npz", "--mode", "phased",
                 "--frequencies", f"{low:g}:{high:g}:10",
             )  # fmt: skip
-            found = []
             drawn = [*random_fingers(rig, number, count)]
-            for fingers, (promised, felt) in zip(drawn, _felt(board, rig, drawn), strict=True):
-                best = _with_lags(built).contrast(fingers.query(exact), fingers.factors)
-                was = promised_by(fingers.query(bought))
-                found.append(Touch(len(fingers.quiet), was, promised, felt, best))
+            felt, lost = _felt(board, rig, drawn)
             xruns = board.log_count("XRun")
-    return Played(Outcome(number, tuple(found)), measure_s, repeated, xruns)
+    real = _with_lags(built)
+    touches = tuple(
+        Touch(
+            len(each.quiet),
+            promised_by(each.query(bought)),
+            *pair,
+            real.contrast(each.query(exact), each.factors),
+        )
+        for each, pair in zip(drawn, felt, strict=True)
+    )
+    return Played(Outcome(number, touches), measure_s, repeated, lost, xruns)
 
 
 def _with_lags(built: BuiltBoard) -> BuiltBoard:
@@ -127,22 +138,31 @@ def _with_lags(built: BuiltBoard) -> BuiltBoard:
     return replace(built, rig=replace(built.rig, eras=eras))
 
 
-def _felt(board: Desk, rig: Rig, drawn: Sequence[Fingers]) -> Iterator[tuple[float, float]]:
-    """Yield the contrast promised to touches, and felt [dB]."""
+def _felt(board: Desk, rig: Rig, drawn: Sequence[Fingers]) -> tuple[list[tuple[float, float]], int]:
+    """Contrast promised to touches, and felt [dB]; how many were broken off, and done again."""
+    found: list[tuple[float, float]] = []
+    lost = 0
     with playing(board, level_db_sl=LEVEL_DB_SL) as era:
-        for fingers in drawn:
+        while len(found) < len(drawn):
+            fingers = drawn[len(found)]
             places = [fingers.target, *fingers.quiet]
             board.touch_plate(
                 [(*at, load) for at, load in zip(places, fingers.factors.tolist(), strict=True)]
             )
-            status = hold(era, [*fingers.quiet, fingers.target], _SETTLING)
-            yield _contrast_promised(status), _contrast_felt(board, era, rig, places, status)
-            era.touch([])
-
-
-def _contrast_promised(status: StatusResult) -> float:
-    assert status.promised_contrast_db is not None
-    return status.promised_contrast_db
+            try:
+                with era.armed("weekend", lease_s=60):
+                    status = hold(era, [*fingers.quiet, fingers.target], _SETTLING)
+                    assert status.promised_contrast_db is not None
+                    felt = _contrast_felt(board, era, rig, places, status)
+                    found.append((status.promised_contrast_db, felt))
+                    era.touch([])
+            except LeaseLost as problem:
+                print(problem, file=sys.stderr, flush=True)
+                lost += 1
+                if lost > len(drawn):
+                    raise RuntimeError("more touches are broken off than played") from problem
+                until_ready(era)
+    return found, lost
 
 
 def _contrast_felt(
@@ -159,8 +179,8 @@ def _contrast_felt(
         era.touch([*places[1:], places[0]])
         time.sleep(REPEAT)
     felt: FloatArray = board.felt()
-    size = {"length": rig.plate.length, "width": rig.plate.width}
-    _, weights = fingertips_on(np.array(places), **size)
+    plate = rig.plate
+    _, weights = fingertips_on(np.array(places), length=plate.length, width=plate.width)
     found = sizes(felt.reshape(len(felt), -1), status, 48_000 / SAMPLES)
     return felt_contrast(found.reshape(felt.shape[1:]), weights)
 
@@ -171,8 +191,9 @@ def summary(found: Sequence[Played]) -> str:
     return (
         f"{table([each.outcome for each in found])}\n\n"
         f"Measured in {min(seconds):.0f} to {max(seconds):.0f} s a board; "
-        f"{sum(each.repeated for each in found)} places measured again; "
-        f"{sum(each.xruns for each in found)} blocks lost by the server."
+        f"{sum(each.repeated for each in found)} places not kept at once; "
+        f"{sum(each.lost for each in found)} touches broken off and repeated; "
+        f"{sum(each.xruns for each in found)} blocks that the server had late."
     )
 
 
@@ -196,6 +217,8 @@ def main() -> None:
         print(summary(found[-1:]), flush=True)
         RESULTS.parent.mkdir(exist_ok=True)
         RESULTS.write_text(json.dumps([asdict(each) for each in found]), "utf-8")
+    if not found:
+        sys.exit(1)
     text = summary(found)
     print(f"\n{text}")
     if options.report:

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
-from benchmarks.desk_plate.truth import draw_truth
+from benchmarks.desk_plate.truth import as_built, draw_truth
 from desk_card import DeskCard
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
@@ -72,6 +72,22 @@ def test_exciters_in_time_are_those_of_the_direct_solution(board: Rig) -> None:
         exact[:, number] *= actuator.response(FREQUENCIES)[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     assert wrong.max() < 0.005
+
+
+def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
+    """Each exciter has the gain of its file amid the band, but for a lag that all have alike."""
+    gains = {"SW": (1.2, 0.1), "SE": (0.8, -0.15), "NE": (1.0, 0.0), "NW": (0.9, 0.2)}
+    eras = [replace(era, gains=((100.0, *gains[era.name]),)) for era in board.eras]
+    truth = as_built(replace(board, eras=tuple(eras)), mesh=MESH)
+    assert truth.rig.plate == board.plate
+    assert [replace(era, gains=()) for era in eras] == [*truth.rig.eras]
+    middle = np.array([np.sqrt(40.0 * 300.0)])
+    found = np.array([each.response(middle)[0] for each in truth.actuators])
+    wanted = np.array([size * np.exp(1j * phase) for size, phase in gains.values()])
+    lag = found / wanted
+    np.testing.assert_allclose(lag, lag[0], rtol=1e-12)
+    assert abs(lag[0]) == pytest.approx(1)
+    assert -0.3 < np.angle(lag[0]) < 0
 
 
 def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: Path) -> None:

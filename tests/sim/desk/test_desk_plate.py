@@ -1,5 +1,6 @@
 """The plate on a desk against a direct solution, and identified behind its sound card."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.errors import InputError
+from model.finger.fingertip import fingertips_on
 from model.identification.identify import identify
 from model.identification.measurement import MeasuredPlate
 from model.rig.rig import Rig
@@ -53,6 +55,36 @@ def test_model_agrees_with_the_direct_solution(
         exact[:, number] *= moved[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     assert wrong.max() < 0.005
+
+
+def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
+    """At all points of fingertips whose loads differ, as the direct solution of the loaded plate.
+
+    What differs is damping, viscous here and hysteretic there.
+    """
+    rig, factors, frequency = truth.rig, [0.6, 1.7], 233.0
+    sensors = [WiredSensor("P1", 0.03, 0.05, 1, 1e-3)]
+    desk = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
+    desk.set_fingers(FINGERS, factors)
+    played = np.zeros((48_000, 5))
+    played[:, 1] = np.sin(2 * np.pi * frequency * np.arange(len(played)) / RATE)
+    desk.advance(played[:38_400])
+    desk.begin_feeling()
+    desk.advance(played[38_400:])
+    felt = desk.felt()
+    points, _ = fingertips_on(np.array(FINGERS), length=rig.plate.length, width=rig.plate.width)
+    assert felt.shape == (600, *points.shape[:2])
+    loads = [
+        replace(each, fingertip=each.fingertip.multiplied(factor))
+        for each, factor in zip(fingertip_loads(rig.fingertip, FINGERS), factors, strict=True)
+    ]
+    direct = direct_responder(rig.plate, rig.mesh)
+    places, hertz = points.reshape(-1, 2), np.array([frequency])
+    exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
+    exact = exact * truth.actuators[1].response(hertz)
+    times = (38_400 + 16 * np.arange(len(felt))) / RATE
+    found = phasors(felt.reshape(len(felt), -1), times, frequency)
+    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
 
 
 def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:

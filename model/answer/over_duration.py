@@ -27,6 +27,7 @@ from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import rise
 from model.transients.knots import RISE
 from model.transients.loaded_envelopes import enveloped_accelerations
+from model.transients.swings import DECAYED, Swing
 
 ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
@@ -52,6 +53,10 @@ _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 _RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
 _TINY = 1e-30
 
+CLICKS_APART = 0.060
+"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
+one."""
+
 _LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
 
 
@@ -62,6 +67,17 @@ def pulse_ramp(duration: float) -> float:
     (median) stronger than the first 40, along a ramp of half of it 1.5, as long as it 3 dB.
     """
     return min(ONSET_RAMP, duration / 4)
+
+
+def swing_of_pulse(duration: float, ramp: float) -> Swing:
+    """Return the swing of pulses of a duration along plain ramps [s], one after the other.
+
+    Of a long one its first SHAPED_FROM: by then the onset has decayed as far as the end will.
+    """
+    of_pulse = DriveEnvelope.of_pulse(duration, ramp)
+    rings = [0.0] * math.ceil(DECAYED / of_pulse.step)
+    shares = (0.0, *of_pulse.values.tolist(), *rings)
+    return Swing(shares, of_pulse.step, max(duration, CLICKS_APART))
 
 
 def shaped_gain(duration: float) -> float:

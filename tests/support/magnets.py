@@ -72,9 +72,7 @@ class Magnets:
 
     def __init__(self, rig: Rig) -> None:
         eras, places = rig.eras, footprints_of(rig.eras, rig.masses)
-        reduced = reduce_plate(
-            rig.plate, rig.mesh, places, frequency_max=rig.limits.frequency_max
-        )
+        reduced = reduce_plate(rig.plate, rig.mesh, places, frequency_max=rig.limits.frequency_max)
         shapes = reduced.at(places)
         M, C, K = modal_matrices(reduced, eras, loads=rig.masses, attachment_shapes=shapes)
         r, count, inverse = len(K), len(eras), np.linalg.inv(M)

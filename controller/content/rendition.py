@@ -128,8 +128,8 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     remarks = list(pattern.remarks)
     if close:
         remarks.append(
-            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * CLICKS_APART:.0f} ms "
-            "from a stronger one: left to what lasts"
+            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * CLICKS_APART:.0f} "
+            "ms from a stronger one: left to what lasts"
         )
     course, band, modulation = None, _band(MIN_HZ, frequencies), None
     if highest := float(shares.max()):

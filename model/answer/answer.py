@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.answer.fingers import ANY_BAND, Finger, Placement
-from model.answer.over_duration import ONSET_RAMP, pulse_ramp, swing_of_pulse
+from model.answer.over_duration import ONSET_RAMP, pulse_ramp, swings_of_pulse
 from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
@@ -274,7 +274,7 @@ class Answer:
             if stream.course is not None:
                 swings = stream.course.swings
             elif duration is not None:
-                swings = (swing_of_pulse(duration, ramp),)
+                swings = swings_of_pulse(duration, ramp)
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(

@@ -11,7 +11,7 @@ weights are searched and drawn plates judged.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import fft
@@ -53,6 +53,9 @@ _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 _RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
 _TINY = 1e-30
 
+FADE_RAMP = 0.020
+"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
+
 CLICKS_APART = 0.060
 """Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
 one."""
@@ -69,15 +72,22 @@ def pulse_ramp(duration: float) -> float:
     return min(ONSET_RAMP, duration / 4)
 
 
-def swing_of_pulse(duration: float, ramp: float) -> Swing:
-    """Return the swing of pulses of a duration along plain ramps [s], one after the other.
+@lru_cache
+def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
+    """Return the swings of pulses of a duration one after the other, along plain ramps [s].
 
-    Of a long one its first SHAPED_FROM: by then the onset has decayed as far as the end will.
+    They end along their own, or along that of contents that end. Of a long one its first
+    SHAPED_FROM: by then the onset has decayed as far as the end will.
     """
-    of_pulse = DriveEnvelope.of_pulse(duration, ramp)
-    rings = [0.0] * math.ceil(DECAYED / of_pulse.step)
-    shares = (0.0, *of_pulse.values.tolist(), *rings)
-    return Swing(shares, of_pulse.step, max(duration, CLICKS_APART))
+    length = min(duration, SHAPED_FROM)
+    count = math.ceil((length + DECAYED) / _PULSE_STEP)
+    times = np.asarray(_PULSE_STEP * np.arange(count), dtype=float)
+    shares = [
+        rise(times, ramp) - rise(np.asarray(times - length), end) for end in (ramp, FADE_RAMP)
+    ]
+    again = max(duration, CLICKS_APART)
+    one, other = (Swing(tuple(each.tolist()), _PULSE_STEP, again) for each in shares)
+    return one, other
 
 
 def shaped_gain(duration: float) -> float:

@@ -27,7 +27,7 @@ from model.transients.time_response import PlateInTime, plate_in_time
 
 _STEP = 0.0005  # s
 _AFTER = 20  # steps after the last knot
-_KEPT, _SWINGS_KEPT = 16, 64
+_KEPT, _SWINGS_KEPT = 16, 256
 _CHECKED = 1.0  # Hz between frequencies of a rig that are checked
 
 

@@ -14,6 +14,7 @@ from controller.content.pattern import Pattern, Transient, along
 from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
+from model.answer.over_duration import CLICKS_APART
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.perception import decibels
@@ -31,7 +32,6 @@ CLICK_DURATION, DUCKING = 0.040, 0.030
 SMOOTHING = 0.020
 """Width at half height [s] of the raised cosine over which courses beside others are averaged."""
 
-_APART = 0.060  # s; between the starts of clicks at least, as at different fingers
 _BAND = 0.1  # on each side of a frequency
 _WIDER = 2 ** (1 / 3) / (1 + _BAND)  # beside others: to a third of an octave on each side
 _MIN_FREQUENCIES = 3  # of a table in a band: an exact one costs 10 dB of contrast on four ERAs
@@ -128,8 +128,8 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
     remarks = list(pattern.remarks)
     if close:
         remarks.append(
-            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * _APART:.0f} ms from "
-            "a stronger one: left to what lasts"
+            f"{len(close)} of {len(close) + len(taps)} taps, less than {1000 * CLICKS_APART:.0f} "
+            "ms from a stronger one: left to what lasts"
         )
     course, band, modulation = None, _band(MIN_HZ, frequencies), None
     if highest := float(shares.max()):
@@ -206,7 +206,7 @@ def _apart(pattern: Pattern) -> list[Transient]:
         at = bisect_left(times, tap.time)
         around = times[max(at - 1, 0) : at + 1]
         apart = min((abs(tap.time - each) for each in around), default=np.inf)
-        if tap.intensity > 0 and apart >= _APART - _ROUNDING:
+        if tap.intensity > 0 and apart >= CLICKS_APART - _ROUNDING:
             kept.insert(at, tap)
             times.insert(at, tap.time)
     return kept

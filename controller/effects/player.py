@@ -11,6 +11,7 @@ from controller.effects.region import Region
 from controller.effects.strengths import Strengths
 from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.answer.over_duration import CLICKS_APART
 from registry.plugins import WrongResultError
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
@@ -19,9 +20,6 @@ _NOISE = 0.001
 
 REQUESTED_PRIORITY = 1_000_000
 """Priority of an effect requested by name, above all regions."""
-
-CLICKS_APART = 0.060
-"""Pause [s] between the starts of short pulses at two fingers: together they would be one."""
 
 CLICK_ABOVE_DB, NOTICED_ABOVE_DB = 6.0, 3.0
 """Level [dB] of a short pulse above what lasts at its finger: where a layout gives it none, and

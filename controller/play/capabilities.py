@@ -15,14 +15,13 @@ from controller.play.pieces import MAX_STEP
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.protocol.table import MAX_WORDS, QUANTITIES
-from model.answer.answer import Limits, amplitudes_of
+from model.answer.answer import Layer, Limits, amplitudes_of
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
-from model.vibration.excitation import Excitation
 
 MAX_SET_TIME, MAX_PIECE_TIME = 0.010, 0.020
 """How long [s] a set may take on its wire, so that its onset does not delay a touch, and one that
@@ -64,9 +63,10 @@ class PlaybackCapabilities:
     layers: int = 1
     course_knots: int = 0
 
-    def left_by(self, excitations: Sequence[Excitation], table: LocalizationTable) -> Self:
-        """Return what excitations leave of the limits, their peaks together."""
-        taken, strokes = amplitudes_of(excitations), table.full_levels
+    def left_by(self, layers: Sequence[Layer], table: LocalizationTable) -> Self:
+        """Return what layers leave of the limits, their peaks together."""
+        drives = [each for layer in layers for each in layer.drives]
+        taken, strokes = amplitudes_of([each for each, _ in drives]), table.full_levels
         levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
         limits = self.limits
         left = replace(
@@ -76,7 +76,7 @@ class PlaybackCapabilities:
                 for name, highest in (limits.amplitudes or strokes).items()
             },
             power=max(math.sqrt(limits.power) - math.hypot(*levels), 1e-9) ** 2,
-            excursion=max(limits.excursion - table.excursion_of(excitations), 1e-9),
+            excursion=max(limits.excursion - table.excursion_of(drives), 1e-9),
         )
         return replace(self, limits=left)
 

@@ -132,7 +132,7 @@ class Chooser:
             if finger in free.target_keys and one not in pulses
         ]
         left = self._left_by([*pulses, *fading], capabilities)
-        total = [each.layer.excitation for each in free.contents]
+        total = [each.layer for each in free.contents]
         if left.limits.factor_within(total, self.table) >= 1 - NEARLY:
             return free, False
         limited = self._chosen(requested, targets, left)
@@ -159,8 +159,7 @@ class Chooser:
         """Return what contents leave of the amplifiers' limits."""
         if not contents:
             return capabilities
-        taken = [each.layer.excitation for each in contents]
-        return capabilities.left_by(taken, self.table)
+        return capabilities.left_by([each.layer for each in contents], self.table)
 
     def _chosen(
         self,

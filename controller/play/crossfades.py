@@ -134,7 +134,7 @@ class Crossfades:
             for each in playing.values()
         ):
             return False
-        total = [one.layer.excitation for one in (*beside, *voices)]
+        total = [one.layer for one in (*beside, *voices)]
         return self.capabilities.limits.factor_within(total, self.table) >= 1 - NEARLY
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:

@@ -21,7 +21,6 @@ from controller.play.layer_content import LayerContent
 from controller.play.pieces import HELD, PLAIN_STEP
 from controller.play.routing import (
     BESIDE_CLICK,
-    FADE_RAMP,
     Drive,
     PlateLayer,
     SetBuilder,
@@ -34,6 +33,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
+from model.answer.over_duration import FADE_RAMP
 from model.answer.timing import Timing
 from model.rig.rig import Rig
 

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.play.intent import Pulse
-from model.answer.course import Course
+from model.answer.course import KNOT_STEP, Course
 
-STEP, PLAIN_STEP = 0.010, 0.050
-"""Time [s] between knots, which is the delay of a course; and of ramps, where amplifiers have no
-knots, of which each is a set of its own."""
+PLAIN_STEP = 0.050
+"""Time [s] of ramps, where amplifiers have no knots, of which each is a set of its own."""
 
 HELD = 0.1
 """How long [s] a layer lasts beyond its last piece: if no other comes by then it ends by itself."""
@@ -56,7 +55,7 @@ def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first
     if not knots:
         step, count = PLAIN_STEP, 1
     else:
-        least = _AMID if is_first and since > 0 else STEP
+        least = _AMID if is_first and since > 0 else KNOT_STEP
         count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
         step = max(least, _SHORTEST / count)
         left = min((pulse.duration - since) / step, count)

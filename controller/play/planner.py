@@ -14,13 +14,13 @@ from controller.play.content import Prediction, Selection, no_layer_free
 from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import IntentSource, Pulse
 from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
-from controller.play.routing import FADE_RAMP
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.timing import HEARTBEAT
 from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
+from model.answer.over_duration import FADE_RAMP
 from model.answer.plan import prepare_answers, query
 from model.answer.timing import Timing
 from model.rig.rig import Rig

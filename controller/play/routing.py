@@ -21,6 +21,7 @@ from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
 from model.answer.fingers import Placement
+from model.answer.over_duration import FADE_RAMP
 from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -32,9 +33,6 @@ Drive = Mapping[str, Tone]
 
 PlateLayer = Mapping[str, Layer]
 """What one layer plays on every amplifier, by name."""
-
-FADE_RAMP = 0.020
-"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
 
 BESIDE_CLICK = 0.100
 """Fade-out [s] beside a short pulse, below which a shorter one would be felt with it."""

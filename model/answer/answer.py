@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.answer.fingers import ANY_BAND, Finger, Placement
-from model.answer.over_duration import ONSET_RAMP, pulse_ramp
+from model.answer.over_duration import ONSET_RAMP, pulse_ramp, swings_of_pulse
 from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
@@ -19,6 +19,7 @@ from model.finger.perception import decibels
 from model.structure.attachments import Source
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes
+from model.transients.swings import Swing
 from model.vibration.excitation import Excitation
 
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
@@ -83,7 +84,8 @@ class Layer:
     """What is played at once for the fingers of one vibration, by number.
 
     excitation: of all ERAs; side_bands: excitations beside it where its strength comes and goes;
-    ramp [s]; onset, ending: envelopes that replace it; contrast_to_plate_db: level above that of
+    ramp [s]; onset, ending: envelopes that replace it; swings: ways in which its level comes and
+    goes, without any it lasts; contrast_to_plate_db: level above that of
     the plate farther than 50 mm, root mean square, where no other finger is there.
     """
 
@@ -95,6 +97,7 @@ class Layer:
     ending: Envelopes | None = None
     drive_mode: str = UNRESTRICTED
     contrast_to_plate_db: float | None = None
+    swings: tuple[Swing, ...] = ()
 
     @property
     def frequency(self) -> float | None:
@@ -108,10 +111,21 @@ class Layer:
         return (self.excitation, *self.side_bands)
 
     @property
+    def drives(self) -> list[tuple[Excitation, tuple[Swing, ...]]]:
+        """The same, each with the swings of its level."""
+        return [(each, self.swings) for each in self.excitations]
+
+    @property
     def voices(self) -> tuple["Layer", ...]:
         """It without side bands, and each of them as a layer, along its ramp."""
         beside = [
-            Layer(each, self.fingers, ramp=self.ramp, drive_mode=self.drive_mode)
+            Layer(
+                each,
+                self.fingers,
+                ramp=self.ramp,
+                drive_mode=self.drive_mode,
+                swings=self.swings,
+            )
             for each in self.side_bands
         ]
         return (replace(self, side_bands=()), *beside)
@@ -151,12 +165,13 @@ class Limits:
     slew: float = math.inf
     excursion: float = 1.0
 
-    def factor_within(self, excitations: Sequence[Excitation], table: LocalizationTable) -> float:
-        """Return the factor, 1 at most, by which excitations of a table are within together."""
-        share, power = table.excursion_of(excitations) / self.excursion, 0.0
+    def factor_within(self, layers: Sequence[Layer], table: LocalizationTable) -> float:
+        """Return the factor, 1 at most, by which layers of a table are within together."""
+        drives = [each for layer in layers for each in layer.drives]
+        share, power = table.excursion_of(drives) / self.excursion, 0.0
         strokes = table.full_levels
         highest = self.amplitudes or strokes
-        for name, amplitude in amplitudes_of(excitations).items():
+        for name, amplitude in amplitudes_of([each for each, _ in drives]).items():
             share = max(share, amplitude / highest[name])
             power += (amplitude / strokes[name]) ** 2
         return 1.0 / max(1.0, share, math.sqrt(power / self.power))
@@ -254,17 +269,24 @@ class Answer:
                 sides = []
             is_plain = not self.contents.is_shaped and stream.course is None
             duration = stream.duration if is_plain else None
+            ramp = ONSET_RAMP if duration is None else max(pulse_ramp(duration), least)
+            swings: tuple[Swing, ...] = ()
+            if stream.course is not None:
+                swings = stream.course.swings
+            elif duration is not None:
+                swings = swings_of_pulse(duration, ramp)
             onset, ending = self.envelopes[number] if self.envelopes else (None, None)
             layers.append(
                 Layer(
                     excitation,
                     stream.targets,
                     tuple(sides),
-                    ONSET_RAMP if duration is None else max(pulse_ramp(duration), least),
+                    ramp,
                     onset,
                     ending,
                     self.contents.drive_mode,
                     None if self.contents.background is None else self._contrast_to_plate_db,
+                    swings,
                 )
             )
         return tuple(layers)

@@ -1,5 +1,6 @@
 """Courses: how strongly a stimulus is felt over its duration, as an envelope of its amplitude."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,8 +8,12 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
+from model.transients.swings import DECAYED, Swing
 
 MAX_POINTS = 20_000
+
+KNOT_STEP = 0.010
+"""Time [s] between the knots along which amplifiers play a course, where wires carry as many."""
 
 STRONGEST = 0.040
 """Time [s] of the strongest moments of a course, by which it is felt."""
@@ -62,6 +67,21 @@ class Course:
         times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
         samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
         return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
+
+    @cached_property
+    def swings(self) -> tuple[Swing, ...]:
+        """It as amplifiers may play it from knot to knot: once, then over and over.
+
+        Where wires carry fewer knots, these are further apart.
+        """
+        return tuple([self._swing(factor * KNOT_STEP) for factor in (1, 2, 4)])
+
+    def _swing(self, step: float) -> Swing:
+        count, rest = (math.ceil(each / step) for each in (self.duration, DECAYED))
+        times = np.asarray(step * np.arange(1, count + rest + 1), dtype=float)
+        once = np.where(times < self.duration, self.at(times), 0.0)
+        anew = self.at(np.mod(times, self.duration))
+        return Swing((0.0, *once.tolist(), *anew.tolist()), step)
 
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""

@@ -11,7 +11,7 @@ weights are searched and drawn plates judged.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import fft
@@ -27,6 +27,7 @@ from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import rise
 from model.transients.knots import RISE
 from model.transients.loaded_envelopes import enveloped_accelerations
+from model.transients.swings import DECAYED, Swing
 
 ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
@@ -52,6 +53,13 @@ _PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
 _RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
 _TINY = 1e-30
 
+FADE_RAMP = 0.020
+"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
+
+CLICKS_APART = 0.060
+"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
+one."""
+
 _LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
 
 
@@ -62,6 +70,24 @@ def pulse_ramp(duration: float) -> float:
     (median) stronger than the first 40, along a ramp of half of it 1.5, as long as it 3 dB.
     """
     return min(ONSET_RAMP, duration / 4)
+
+
+@lru_cache
+def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
+    """Return the swings of pulses of a duration one after the other, along plain ramps [s].
+
+    They end along their own, or along that of contents that end. Of a long one its first
+    SHAPED_FROM: by then the onset has decayed as far as the end will.
+    """
+    length = min(duration, SHAPED_FROM)
+    count = math.ceil((length + DECAYED) / _PULSE_STEP)
+    times = np.asarray(_PULSE_STEP * np.arange(count), dtype=float)
+    shares = [
+        rise(times, ramp) - rise(np.asarray(times - length), end) for end in (ramp, FADE_RAMP)
+    ]
+    again = max(duration, CLICKS_APART)
+    one, other = (Swing(tuple(each.tolist()), _PULSE_STEP, again) for each in shares)
+    return one, other
 
 
 def shaped_gain(duration: float) -> float:

@@ -210,7 +210,7 @@ class _Answering:
             if stream.duration is not None:
                 found = as_ramps_allow(self.table, found, self.limits)
                 break
-        if (factor := self.limits.factor_within(found.excitations, self.table)) >= 1 - NEARLY:
+        if (factor := self.limits.factor_within(found.layers, self.table)) >= 1 - NEARLY:
             return found
         if len(found.contents.streams) > 1:
             gains = gains_within(self.table, found, self.limits)
@@ -221,7 +221,7 @@ class _Answering:
                 )
                 lowered = replace(lowered, asked=self.fingers)
             found = lowered
-            factor = self.limits.factor_within(found.excitations, self.table)
+            factor = self.limits.factor_within(found.layers, self.table)
         return scaled(found, float(decibels(factor))) if factor < 1 else found
 
     @cached_property

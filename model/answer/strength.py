@@ -78,7 +78,7 @@ def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> Flo
     power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
     highest = limits.amplitudes or strokes
     full = amplitudes / [highest[name] for name in strokes]
-    ways = np.array([table.excursion_of(layer.excitations) for layer in found.layers])
+    ways = np.array([table.excursion_of(layer.drives) for layer in found.layers])
     limited = np.column_stack([full, power / math.sqrt(limits.power), ways / limits.excursion])
     streams = found.contents.streams
     promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])

@@ -63,6 +63,7 @@ from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster
 from model.transients.excursions import MagnetMotions
+from model.transients.swings import Swing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration.excitation import Excitation, base_amplitudes
 from registry.limits import GuardLimits
@@ -347,24 +348,32 @@ class LocalizationTable:
         """Share of full level that all actuators may play together in any phases, (f,)."""
         if not self._is_limited:
             return np.ones(len(self.frequencies))
-        return MagnetMotions.of(self.in_time).shares(self.frequencies)
+        return self._magnets.shares(self.frequencies)
+
+    @cached_property
+    def _magnets(self) -> MagnetMotions:
+        """Motions of its exciters' magnets."""
+        return MagnetMotions.of(self.in_time)
 
     @cached_property
     def _is_limited(self) -> bool:
         """Whether an excursion limits what any of its actuators plays."""
         return any(math.isfinite(era.excursion) for era in self.eras)
 
-    def excursion_of(self, excitations: Iterable[Excitation]) -> float:
-        """Part of the magnets' excursion that is kept for excitations, whose parts add.
+    def excursion_of(self, drives: Iterable[tuple[Excitation, Sequence[Swing]]]) -> float:
+        """Part of the magnets' excursion that is kept for drives, whose parts add.
 
-        Of full level the share of each that is strongest in `allowed_shares`; 0 without a limit.
+        Of full level the share of each that is strongest in `allowed_shares`, or in what may swing
+        along the worst of its swings; 0 without a limit.
         """
         if not self._is_limited:
             return 0.0
         parts = dict[tuple[int, float], float]()
-        for number, each in enumerate(excitations):
+        for number, (each, swings) in enumerate(drives):
             for name, tone in each.items():
                 share = float(np.interp(tone.frequency, self.frequencies, self.allowed_shares))
+                for swing in swings:
+                    share = min(share, self._magnets.share_along(tone.frequency, swing))
                 part = tone.amplitude / self.full_levels[name] / share
                 parts[number, tone.frequency] = max(part, parts.get((number, tone.frequency), 0.0))
         return sum(parts.values())

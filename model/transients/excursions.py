@@ -3,7 +3,8 @@
 An onset moves a magnet further than the settled vibration: the free vibration near its own
 resonance beats with the drive. A drive that rises or falls steadily, along whichever ramp, is a
 mean of drives that jump at different times; so it moves a magnet no further than the drive that
-jumps, with which shares of full level are counted. Shaped envelopes rise above their last
+jumps, with which shares of full level are counted; what comes and goes is followed
+(`model.transients.swings`). Shaped envelopes rise above their last
 amplitude: of their difference to a plain ramp as much is kept as magnets allow.
 """
 
@@ -21,11 +22,12 @@ from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
+from model.transients.swings import DECAYED, Swing, motions_along
 from model.transients.time_response import PlateInTime, plate_in_time
 
-_STEP, _FOLLOWED = 0.0005, 0.25  # s; a beat is over by then, or slower than the magnets' decay
+_STEP = 0.0005  # s
 _AFTER = 20  # steps after the last knot
-_KEPT = 16
+_KEPT, _SWINGS_KEPT = 16, 256
 _CHECKED = 1.0  # Hz between frequencies of a rig that are checked
 
 
@@ -54,12 +56,16 @@ class MagnetMotions:
         least: FloatArray = (self.excursions / self.by_jumps(frequencies)).min(axis=1)
         return np.asarray(np.minimum(least, 1.0))
 
+    def share_along(self, frequency: float, swing: Swing) -> float:
+        """Share of full level, 1 at most, that may swing at a frequency [Hz]."""
+        return _share_along(self, frequency, swing)
+
     def by_jumps(self, frequencies: FloatArray) -> FloatArray:
         """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].
 
         Of all together, in those phases in which the motions by each add; without fingers.
         """
-        times = np.arange(0, _FOLLOWED, _STEP)
+        times = np.arange(0, DECAYED, _STEP)
         decays = np.exp(np.outer(times, self.plate.eigenvalues))
         found = []
         for frequency in frequencies.tolist():
@@ -112,6 +118,12 @@ class MagnetMotions:
         by_mode = z.T[:, :, None] * self.rows.T[:, None, :]
         flat = by_mode.reshape(len(by_mode), -1)
         return flat, flat.sum(axis=0)
+
+
+@lru_cache(_SWINGS_KEPT)  # of an answer that is asked for several times
+def _share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float:
+    moved = motions_along(magnets.plate, magnets.rows, frequency, swing)
+    return min(1.0, float((magnets.excursions / moved).min()))
 
 
 @lru_cache(_KEPT)

@@ -53,7 +53,7 @@ class SetDrives:
     def __init__(self) -> None:
         self.full_levels = defaultdict[str, float](lambda: STROKE)
 
-    def excursion_of(self, excitations: Sequence[Excitation]) -> float:
+    def excursion_of(self, drives: Sequence[Any]) -> float:
         """None."""
         return 0.0
 
@@ -181,7 +181,7 @@ def set_answer(
         np.ones(1, np.float32),
     )
     table: Any = SetDrives()
-    factor = limits.factor_within(found.excitations, table)
+    factor = limits.factor_within(found.layers, table)
     return scaled(found, 20 * np.log10(factor)) if factor < 1 else found
 
 

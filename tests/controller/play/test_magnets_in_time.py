@@ -118,7 +118,7 @@ def test_contents_together_keep_magnets_within_their_excursion() -> None:
     largest, every = [], PlaybackCapabilities("phased", ("phased",), Limits(), RAMPS_ONLY)
     for first, second in PLACES:
         one = alone(first, 70.0, Limits(excursion=0.5))
-        other = alone(second, 90.0, every.left_by(one.excitations, table()).limits)
+        other = alone(second, 90.0, every.left_by(one.layers, table()).limits)
         onsets = [layer.onset for layer in (*one.layers, *other.layers) if layer.onset]
         assert len(onsets) == 2
         largest += [furthest(voltages(onsets, phase=phase)) for phase in (1.0, 1j)]

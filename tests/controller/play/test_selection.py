@@ -42,7 +42,7 @@ class Table:
         self.most: float | None = None
         self.error: Exception | None = None
 
-    def excursion_of(self, excitations: Sequence[Excitation]) -> float:
+    def excursion_of(self, drives: Sequence[Any]) -> float:
         """An ERA has no magnet."""
         return 0.0
 

@@ -125,7 +125,7 @@ def test_drive_stays_within_its_limits(limits: Limits, duration: float | None) -
     finger = Finger(TARGET, Stimulus(60.0, duration=duration))
     found = answer(table, [finger], drive_mode="phased", limits=limits)
     strokes = table.full_levels
-    assert limits.factor_within(found.excitations, table) == pytest.approx(1.0, abs=1e-6)
+    assert limits.factor_within(found.layers, table) == pytest.approx(1.0, abs=1e-6)
     used = [
         amplitude / (limits.amplitudes or strokes)[name]
         for name, amplitude in found.amplitudes.items()

@@ -2,37 +2,18 @@
 
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.desk.libjack import JackClient, jack_name
 from sim.desk.soft_amp.output import default_block, sounddevice
 
+Device: TypeAlias = dict[str, Any]
+"""A device for programs; device: what `--device` takes; block_frames: of a block, by default.
 
-@dataclass(frozen=True)
-class Device:
-    """A device; device: what `--device` takes; block_frames: of a block, by default.
-
-    rate_hz: that of the server, which has no other, or the default of a device of PortAudio.
-    """
-
-    device: str
-    host: str
-    name: str
-    outputs: int
-    inputs: int
-    rate_hz: int
-    block_frames: int
-
-    def __str__(self) -> str:
-        """The device in one line."""
-        name = "" if self.name in self.device else f"{self.name}, {self.host}: "
-        return (
-            f"{self.device}: {name}{self.outputs} outputs, {self.inputs} inputs, {self.rate_hz} "
-            f"Hz, blocks of {self.block_frames} frames"
-        )
+rate_hz: that of the server, which has no other, or the default of a device of PortAudio.
+"""
 
 
 def jack_devices() -> Iterator[Device]:
@@ -40,10 +21,15 @@ def jack_devices() -> Iterator[Device]:
     with closing(JackClient("era-list")) as client:
         for name, outputs, inputs in client.clients():
             if outputs + inputs:
-                title = name or "hardware"
-                yield Device(
-                    jack_name(name), "JACK", title, outputs, inputs, client.rate, client.block
-                )
+                yield {
+                    "device": jack_name(name),
+                    "host": "JACK",
+                    "name": name or "hardware",
+                    "outputs": outputs,
+                    "inputs": inputs,
+                    "rate_hz": client.rate,
+                    "block_frames": client.block,
+                }
 
 
 def portaudio_devices() -> Iterator[Device]:
@@ -51,15 +37,15 @@ def portaudio_devices() -> Iterator[Device]:
     library = sounddevice()
     hosts = library.query_hostapis()
     for number, each in enumerate(library.query_devices()):
-        yield Device(
-            str(number),
-            hosts[each["hostapi"]]["name"],
-            each["name"],
-            each["max_output_channels"],
-            each["max_input_channels"],
-            round(each["default_samplerate"]),
-            default_block(),
-        )
+        yield {
+            "device": str(number),
+            "host": hosts[each["hostapi"]]["name"],
+            "name": each["name"],
+            "outputs": each["max_output_channels"],
+            "inputs": each["max_input_channels"],
+            "rate_hz": round(each["default_samplerate"]),
+            "block_frames": default_block(),
+        }
 
 
 def listed_devices() -> tuple[list[str], dict[str, Any]]:
@@ -71,5 +57,12 @@ def listed_devices() -> tuple[list[str], dict[str, Any]]:
             found += devices()
         except (InputError, LinkError) as problem:
             missing.append({"host": host, "reason": str(problem)})
-    rows = [*map(str, found), *(f"no {each['host']}: {each['reason']}" for each in missing)]
-    return rows, {"devices": [asdict(each) for each in found], "missing": missing}
+    rows = [*map(_line, found)]
+    rows += [f"no {each['host']}: {each['reason']}" for each in missing]
+    return rows, {"devices": found, "missing": missing}
+
+
+def _line(each: Device) -> str:
+    name = "" if each["name"] in each["device"] else "{name}, {host}: "
+    line = "{device}: " + name + "{outputs} outputs, {inputs} inputs, {rate_hz} Hz, blocks of "
+    return (line + "{block_frames} frames").format(**each)

@@ -153,17 +153,16 @@ def impedance(
     if "glued" in circuits and weight is not None and base is None:
         lighter = exciter_values(*runs, replace(bench, base=1e-3 * _LIGHT))
         by_light = {name: lighter[name][0] / values[name][0] - 1 for name in values}
-    following = None
-    if output is not None and "measured" in circuits:
-        following = next_line(
-            "era", "measure", FLAG, "--device", str(device), "--free", output, "-o",
-            output.with_stem("glued"), "--weight", "GRAMS", "--series", f"{series:g}",
-        )  # fmt: skip
+    again = next_line(
+        "era", "measure", FLAG, "--device", str(device), "--free", output or "", "-o",
+        (output or Path("free.csv")).with_stem("glued"), "--weight", "GRAMS", "--series",
+        f"{series:g}",
+    )  # fmt: skip
     rows = [
         f"{len(default_lines())} frequencies; wrote {output}" if output else None,
         *_rows(circuits, values, bench),
         *_warnings(circuits, values, by_light),
-        following,
+        again if "measured" in circuits else None,
     ]
     answer = {
         "runs": {

@@ -103,7 +103,10 @@ class JackClient:
         return _names(libjack().jack_get_ports(self.pointer, pattern, _AUDIO, flags))
 
     def first_ports(self, other: str, flag: int, count: int) -> list[str]:
-        """The first of such ports; InputError where there are fewer, NoSound without a card."""
+        """The first of such ports, those that take samples free of other programs.
+
+        Raises InputError where there are fewer, NoSound without a card, LinkError for busy ones.
+        """
         found = self.ports_of(other, flag)
         what = "outputs" if flag == IS_INPUT else "inputs"  # of the other client
         if not found and count and not other:
@@ -115,6 +118,8 @@ class JackClient:
                 f"{did_you_mean(jack_name(other), map(jack_name, known))}list devices with "
                 "era soft-amp --list"
             )
+        if flag == IS_INPUT:
+            self.check_free(found[:count], device=jack_name(other))
         return found[:count]
 
     def clients(self) -> list[tuple[str, int, int]]:
@@ -128,12 +133,6 @@ class JackClient:
             (name, len(self.ports_of(name, IS_INPUT)), len(self.ports_of(name, IS_OUTPUT)))
             for name in names
         ]
-
-    def takers(self, other: str, count: int) -> list[str]:
-        """The first ports of a client that take samples; LinkError where one is played to."""
-        ports = self.first_ports(other, IS_INPUT, count)
-        self.check_free(ports, device=jack_name(other))
-        return ports
 
     def connected_to(self, port: str) -> list[str]:
         """Ports that a port is connected to."""

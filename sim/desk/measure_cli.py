@@ -99,7 +99,7 @@ def measure(
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
     from sim.desk.measuring.desk import Desk
-    from sim.desk.measuring.measure import open_desk
+    from sim.desk.measuring.measure import measure_at_once, open_desk
 
     check_place(output, example="measured.uff")
     check_ending(output, ".uff", ".unv", ".csv", what="measured responses")
@@ -126,7 +126,6 @@ def measure(
 
         rows, answer = measured_from(source, desk, output)
     else:
-        from sim.desk.measuring.at_once import measure_at_once
         from sim.desk.measuring.moved_sensor import measure_by_moving
 
         opened = open_desk(desk, device or "", level=level, frequencies=lines, seed=seed)

@@ -145,21 +145,17 @@ def _place(
 ) -> "AbstractContextManager[Place]":
     from sim.desk.soft_amp.settings import tcp_place, terminal_place
 
-    given = [
-        name
-        for name, is_given in (
-            ("--serial", serial),
-            ("--tcp", tcp is not None),
-            ("--modbus-tcp", modbus_tcp is not None),
-        )
-        if is_given
-    ]
+    ports = {
+        "--serial": 0 if serial else None,
+        "--tcp": tcp,
+        "--modbus-tcp": modbus_tcp,
+    }
+    given = [name for name, port in ports.items() if port is not None]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} exclude each other; give one")
-    if link is not None and given not in ([], ["--serial"]):
+    if given in ([], ["--serial"]):
+        return terminal_place(link)
+    if link is not None:
         raise InputError(f"--link is of a pseudo-terminal; omit it, or {given[0]}")
-    if tcp is not None:
-        return tcp_place(tcp, protocol=Protocol.SERIAL)
-    if modbus_tcp is not None:
-        return tcp_place(modbus_tcp, protocol=Protocol.MODBUS)
-    return terminal_place(link)
+    protocol = Protocol.SERIAL if modbus_tcp is None else Protocol.MODBUS
+    return tcp_place(ports[given[0]] or 0, protocol=protocol)

@@ -83,11 +83,6 @@ class Desk:
         return [sensor.input - 1 for sensor in self.sensors]
 
     @property
-    def full_levels(self) -> FloatArray:
-        """Full level of each ERA: its stroke [m], or volts of an exciter."""
-        return np.array([era.full_level for era in self.rig.eras])
-
-    @property
     def sensitivities(self) -> FloatArray:
         """Sensitivity of each sensor, see `WiredSensor`."""
         return np.array([sensor.sensitivity for sensor in self.sensors])
@@ -99,12 +94,13 @@ class Desk:
 
         looped (f,): of the loop-back.
         """
-        plain = values[:, self.columns, : len(self.full_levels)] / converters(looped)[:, None, None]
+        full = np.array([*self.rig.full_levels.values()])
+        plain = values[:, self.columns, : len(self.eras)] / converters(looped)[:, None, None]
         return Responses(
             tuple(sensor.name for sensor in self.sensors),
             np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
             frequencies,
-            plain.transpose(0, 2, 1) / self.full_levels[:, None] / self.sensitivities,
+            plain.transpose(0, 2, 1) / full[:, None] / self.sensitivities,
             masses=np.array([sensor.mass for sensor in self.sensors]),
         )
 

@@ -1,30 +1,21 @@
 """Responses in plain text while they are measured: a line for each sensor, one screen in all."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 
 from model.arrays import FloatArray
 from model.calibration.sensor_file import WiredSensor
-from sim.desk.measuring.measure import Show
 from sim.desk.measuring.multisine import Multisine
+
+Show = Callable[[Sequence[FloatArray]], None]
+"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
 
 STEPS = "▁▂▃▄▅▆▇█"
 _RANGE = 60.0  # dB from the highest step to the lowest
 _BESIDE = 40  # columns of names and numbers
 _LINES = 5  # of a screen that are not of sensors
-
-
-def levels(multisine: Multisine, recorded: Sequence[FloatArray], columns: list[int]) -> FloatArray:
-    """Root mean square over the runs of response to all sources together, (sensors, f) [dB].
-
-    Relative to a sample by a sample. With all runs it is that over the sources, since the turns of
-    their phases are orthogonal.
-    """
-    found = [multisine.found(each[:, columns]).T for each in recorded]
-    power = (np.abs(found) ** 2).mean(axis=0) / np.abs(multisine.played(0)[:, 0]) ** 2
-    return np.asarray(10 * np.log10(np.maximum(power, 1e-30)))
 
 
 def plot(
@@ -42,7 +33,10 @@ def plot(
     """
     shown = sensors[: max(1, height - _LINES)]
     columns = [sensor.input - 1 for sensor in shown]
-    found = levels(multisine, recorded, columns)
+    heard = np.array([multisine.found(each[:, columns]).T for each in recorded])
+    # To all sources together, a sample by a sample: the turns of their phases are orthogonal.
+    power = (np.abs(heard) ** 2).mean(axis=0) / np.abs(multisine.played(0)[:, 0]) ** 2
+    found = 10 * np.log10(np.maximum(power, 1e-30))  # (sensors, f) [dB]
     groups = np.array_split(np.arange(found.shape[1]), min(found.shape[1], max(8, width - _BESIDE)))
     drawn = np.array([found[:, group].max(axis=1) for group in groups]).T  # (sensors, columns)
     top = drawn.max()

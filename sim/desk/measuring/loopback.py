@@ -132,36 +132,26 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
 def check_wiring(found: Estimate, desk: Desk) -> None:
     """Raise InputError where the loop-back shows inputs or outputs to be swapped."""
     came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
-    own, eras, output, loopback = desk.looped, desk.eras, desk.output, desk.input
-    first, others = came.max(axis=1), np.sort(came, axis=1)[:, -2]
-    alone = (first > _LOOPED) & (others < _CROSSTALK * first)  # of one output, as cables are
-    source = int(came[loopback - 1].argmax())
-    if source != own and alone[loopback - 1]:
-        name, at = eras[source]
+    own, at, output = desk.looped, desk.input, desk.output
+    others = np.delete(came, own, axis=1)
+    is_cable = (came[:, own] > _LOOPED) & (others.max(axis=1) < _CROSSTALK * came[:, own])
+    if is_cable[at - 1]:
+        return
+    if is_cable.any():
+        back = int(is_cable.argmax()) + 1
         raise InputError(
-            f"input {loopback} must bring back output {output}, got output {at} of ERA {name}: "
-            "outputs are swapped; exchange their cables"
-        )
-    back = int(np.where(alone & (came.argmax(axis=1) == own), first, 0).argmax()) + 1
-    if back != loopback and came[back - 1, own] > _LOOPED and alone[back - 1]:
-        raise InputError(
-            f"the loop-back of output {output} must come back at input {loopback}, got it at input "
+            f"the loop-back of output {output} must come back at input {at}, got it at input "
             f"{back}, {desk.named_inputs.get(back, 'of no sensor')}: inputs are swapped; exchange "
             "their cables"
         )
-    looped = came[loopback - 1, own]
-    if looped < _LOOPED:
-        raise InputError(
-            f"input {loopback} must bring back output {output} as the loop-back, got "
-            f"{looped:.2g} of it; connect them by a cable"
-        )
-    crosstalk = np.where(np.arange(len(eras)) == own, 0, came[loopback - 1, : len(eras)])
-    if crosstalk.max(initial=0) > _CROSSTALK * looped:
-        name, at = eras[int(crosstalk.argmax())]
-        raise InputError(
-            f"the loop-back must be output {output} alone, got {crosstalk.max():.2g} of output "
-            f"{at} of ERA {name} too; check mixers and monitoring of the sound card"
-        )
+    heard = others[at - 1, : len(desk.eras)]
+    name, other = [each for each in desk.eras if each[1] != output][int(heard.argmax())]
+    raise InputError(
+        f"input {at} must bring back output {output} alone, as the loop-back, got "
+        f"{came[at - 1, own]:.2g} of it and {heard.max():.2g} of output {other} of ERA {name}; "
+        "connect them by a cable, exchange those of outputs that are swapped, and check mixers and "
+        "monitoring of the sound card"
+    )
 
 
 def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:

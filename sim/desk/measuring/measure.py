@@ -1,16 +1,20 @@
 """A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
-from model.progress import Progress, unseen
+from model.calibration.responses_file import write_responses
+from model.commands.options import Stopwatch, progress_bar
+from model.progress import Progress
 from sim.desk.measuring.desk import Desk
+from sim.desk.measuring.live_plot import Show, live_plot
 from sim.desk.measuring.loopback import (
     check_clocks,
     check_coherence,
@@ -71,9 +75,6 @@ def play_run(
 LEVEL = 0.3
 """Usual largest sample of each output."""
 
-Show = Callable[[Sequence[FloatArray]], None]
-"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -122,8 +123,7 @@ def open_desk(
         limits = desk.rig.limits
         frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
     desk.check_frequencies(frequencies, what="--frequencies")
-    opened = open_card(device, outputs=desk.output, inputs=desk.input, limit=level)
-    with closing(opened) as card:
+    with closing(open_card(device, outputs=desk.output, inputs=desk.input, limit=level)) as card:
         yield card, Multisine(frequencies, len(desk.sources), card.rate, level, seed)
 
 
@@ -187,7 +187,7 @@ def check_by_steps(
     measured: Measured,
     *,
     level: float,
-    progress: Progress = unseen,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Play some of the frequencies on each ERA alone; raises LinkError for lost blocks.
 
@@ -231,3 +231,57 @@ def _played(desk: Desk, card: SoundCard, era: int, frequency: float, level: floa
         is_whole=lambda kept: is_whole(kept[:, desk.input - 1], samples=tone.samples),
     )
     return np.asarray(tone.found(run.whole)[0] / tone.played(0)[0])
+
+
+def measure_at_once(
+    desk: Desk,
+    opened: AbstractContextManager[tuple[SoundCard, Multisine]],
+    output: Path,
+    *,
+    periods: int,
+    is_stepped: bool,
+) -> tuple[list[str], dict[str, Any]]:
+    """Measure, write the responses, and return the report; is_stepped: with single tones, too.
+
+    Raises InputError, LinkError, OSError.
+    """
+    check = None
+    with Stopwatch() as timed, opened as (card, multisine):
+        with live_plot(multisine, desk.sensors) as show:
+            found = measure(desk, card, multisine, periods=periods, show=show)
+        if is_stepped:
+            with progress_bar("tones") as progress:
+                check = check_by_steps(desk, card, found, level=multisine.level, progress=progress)
+    write_responses(output, found.responses, desk.rig)
+    written = f"measured in {timed.elapsed:.1f} s; wrote {output}"
+    return [*_rows(found, check, rate=card.rate), written], {
+        "frequencies_hz": found.responses.frequencies.tolist(),
+        "latency_s": found.latency,
+        "repeated_runs": found.repeated,
+        "sensors": {name: found.quality(n) for n, name in enumerate(found.responses.sensors)},
+        "stepped": check,
+        "measure_time_s": timed.elapsed,
+        "files": [str(output)],
+    }
+
+
+def _rows(found: Measured, check: dict[str, Any] | None, *, rate: float) -> Iterator[str]:
+    """Yield how well responses were measured."""
+    lines = found.responses.frequencies
+    yield (
+        f"{len(lines)} frequencies from {lines[0]:g} to {lines[-1]:g} Hz; delay of the sound card "
+        f"{1e3 * found.latency:.3f} ms ({found.latency * rate:.1f} samples); "
+        f"{found.repeated} runs repeated for lost blocks"
+    )
+    yield "sensor      coherence   lowest   noise    square law"
+    for n, name in enumerate(found.responses.sensors):
+        yield (
+            f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
+            f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
+            f"{100 * found.even[n]:8.2f} %"
+        )
+    if check is not None:
+        yield (
+            "stepped tones differ by {level_rms_db:.3f} dB rms, {level_max_db:.2f} dB at most, and "
+            "{phase_rms_deg:.2f}° rms, {phase_max_deg:.1f}° at most".format(**check)
+        )

@@ -73,19 +73,15 @@ class PlacesFile:
     def keep(self, place: WiredSensor, found: Measured) -> None:
         """Write the file with another place; raises OSError."""
         self.values[place.name] = found.responses.values[:, :, 0]
-        write_responses(self.path, self.responses, self.desk.rig, setting=self.setting)
-
-    @property
-    def responses(self) -> Responses:
-        """All that is measured."""
         places = [place for place in self.desk.sensors if place.name in self.values]
-        return Responses(
+        responses = Responses(
             tuple(place.name for place in places),
             np.array([[place.x, place.y] for place in places]),
             self.multisine.frequencies,
             np.stack([self.values[place.name] for place in places], axis=2),
             masses=np.array([place.mass for place in places]),
         )
+        write_responses(self.path, responses, self.desk.rig, setting=self.setting)
 
     def _place_at(self, at: Sequence[float]) -> WiredSensor:
         for place in self.desk.sensors:
@@ -194,8 +190,6 @@ def measure_places(
             case "r" if last is not None:
                 todo.insert(0, last)
                 last = None
-            case "r":
-                tell("no place was measured just before; Enter, s or q")
             case "":
                 try:
                     measured = measure(
@@ -216,7 +210,7 @@ def measure_places(
                 last = todo.pop(0)
                 tell(_line(place, measured))
             case _:
-                tell(f"a reply must be Enter, r, s or q, got {reply.strip()[:20]!r}")
+                tell(f"a reply must be Enter, s, q, or r once, got {reply.strip()[:20]!r}")
     return found
 
 

@@ -119,13 +119,11 @@ def ramped(samples: FloatArray, count: int) -> FloatArray:
 
 def default_frequencies(low: float, high: float) -> FloatArray:
     """Odd whole frequencies [Hz] in steps of 10 from above a lowest to below a highest one."""
-    first = int(np.ceil(low))
-    first += 1 - first % 2
-    last = int(np.floor(high))
-    last -= 1 - last % 2
-    if last < first:
+    odd = np.arange(1.0, high + 1e-9, 2)
+    odd = odd[odd >= low]
+    if not odd.size:
         raise InputError(f"limits.frequency must leave odd hertz, got {low:g} to {high:g} Hz")
-    return np.unique(np.append(np.arange(first, last, _STEP), last)).astype(float)
+    return np.unique([*odd[:: _STEP // 2], odd[-1]])
 
 
 _AROUND = 4  # lines of a period on either side, from which noise is taken

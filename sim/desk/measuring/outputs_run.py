@@ -122,16 +122,15 @@ def _rows(
     has_levels = any(each.relative_level is not None for each in heard)
     yield "output  drives      channel" + ("  polarity    level" if has_levels else "")
     for each in heard:
-        more, wrong = "", [each.verdict] if each.verdict != "ok" else []
-        if each.era and each.polarity and each.relative_level:
-            more = (
-                f"  {'-+'[each.polarity > 0]:>8s}  {20 * math.log10(each.relative_level):+5.1f} dB"
-            )
-        channel = str(channels[each.era]) if each.era else "-"
-        if each.era and channels[each.era] != own[each.era]:
-            wrong.insert(0, f"the rig has channel {own[each.era]}")
-        drives = f"{each.output:6d}  {each.era or '-':10s} {channel:>8s}{more}"
-        yield f"{drives}  {'; '.join(wrong)}".rstrip()
+        channel, more, verdict = channels.get(each.era or ""), "", each.verdict
+        if each.polarity and each.relative_level:
+            sign = "+" if each.polarity > 0 else "-"
+            more = f"  {sign:>8s}  {20 * math.log10(each.relative_level):+5.1f} dB"
+        if each.era and channel != own[each.era]:
+            verdict = f"the rig has channel {own[each.era]}; {verdict}"
+        verdict = verdict.removesuffix("ok").removesuffix("; ")
+        drives = f"{each.output:6d}  {each.era or '-':10s} {'-' if channel is None else channel:>8}"
+        yield f"{drives}{more}  {verdict}".rstrip()
     if missing:
         yield f"on no output: {', '.join(missing)}; check cables and amplifier, or --outputs"
     elif channels == own:

@@ -1,7 +1,6 @@
 """A plate measured through a sound card for its identification: multisines, some of them again."""
 
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -74,7 +73,16 @@ def measure_through(
         measurement,
         multisine.level,
         time.monotonic() - started,
-        sensors=tuple(_sensors(desk, found)),
+        sensors=tuple(
+            {
+                "sensor": sensor.name,
+                "input": sensor.input,
+                "x_m": sensor.x,
+                "y_m": sensor.y,
+                "coherence_min": found.quality(n)["coherence_min"],
+            }
+            for n, sensor in enumerate(desk.sensors)
+        ),
         notes=(),
         details={"latency_s": found.latency, "repeated_runs": found.repeated},
     )
@@ -98,7 +106,8 @@ def _repeats(
     desk: Desk, found: Measured, multisine: Multisine, recorded: FloatArray
 ) -> tuple[Repeat, ...]:
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
-    bases = multisine.played(_REPEATED)[:, : len(desk.full_levels)] * desk.full_levels  # (f, eras)
+    full = [*desk.rig.full_levels.values()]
+    bases = multisine.played(_REPEATED)[:, : len(full)] * full  # (f, eras)
     first = np.einsum("fes,fe->fs", found.responses.values, bases)
     heard = multisine.found(recorded)[:, desk.columns] / desk.sensitivities
     again = heard / converters(found.looped)[:, None]
@@ -109,18 +118,3 @@ def _repeats(
     return tuple(
         Repeat(names, float(multisine.frequencies[n]), first[n], again[n]) for n in loudest
     )
-
-
-def _sensors(desk: Desk, found: Measured) -> list[Mapping[str, object]]:
-    """The sensors, for programs."""
-    lowest: FloatArray = found.coherence.min(axis=0)
-    return [
-        {
-            "sensor": sensor.name,
-            "input": sensor.input,
-            "x_m": sensor.x,
-            "y_m": sensor.y,
-            "coherence_min": float(coherence),
-        }
-        for sensor, coherence in zip(desk.sensors, lowest, strict=True)
-    ]

@@ -41,11 +41,6 @@ class _Transfer(ctypes.Structure):
         ("arrivals", ctypes.c_void_p),
         ("blocks", ctypes.c_uint64),
     )
-    position: int
-    is_running: int
-    gaps: int
-    is_lost: int
-    blocks: int
 
 
 class Ports(ctypes.Structure):
@@ -130,7 +125,7 @@ class SoundCard(ABC):
     @property
     def position(self) -> int:
         """Frames that were played and recorded since `begin`."""
-        return self._transfer.position
+        return int(self._transfer.position)
 
     @abstractmethod
     def close(self) -> None:
@@ -177,7 +172,7 @@ class JackCard(SoundCard):
             raise
 
     def _start(self, other: str, outputs: int, inputs: int) -> None:
-        takers = self._client.takers(other, outputs)
+        takers = self._client.first_ports(other, IS_INPUT, outputs)
         givers = self._client.first_ports(other, IS_OUTPUT, inputs)
         out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
         for port, taker in zip(out, takers, strict=True):

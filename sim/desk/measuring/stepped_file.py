@@ -31,7 +31,9 @@ _ENDINGS = (".csv", ".wav")
 _Known = TypeVar("_Known")
 
 
-def measured_from(source: Path, desk: Desk, output: Path) -> tuple[list[str], dict[str, Any]]:
+def measured_from(
+    source: Path, desk: Desk, output: Path
+) -> tuple[list[str | None], dict[str, Any]]:
     """Read files of a stepped sine, write responses, and return the report; raises InputError."""
     found = responses_of(read_stepped(source, desk), desk.rig)
     write_responses(output, found, desk.rig)
@@ -42,12 +44,10 @@ def measured_from(source: Path, desk: Desk, output: Path) -> tuple[list[str], di
         f"{source}: {counted(len(found.sensors), 'sensor')}, "
         f"{counted(len(lines), 'frequency', plural='frequencies')} from {lines[0]:g} to "
         f"{lines[-1]:g} Hz, {counted(found.count, 'value')}",
+        f"{counted(count, 'value')} missing, or not settled and left out" if count else None,
+        f"without {', '.join(absent)}" if absent else None,
+        f"wrote {output}",
     ]
-    if count:
-        rows.append(f"{counted(count, 'value')} missing, or not settled and left out")
-    if absent:
-        rows.append(f"without {', '.join(absent)}")
-    rows.append(f"wrote {output}")
     return rows, {
         "frequencies_hz": lines.tolist(),
         "sensors": [*found.sensors],

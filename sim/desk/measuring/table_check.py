@@ -1,8 +1,8 @@
 """Promises of a table played and measured through a sound card."""
 
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from model.progress import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
     MeasuredVerification,
-    Promise,
     measured_promise,
     promises,
 )
@@ -34,9 +33,6 @@ _RAMP = 0.04  # s
 _PLAYED = _SETTLING + _WINDOW + _RAMP  # s
 _MARK = 1000.0  # Hz; of the loop-back, by which lost blocks show
 _MARK_LEVEL = 0.3
-
-Recorder = Callable[[Promise], Run]
-"""Plays a promise, and keeps samples (n, inputs) of the plate that has settled."""
 
 
 def check_table(
@@ -61,7 +57,27 @@ def check_table(
     named = desk.named_inputs
     places = {name: (sensor.x, sensor.y) for name, sensor in by_name.items()}
     found = []
-    with _recorder(desk, settings, level) as (rate, record):
+    is_card = settings.url is None
+    with ExitStack() as stack:
+        card = stack.enter_context(
+            closing(
+                open_card(
+                    settings.device,
+                    outputs=desk.output if is_card else 0,
+                    inputs=desk.input,
+                    limit=level if is_card else 0,
+                )
+            )
+        )
+        if settings.url is None:
+            record = partial(_by_card, card, desk, level)
+        else:
+            is_output = not rig.outputs.isdisjoint(rig.amplifiers)
+            amplifier = stack.enter_context(
+                BlockingAmplifier(settings.url, limits=rig.limits, is_output=is_output)
+            )
+            amplifier.arm()
+            record = partial(_by_amplifier, card, amplifier, rig)
         for promise in promises(
             table, places, count=settings.samples, level=level, seed=settings.seed
         ):
@@ -69,44 +85,21 @@ def check_table(
             frequencies = np.unique([tone.frequency for tone in excitation.values()])
             # A table may have been built of more; an amplifier's ledger refuses them, too.
             desk.check_frequencies(frequencies, what="frequencies of the table")
-            run = record(promise)
+            run = record(promise.layer)
             chosen = [by_name[name] for name in promise.sensors]
             inputs = [sensor.input for sensor in chosen]
-            cable = [desk.input] if settings.url is None else []
+            cable = [desk.input] if is_card else []
             check_levels(run.recorded, {n: named[n] for n in [*inputs, *cable]})
             # All tones are fitted together, since their frequencies need not fit into the window.
             samples = run.whole[:, [n - 1 for n in inputs]]
-            tones = fit_tones(np.arange(len(samples)) / rate, samples, frequencies.tolist())
+            tones = fit_tones(np.arange(len(samples)) / card.rate, samples, frequencies.tolist())
             amplitudes = np.abs(tones / [sensor.sensitivity for sensor in chosen])
             found.append(measured_promise(table, promise, frequencies, amplitudes))
             progress(len(found), settings.samples)
     return MeasuredVerification(tuple(found))
 
 
-@contextmanager
-def _recorder(
-    desk: Desk, settings: CheckSettings, level: float
-) -> Iterator[tuple[float, Recorder]]:
-    """The rate [Hz] of an open card, and an amplifier where that plays; no sample exceeds level."""
-    is_card = settings.url is None
-    card = open_card(
-        settings.device,
-        outputs=desk.output if is_card else 0,
-        inputs=desk.input,
-        limit=level if is_card else 0,
-    )
-    with closing(card):
-        if settings.url is None:
-            yield card.rate, lambda promise: _by_card(card, desk, promise.layer, level)
-            return
-        rig = desk.rig
-        is_output = not rig.outputs.isdisjoint(rig.amplifiers)
-        with BlockingAmplifier(settings.url, limits=rig.limits, is_output=is_output) as amplifier:
-            amplifier.arm()
-            yield card.rate, lambda promise: _by_amplifier(card, amplifier, rig, promise)
-
-
-def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promise: Promise) -> Run:
+def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, pattern: Layer) -> Run:
     """Record what an amplifier plays, once."""
     seconds = _SETTLING + _WINDOW
     tones = tuple(
@@ -116,7 +109,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promi
             tone.amplitude / rig.era(name).full_level,
             float(np.degrees(tone.phase)),
         )
-        for name, tone in promise.layer.excitation.items()
+        for name, tone in pattern.excitation.items()
     )
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
@@ -139,7 +132,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, promi
     return run
 
 
-def _by_card(card: SoundCard, desk: Desk, pattern: Layer, level: float) -> Run:
+def _by_card(card: SoundCard, desk: Desk, level: float, pattern: Layer) -> Run:
     """Play a pattern from memory: a level is a sample, as of an amplifier whose output it is.
 
     level: that no output exceeds, the loop-back's included, since cables may be swapped.

@@ -14,6 +14,8 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
+from functools import partial
 from types import FrameType
 
 from drivers.errors import LinkError
@@ -37,35 +39,30 @@ class _Ended(Exception):
 
 def main() -> None:
     """Play until a signal comes, or the device has gone."""
-    settings = Settings.from_json(sys.argv[1])
+    settings = Settings(**json.loads(sys.argv[1]))
     counters_file, terminal, listening, parent, rate = map(int, sys.argv[2:])
     _end_with_parent()
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: that is for the parent
     counters = counters_in(counters_file)
+    start = partial(
+        Engine,
+        settings,
+        counters=counters,
+        terminal=terminal,
+        listening=listening,
+        parent=parent,
+    )
     output: Output | None = None
     engine = None
-
-    def start(rate: int, *, is_recovering: bool) -> Engine:
-        engine = Engine()
-        engine.start(
-            settings,
-            rate=rate,
-            counters=counters,
-            is_recovering=is_recovering,
-            terminal=terminal,
-            listening=listening,
-            parent=parent,
-        )
-        return engine
-
     try:
-        output = None if rate else _opened(settings)
+        with suppress(NoSound):
+            output = None if rate else open_output(settings)
         if output is not None:
-            engine = start(output.rate, is_recovering=False)
+            engine = start(rate=output.rate, is_recovering=False)
         else:  # hosts are to hear of the fault before the device is there
             assumed = rate or settings.rate or _DEFAULT_RATE
-            engine = start(assumed, is_recovering=True)
+            engine = start(rate=assumed, is_recovering=True)
             output = _awaited(settings, rate=assumed)
             if output.rate != assumed:
                 _tell(event="other rate", rate=output.rate)
@@ -91,14 +88,6 @@ def main() -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself
         _tell(event="refused", is_input=isinstance(problem, InputError), reason=str(problem))
         os._exit(REFUSED)
-
-
-def _opened(settings: Settings) -> Output | None:
-    """The device, None without a sound server; raises InputError, LinkError."""
-    try:
-        return open_output(settings)
-    except NoSound:
-        return None
 
 
 def _awaited(settings: Settings, *, rate: int) -> Output:

@@ -32,16 +32,6 @@ class Counters(ctypes.Structure):
         ("fault", ctypes.c_uint32 * 2),
         ("block", ctypes.c_uint32),
     )
-    blocks: int
-    frames: int
-    gaps: int
-    xruns: int
-    clipped: int
-    requests: int
-    is_streaming: int
-    is_lost: int
-    is_realtime: int
-    block: int
 
 
 def new_file() -> IO[bytes]:
@@ -53,7 +43,6 @@ def new_file() -> IO[bytes]:
 
 def counters_in(descriptor: int) -> Counters:
     """The counters in a file, shared with every process that maps it."""
-    os.fstat(descriptor)
     return Counters.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(Counters)))
 
 
@@ -99,12 +88,12 @@ class JackCalls(ctypes.Structure):
 
 
 class Engine:
-    """The library, loaded; raises InputError."""
+    """The amplifiers at a rate [Hz] and their lines, which start; descriptors: -1 for none.
 
-    def __init__(self) -> None:
-        self._library = library()
+    Raises InputError, LinkError.
+    """
 
-    def start(
+    def __init__(
         self,
         settings: Settings,
         *,
@@ -115,7 +104,7 @@ class Engine:
         listening: int,
         parent: int,
     ) -> None:
-        """Start the amplifiers at a rate [Hz] and their lines; descriptors: -1 for none."""
+        self._library = library()
         sound = _SoundSettings(
             rate,
             settings.channels,

@@ -1,7 +1,6 @@
 """The engine as a library: of a wheel of this platform, or compiled at first use."""
 
 import ctypes
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -37,11 +36,8 @@ def library() -> ctypes.CDLL:
             raise InputError(
                 f"soft-amp: {own} cannot be loaded: {problem}; reinstall era-haptics"
             ) from None
-    folder = _sources()
-    headers = [path for part in _PARTS for path in (folder / part).glob("*.h")]
-    return kept_library(
-        "soft-amp", _files(folder, suffix=".c"), headers, flags=_flags(folder), what=_WHAT
-    )
+    sources, headers, flags = _recipe()
+    return kept_library("soft-amp", sources, headers, flags=flags, what=_WHAT)
 
 
 def address_of(name: str) -> int:
@@ -53,23 +49,21 @@ def address_of(name: str) -> int:
 
 def compile_engine(path: Path) -> None:
     """Compile the library to a file. Raises InputError."""
-    folder = _sources()
-    compile_library(path, _files(folder, suffix=".c"), flags=_flags(folder), what=_WHAT)
+    sources, _, flags = _recipe()
+    compile_library(path, sources, flags=flags, what=_WHAT)
 
 
-def _flags(folder: Path) -> list[str]:
-    return [*_FLAGS, *(f"-I{folder / part}" for part in _PARTS)]
-
-
-def _sources() -> Path:
-    """The folder of the firmware's sources."""
-    for folder in _FOLDERS:
-        if (folder / "ports" / "sound").is_dir():
-            return folder
-    raise InputError(f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics")
-
-
-def _files(folder: Path, *, suffix: str) -> Iterable[Path]:
-    yield from (folder / "core" / f"{name}{suffix}" for name in _CORE)
-    yield from (folder / "wire" / f"{name}{suffix}" for name in _WIRE)
-    yield from (folder / "ports" / "sound").glob(f"*{suffix}")
+def _recipe() -> tuple[list[Path], list[Path], list[str]]:
+    """Sources, headers and flags of the compiler; raises InputError."""
+    folder = next((each for each in _FOLDERS if (each / "ports" / "sound").is_dir()), None)
+    if folder is None:
+        raise InputError(
+            f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics"
+        )
+    sources = [
+        *(folder / "core" / f"{name}.c" for name in _CORE),
+        *(folder / "wire" / f"{name}.c" for name in _WIRE),
+        *(folder / "ports" / "sound").glob("*.c"),
+    ]
+    headers = [path for part in _PARTS for path in (folder / part).glob("*.h")]
+    return sources, headers, [*_FLAGS, *(f"-I{folder / part}" for part in _PARTS)]

@@ -9,7 +9,15 @@ from typing import Any, TypeAlias
 from drivers.errors import LinkError
 from model.errors import InputError
 from registry.suggestions import did_you_mean
-from sim.desk.libjack import IS_OUTPUT, JackClient, NoSound, check_free, jack_name, libjack
+from sim.desk.libjack import (
+    IS_INPUT,
+    IS_OUTPUT,
+    JackClient,
+    NoSound,
+    check_free,
+    jack_name,
+    libjack,
+)
 from sim.desk.soft_amp.engine import Engine, JackCalls
 from sim.desk.soft_amp.library import address_of
 from sim.desk.soft_amp.settings import Settings, check_rate
@@ -53,7 +61,7 @@ class JackOutput:
                 f"{settings.block}; start the server with -p {settings.block}, or omit --block"
             )
         self.name = jack_name(destination)
-        self._inputs = self._client.takers(destination, settings.channels)
+        self._inputs = self._client.first_ports(destination, IS_INPUT, settings.channels)
         names = [f"out_{n}" for n in range(1, settings.channels + 1)]
         self._ports = self._client.register(names, IS_OUTPUT)
 
@@ -180,6 +188,10 @@ def default_block() -> int:
     return _WITH_PRIORITY if may_be_realtime() else _WITHOUT
 
 
+_REFUSED = {-9997: "--rate", -9998: "--channels"}
+"""The option at fault by paInvalidSampleRate, paInvalidChannelCount of portaudio.h."""
+
+
 class PortAudioOutput:
     """A stream of interleaved floats; the callback is C, without Python."""
 
@@ -205,20 +217,15 @@ class PortAudioOutput:
         self._stream: Any = None
 
     def _refused(self, problem: Exception) -> Exception:
-        text, number = str(problem.args[0]), problem.args[1] if len(problem.args) > 1 else 0
-        match number:  # of portaudio.h
-            case -9997:  # paInvalidSampleRate
-                return InputError(
-                    f"--rate must be one that {self.name} offers, got {self.rate} Hz; omit it for "
-                    "its own, or try 48000"
-                )
-            case -9998:  # paInvalidChannelCount
-                return InputError(
-                    f"--channels: {self.name} does not offer {self._settings.channels} channels"
-                )
-            case -9985:  # paDeviceUnavailable
-                return LinkError(f"--device {self.name}: busy; end the program that plays on it")
-        return LinkError(f"--device {self.name}: cannot be opened: {text}")
+        text, number = problem.args[0], problem.args[-1]
+        if number in _REFUSED:
+            return InputError(
+                f"{_REFUSED[number]} must be one that {self.name} offers, got {self.rate} Hz, "
+                f"{self._settings.channels} channels: {text}; omit --rate for its own, or try 48000"
+            )
+        return LinkError(
+            f"--device {self.name}: cannot be opened: {text}; end the program that plays on it"
+        )
 
     def start(self, engine: Engine) -> None:
         """Let PortAudio call the engine; raises LinkError."""

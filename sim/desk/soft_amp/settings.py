@@ -3,13 +3,12 @@
 A terminal or a port is kept while the process that plays restarts.
 """
 
-import json
 import math
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from pathlib import Path
 
@@ -37,7 +36,7 @@ class Protocol(IntEnum):
 
 @dataclass(frozen=True)
 class Settings:
-    """A software amplifier.
+    """A software amplifier; its values pass as JSON.
 
     device: `jack`, `jack:CLIENT`, or a name or number of PortAudio; rate [Hz] and block [frames]:
     those of the device if None; limit: largest sample, 0..1; max_gaps: holes in the sound within
@@ -62,7 +61,7 @@ class Settings:
                 f"--channels above {CHANNELS_OF_AMPLIFIER} must be even, since they are two "
                 f"amplifiers of half as many, got {self.channels}"
             )
-        least = math.sqrt(0.5) if self.law is Law.SQUARE else 0.0
+        least = math.sqrt(0.5) if self.law == Law.SQUARE else 0.0
         if not least < self.limit <= 1:
             raise InputError(
                 f"--limit must be above {least:.3g} and at most 1 with this law, got {self.limit:g}"
@@ -74,17 +73,6 @@ class Settings:
     def amplifiers(self) -> int:
         """Number of amplifiers, at addresses 1 and 2."""
         return 1 if self.channels <= CHANNELS_OF_AMPLIFIER else 2
-
-    def to_json(self) -> str:
-        """These settings as text."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> "Settings":
-        """The settings of such a text."""
-        values = json.loads(text)
-        law, protocol = Law(values.pop("law")), Protocol(values.pop("protocol"))
-        return cls(**values, law=law, protocol=protocol)
 
 
 def check_rate(rate: float, *, what: str) -> int:

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from typing import Any
 
 from drivers.errors import LinkError
@@ -40,7 +41,8 @@ Report = Callable[[str], None]
 class Supervisor:
     """Run an amplifier at a place; report: takes a line for each event.
 
-    Events after the start go to `report`; errors of the start are raised: InputError, LinkError.
+    It starts at once. Events after `start` go to `report`; errors of the start are raised:
+    InputError, LinkError.
     """
 
     def __init__(self, settings: Settings, place: Place, *, report: Report) -> None:
@@ -50,17 +52,15 @@ class Supervisor:
         self._file = new_file()
         self.counters: Counters = counters_in(self._file.fileno())
         self._stack = ExitStack()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._rest = b""
         self._reported = 0.0
         self._seen = (0, 0)
         self._said: set[str] = set()
         self._rate = 0  # Hz; of the device, or until it says its own
         self._was_open = False
+        self._launch()
 
     def start(self) -> None:
-        """Start to play, or to wait for a sound server."""
-        self._launch()
+        """Wait until it plays, or waits for a sound server."""
         end = time.monotonic() + _START
         while time.monotonic() < end:
             for event in self._events(_POLL):
@@ -70,7 +70,7 @@ class Supervisor:
                     raise kind(event["reason"])
                 self._take(event)
                 return
-            if self._status() is not None:
+            if self._process.poll() is not None:
                 break
         self.end()
         raise LinkError(f"soft-amp: {self._settings.device} was not opened in {_START:g} s")
@@ -80,7 +80,7 @@ class Supervisor:
         _raise_priority()
         blocks, since, looked = -1, time.monotonic(), time.monotonic()
         while True:
-            status = self._status()  # before what it says, of which nothing is left then
+            status = self._process.poll()  # before what it says, of which nothing is left then
             for event in self._events(_POLL):
                 self._take(event)
             now = time.monotonic()
@@ -119,13 +119,12 @@ class Supervisor:
 
     def end(self) -> None:
         """Let it fall silent and end; kill it where it does not."""
-        if self._process is not None:
-            with suppress(ProcessLookupError):
-                self._process.terminate()
-            try:
-                self._process.wait(_END)
-            except subprocess.TimeoutExpired:
-                self._kill()
+        with suppress(ProcessLookupError):
+            self._process.terminate()
+        try:
+            self._process.wait(_END)
+        except subprocess.TimeoutExpired:
+            self._kill()
         self._stack.close()
 
     def _launch(self) -> None:
@@ -137,7 +136,7 @@ class Supervisor:
         self._process = subprocess.Popen(  # noqa: S603  this program
             [
                 *(sys.executable, "-P", "-m", "sim.desk.soft_amp"),
-                self._settings.to_json(),
+                json.dumps(asdict(self._settings)),
                 *map(str, inherited),
                 str(self._rate),
             ],
@@ -148,9 +147,8 @@ class Supervisor:
         )
         os.close(life)
         assert self._process.stdout is not None  # noqa: S101  a pipe was requested
-        self._stack.enter_context(self._process.stdout)
-        os.set_blocking(self._process.stdout.fileno(), False)
-        self._rest = b""
+        self._said_by = self._stack.enter_context(self._process.stdout).fileno()
+        os.set_blocking(self._said_by, False)
 
     def _restart(self, reason: str) -> None:
         self._say(f"silent and in fault: {reason}; opening {self._settings.device} again")
@@ -158,24 +156,17 @@ class Supervisor:
         self._launch()
 
     def _kill(self) -> None:
-        assert self._process is not None  # noqa: S101  launched before
         self._process.kill()
         self._process.wait()
 
-    def _status(self) -> int | None:
-        return None if self._process is None else self._process.poll()
-
     def _events(self, timeout: float) -> list[dict[str, Any]]:
         """What the process says within a time [s]."""
-        assert self._process is not None  # noqa: S101  launched before
-        assert self._process.stdout is not None  # noqa: S101  a pipe was requested
-        if not select.select([self._process.stdout], [], [], timeout)[0]:
+        if not select.select([self._said_by], [], [], timeout)[0]:
             return []
-        data = os.read(self._process.stdout.fileno(), 65536)
+        data = os.read(self._said_by, 65536)  # whole lines: a pipe takes each at once
         if not data:
             time.sleep(timeout)  # it ends
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return [json.loads(line) for line in lines]
+        return [json.loads(line) for line in data.splitlines()]
 
     def _report_underruns(self, now: float) -> None:
         seen = (self.counters.gaps, self.counters.xruns)

@@ -76,11 +76,11 @@ def play(results: Connection) -> None:
 
     At first; then with a latency and a late call; then behind a hole of 480 frames.
     """
-    jack, counters, engine = MadeUpJack(), Counters(), Engine()
+    jack, counters = MadeUpJack(), Counters()
     host, terminal = socket.socketpair()
     terminal.setblocking(False)
     settings = Settings("jack", 2, Protocol.SERIAL, "S")
-    engine.start(
+    engine = Engine(
         settings, rate=RATE, counters=counters, is_recovering=False,
         terminal=terminal.fileno(), listening=-1, parent=-1,
     )  # fmt: skip

@@ -127,6 +127,8 @@ def check_refusal(
         (10, "    stiffness: 17 N", "10 eras.SW.stiffness"),
         (10, "", "8 eras.SW.stiffness"),
         (11, "    stroke: 100", "11 eras.SW.stroke"),
+        (11, "    gains: [[50, 0.9, 90], [60, 0, 0]]", "11 eras.SW.gains"),
+        (11, "    gains: [[50, 0.9, 90], [40, 1, 0]]", "11 eras.SW.gains"),
         (12, "", "8 eras.SW.amplifier"),
         (13, "    channel: 0.5", "13 eras.SW.channel"),
         (13, "    channel: '0'", "13 eras.SW.channel"),
@@ -260,6 +262,11 @@ UNMESHED = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startsw
             GOOD.replace("[0.3048,", "[0.30480000000000007,"),
             lambda rig: (rig.eras[1].x,),
             (0.3048,),
+        ),
+        (
+            GOOD.replace("damping: 2.0", "gains: [[50, 0.9, 90], [60, 1, 0]]"),
+            lambda rig: (rig.eras[0].gains, rig.eras[1].gains),
+            (((50.0, 0.9, math.pi / 2), (60.0, 1.0, 0.0)), ()),
         ),
         (
             GOOD.replace("damping: 2.0", "damping_ratio: 10 %"),

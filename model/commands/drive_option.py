@@ -4,12 +4,20 @@ import math
 import re
 from collections.abc import Sequence
 
+from model.arguments import expect_between
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
 from registry.suggestions import did_you_mean
 
-_FORM = re.compile(r"(?P<era>[^=]+)=(?P<frequency>[^@:]+)(?:@(?P<level>[^:]+)(?::(?P<phase>.+))?)?")
+_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"
+_FORM = re.compile(
+    rf"(?P<era>[^=]+)=\s*(?P<frequency>{_NUMBER})\s*"
+    rf"(@\s*(?P<level>{_NUMBER})\s*(:\s*(?P<phase>{_NUMBER}))?)?",
+    re.IGNORECASE,
+)
+_NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
+"""Parts of a drive, with what they are where they are left out."""
 
 
 def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
@@ -23,8 +31,9 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
         match = _FORM.fullmatch(text.strip())
         if match is None:
             raise InputError(
-                f"--drive must be ERA=HZ[@LEVEL[:PHASE_DEG]], got {text!r}; for instance "
-                f"{names[0]}=110 or {names[0]}=110@0.5:90"
+                f"--drive must be ERA=HZ[@LEVEL[:PHASE_DEG]], in hertz, share of full stroke and "
+                f"degrees without a unit, got {text!r}; for instance {names[0]}=110 or "
+                f"{names[0]}=110@0.5:90"
             )
         name = match["era"]
         if name not in names:
@@ -34,14 +43,11 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
             )
         if name in excitation:
             raise InputError(f"--drive {text!r}: ERA {name} must have one tone, got two")
-        frequency = _number(match["frequency"], text, what="frequency")
-        level = _number(match["level"] or "1", text, what="level")
-        phase = _number(match["phase"] or "0", text, what="phase")
-        if not 0 <= level <= 1:
-            raise InputError(f"--drive {text!r}: level must be between 0 and 1, got {level:g}")
+        frequency, level, phase = (float(match[key] or usual) for key, usual in _NUMBERS.items())
+        expect_between(level, 0, 1, what=f"--drive {text!r}: level")
         if frequency <= 0:
             raise InputError(f"--drive {text!r}: frequency must be positive, got {frequency:g} Hz")
-        stroke = rig.era(name).full_level
+        stroke = rig.full_levels[name]
         excitation[name] = Tone(frequency, level * stroke, math.radians(phase))
     return excitation
 
@@ -60,16 +66,3 @@ def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
         f"{', '.join(beyond)}: outside the rig's limits.frequency of {low:g} to {high:g} Hz; the "
         "guard enforces this range"
     )
-
-
-def _number(text: str, drive: str, *, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(
-            f"--drive {drive!r}: {what} must be a finite number, got {text!r}, in hertz, "
-            "share of full stroke and degrees without a unit"
-        )
-    return value

@@ -329,8 +329,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
             f"    bending wavelength at {_frequency(key)}  {100 * wavelength:.3g} cm"
             for key, wavelength in summary["bending_wavelength_m"].items()
         ),
-        *_mass_rows(summary["point_masses"]),
-        *_support_rows(summary["supports"]),
+        *_attached_rows(summary),
         *_exciter_rows(summary["exciters"], summary.get("reach")),
         *_type_rows(summary["exciter_types"]),
     ]
@@ -342,40 +341,35 @@ _MAX_NAMED = 6  # of masses and supports, which a frame has many of
 
 def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
     """Yield the moduli of a board along the plate's length (1) and its width (2)."""
-    if grain is None:
-        return
-    moduli = {key[:-3]: each for key, each in grain.items() if key.endswith("_pa")}
-    yield f"    along its length and width  {_in_gpa(moduli)}, nu12 {grain['nu12']:.3g}"
-    yield (
-        f"    flexural rigidity along, across  {grain['flexural_rigidity_along_n_m']:.4g}, "
-        f"{grain['flexural_rigidity_across_n_m']:.4g} N m"
-    )
+    if grain is not None:
+        moduli = {key[:-3]: each for key, each in grain.items() if key.endswith("_pa")}
+        yield f"    along its length and width  {_in_gpa(moduli)}, nu12 {grain['nu12']:.3g}"
+        yield (
+            f"    flexural rigidity along, across  {grain['flexural_rigidity_along_n_m']:.4g}, "
+            f"{grain['flexural_rigidity_across_n_m']:.4g} N m"
+        )
 
 
-def _mass_rows(masses: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield what the plate carries."""
-    if len(masses) > _MAX_NAMED:
-        together = 1e3 * sum(each["mass_kg"] for each in masses)
-        yield f"    carries {together:g} g at {len(masses)} points"
-        return
-    for each in masses:
-        yield f"    carries {1e3 * each['mass_kg']:g} g at {_at(each)}"
+_ATTACHED = {
+    "point_masses": ("carries", "mass_kg", 1e3, "g"),
+    "supports": ("held by", "stiffness_n_m", 1e-3, "kN/m"),
+}
+"""In words, by key of a summary: a quantity, with its unit of so many a SI unit."""
 
 
-def _support_rows(supports: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield what holds the plate without driving it."""
-    if len(supports) > _MAX_NAMED:
-        together = sum(each["stiffness_n_m"] for each in supports) / 1e3
-        yield f"    held by {together:.4g} kN/m at {len(supports)} points"
-        return
-    for each in supports:
-        loss = f", loss factor {each['loss_factor']:g}" if each["loss_factor"] else ""
-        yield f"    held by {each['stiffness_n_m'] / 1e3:g} kN/m{loss} at {_at(each)}"
-
-
-def _at(each: dict[str, Any]) -> str:
-    x, y = each["at_m"]
-    return f"({x:g}, {y:g}) m"
+def _attached_rows(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield what the plate carries, and what holds it without driving it."""
+    for kind, (verb, key, count, unit) in _ATTACHED.items():
+        points = summary[kind]
+        if len(points) > _MAX_NAMED:
+            together = count * sum(each[key] for each in points)
+            yield f"    {verb} {together:.4g} {unit} at {len(points)} points"
+            continue
+        for each in points:
+            loss = f", loss factor {loss:g}" if (loss := each.get("loss_factor")) else ""
+            yield "    {} {:g} {}{} at ({:g}, {:g}) m".format(
+                verb, count * each[key], unit, loss, *each["at_m"]
+            )
 
 
 def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
@@ -383,27 +377,20 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
     if laminate is None:
         yield "plate"
         return
-    is_single = len(laminate["layers"]) == 1
-    yield (
-        "plate whose modulus depends on the frequency"
-        if is_single
-        else f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}"
-    )
+    bonded, rows = laminate["rigidity_perfectly_bonded_n_m"], {}
+    if len(laminate["layers"]) == 1:
+        yield "plate whose modulus depends on the frequency"
+    else:
+        yield f"laminate of {1e3 * laminate['thickness_m']:g} mm, bond {laminate['bond']}"
+        sliding = laminate["rigidity_freely_sliding_n_m"]
+        rows = {"perfectly bonded": bonded, "freely sliding": sliding}
     for layer in laminate["layers"]:
         yield (
             f"    {1e3 * layer['thickness_m']:g} mm of {layer['material']}: "
             f"E {layer['E_pa'] / 1e9:g} GPa, rho {layer['rho_kg_m3']:g} kg/m³, nu {layer['nu']:g}"
         )
-    bonded = laminate["rigidity_perfectly_bonded_n_m"]
     in_waves = laminate.get("rigidity_by_frequency_n_m", {})
-    bounds = {
-        "perfectly bonded": bonded,
-        "freely sliding": laminate["rigidity_freely_sliding_n_m"],
-    }
-    rows = {
-        **({} if is_single else bounds),
-        **{f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()},
-    }
+    rows |= {f"in free waves of {_frequency(key)}": each for key, each in in_waves.items()}
     for name, rigidity in rows.items():
         yield (
             f"    {name}  {rigidity:.4g} N m: natural frequencies of bending x "
@@ -412,15 +399,16 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
     yield "homogeneous plate like it at the highest frequency"
 
 
-def _air_rows(air: dict[str, Any] | None) -> list[str]:
-    """The air gap behind a plate."""
+def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
+    """Yield the air gap behind a plate."""
     if air is None:
-        return ["    no air: a plate in a vacuum, unless air_gap is given"]
-    gap = f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges"
-    if not air["closed"]:
-        return [f"{gap} open"]
-    stiffness = f"{air['stiffness_n_m3'] / 1e6:.4g} MN/m³"
-    return [f"{gap} sealed", f"        stiffness against even motion  {stiffness}"]
+        yield "    no air: a plate in a vacuum, unless air_gap is given"
+    else:
+        edges = "sealed" if air["closed"] else "open"
+        yield f"    air gap of {1e3 * air['depth_m']:g} mm behind it, edges {edges}"
+    if air is not None and air["closed"]:
+        stiffness = air["stiffness_n_m3"] / 1e6
+        yield f"        stiffness against even motion  {stiffness:.4g} MN/m³"
 
 
 def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) -> Iterator[str]:
@@ -440,11 +428,8 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
         )
     level, start = f"{reach['level_db_sl']:g} dB SL", reach["from_hz"]
     everywhere = "everywhere but 2 cm at the edges, under a finger"
-    yield (
-        f"    {level} {everywhere}: from {start:g} Hz"
-        if start is not None
-        else f"    {level} {everywhere}: at no frequency"
-    )
+    from_where = "at no frequency" if start is None else f"from {start:g} Hz"
+    yield f"    {level} {everywhere}: {from_where}"
     rows = zip(reach["frequencies_hz"], reach["share_of_places"], strict=True)
     short = [
         f"{frequency:g} Hz on {100 * (1 - share):.1f} %"

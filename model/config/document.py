@@ -9,7 +9,6 @@ numbers, true, false or null (core schema of YAML 1.2).
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -172,9 +171,11 @@ def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Docum
         line = text.count("\n", 0, found.start()) + 1
         message = f"character U+{ord(found[0]):04X} is not allowed in YAML; remove it"
         raise ConfigError(source, [ConfigProblem(line, "", message)])
-    with _errors_at(source, text):
-        reader = _PlainReader(text)
+    reader = _PlainReader(source, text)
+    try:
         data = reader.document()
+    except yaml.MarkedYAMLError as error:
+        raise _unparsed(source, text, error) from error
     if reader.repeated:
         raise ConfigError(source, reader.repeated)
     if data is None:
@@ -186,22 +187,15 @@ def _whole(source: str, message: str) -> ConfigError:
     return ConfigError(source, [ConfigProblem(None, "", message)])
 
 
-@contextmanager
-def _errors_at(source: str, text: str) -> Iterator[None]:
-    """Raise what the parser raises as ConfigError, with the line."""
-    try:
-        yield
-    except _Refusal as error:
-        raise ConfigError(source, error.problems) from None
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = None if mark is None else mark.line + 1
-        said = " ".join(part for part in (error.context, error.problem) if part)
-        remedy = "" if line is None else _remedy(text, line)
-        if not remedy and "expected ','" in said:
-            line, remedy = _missing_comma(text, mark)
-        problem = ConfigProblem(line, "", f"is not valid YAML: {said}{remedy}")
-        raise ConfigError(source, [problem]) from error
+def _unparsed(source: str, text: str, error: yaml.MarkedYAMLError) -> ConfigError:
+    """The error for text that the parser refuses, with the line and what to do."""
+    mark = error.problem_mark or error.context_mark
+    line = None if mark is None else mark.line + 1
+    said = " ".join(part for part in (error.context, error.problem) if part)
+    remedy = "" if line is None else _remedy(text, line)
+    if not remedy and "expected ','" in said:
+        line, remedy = _missing_comma(text, mark)
+    return ConfigError(source, [ConfigProblem(line, "", f"is not valid YAML: {said}{remedy}")])
 
 
 _BLANKS = re.compile(r"(?<!^)\ufeff|[\t\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000]")
@@ -249,13 +243,6 @@ def _missing_comma(text: str, mark: Any) -> tuple[int, str]:
     )
 
 
-class _Refusal(Exception):
-    """A part of a file that is not plain data."""
-
-    def __init__(self, *problems: ConfigProblem) -> None:
-        self.problems = problems
-
-
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml where it is there
 _NOT_ALLOWED = yaml.reader.Reader.NON_PRINTABLE  # libyaml counts bytes, and knows other characters
 
@@ -266,8 +253,8 @@ class _PlainReader:
     lines: of every key and list entry by its path; repeated: keys that are given twice.
     """
 
-    def __init__(self, text: str) -> None:
-        self._text = text
+    def __init__(self, source: str, text: str) -> None:
+        self._source, self._text = source, text
         self._events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         self.lines: dict[KeyPath, int] = {}
         self.repeated: list[ConfigProblem] = []
@@ -312,7 +299,7 @@ class _PlainReader:
                 message = f"is given twice, first on line {self.lines[inner]}; remove one"
                 self.repeated.append(ConfigProblem(_line(key), key_name(inner), message))
                 if len(self.repeated) > MAX_PROBLEMS:
-                    raise _Refusal(*self.repeated)
+                    raise ConfigError(self._source, self.repeated)
             else:
                 mapping[key.value] = value
         return mapping
@@ -330,8 +317,8 @@ class _PlainReader:
         if self._count > _MAX_VALUES:
             raise self._refused((), event, f"has more than {_MAX_VALUES} values")
 
-    def _refused(self, path: KeyPath, event: Any, message: str) -> _Refusal:
-        return _Refusal(ConfigProblem(_line(event), key_name(path), message))
+    def _refused(self, path: KeyPath, event: Any, message: str) -> ConfigError:
+        return ConfigError(self._source, [ConfigProblem(_line(event), key_name(path), message)])
 
 
 _WORDS: dict[str, Scalar] = {

@@ -218,43 +218,45 @@ def _problem(
     """Convert a pydantic error of a section below a path."""
     # pydantic marks an error in the key of a mapping by a last entry "[key]".
     path = tuple(part for part in details["loc"] if part != "[key]")
-    context = details.get("ctx", {})
+    given, context = details["input"], details.get("ctx", {})
+    bound = context.get("min_length", context.get("max_length", 0))
     match details["type"]:
-        case "missing":
-            message = "missing; add it"
         case "extra_forbidden":
             message = _unknown_key(str(path[-1]), _section_at(root, path[:-1], document))
-        case "value_error":
-            message = str(context["error"])
-        case "model_type" | "dict_type":
-            message = f"must be a mapping of `key: value` lines, got {_shown(details)}"
-        case "list_type" | "tuple_type":
-            message = f"must be a list in brackets, got {_shown(details)}"
-        case "int_type" | "int_from_float":
-            message = f"must be a whole number, got {_shown(details)}"
-        case "string_type":
-            message = f"must be text, got {_shown(details)}{_in_quotes(details)}"
-        case "greater_than_equal":
-            message = f"must be at least {context['ge']}, got {_shown(details)}"
-        case "less_than_equal":
-            message = f"must be at most {context['le']}, got {_shown(details)}"
         case "literal_error" | "enum":
             message = _no_choice(details, context["expected"])
-        case "string_too_short":
-            message = "must not be empty; write text, or remove the key"
-        case "string_too_long":
-            bound = counted(context["max_length"], "character")
-            message = f"must have at most {bound}, got {_shown(details)}"
-        case "too_short" | "too_long":
-            bound = f"at least {context['min_length']}" if "min_length" in context else ""
-            bound = bound or f"at most {context['max_length']}"
-            count = len(details["input"])  # where it is known to be too many, it is not counted
-            message = (
-                f"must have {bound} {'entry' if bound.endswith(' 1') else 'entries'}, got {count}"
+        case kind if kind in _MESSAGES:
+            message = _MESSAGES[kind].format(
+                **context,
+                got=_shown(details),
+                quotes=_in_quotes(details),
+                entries=counted(bound, "entry", plural="entries"),
+                characters=counted(bound, "character"),
+                # where it is known to be too many, it is not counted
+                count=len(given) if isinstance(given, list | dict) else 0,
             )
         case _:
             message = f"{reworded(details['msg'])}, got {_shown(details)}"
     return document.problem((*below, *path), message)
+
+
+_WHOLE, _LIST = "must be a whole number, got {got}", "must be a list in brackets, got {got}"
+_MAPPING = "must be a mapping of `key: value` lines, got {got}"
+_MESSAGES = {
+    "missing": "missing; add it",
+    "value_error": "{error}",
+    **dict.fromkeys(("model_type", "dict_type"), _MAPPING),
+    **dict.fromkeys(("list_type", "tuple_type"), _LIST),
+    **dict.fromkeys(("int_type", "int_from_float"), _WHOLE),
+    "string_type": "must be text, got {got}{quotes}",
+    "greater_than_equal": "must be at least {ge}, got {got}",
+    "less_than_equal": "must be at most {le}, got {got}",
+    "string_too_short": "must not be empty; write text, or remove the key",
+    "string_too_long": "must have at most {characters}, got {got}",
+    "too_short": "must have at least {entries}, got {count}",
+    "too_long": "must have at most {entries}, got {count}",
+}
+"""Messages by pydantic's kinds of errors, of which it gives further values."""
 
 
 def _in_quotes(details: ErrorDetails) -> str:

@@ -174,10 +174,11 @@ def equal_area_points(plate: Plate) -> FloatArray:
 
 def _same_frequency(rig: Rig, free: FreePlate) -> PaperFigure:
     """Two ERAs on an edge and two on a diagonal, both at 110 Hz."""
-    both = (110.0, 110.0)
+    pairs = {"edge": edge_pair(rig.eras), "diagonal": diagonal_pair(rig.eras)}
+    titles = "(a) same edge: {names}", "(b) diagonal: {names}"
     panels = {
-        "edge": pair_map(rig, free, edge_pair(rig.eras), both, "(a) same edge: {names}"),
-        "diagonal": pair_map(rig, free, diagonal_pair(rig.eras), both, "(b) diagonal: {names}"),
+        key: pair_map(rig, free, pair, (110.0, 110.0), title)
+        for (key, pair), title in zip(pairs.items(), titles, strict=True)
     }
     return _maps("figure_11_maps", panels, columns=2, caption="Two ERAs at 110 Hz")
 
@@ -186,10 +187,8 @@ def _switched(rig: Rig, free: FreePlate) -> PaperFigure:
     """The diagonal pair at six switched pairs of frequencies."""
     pair = diagonal_pair(rig.eras)
     panels = {
-        f"{first:g}_{second:g}_hz": pair_map(
-            rig, free, pair, (first, second), f"({letter}) {{tones}}"
-        )
-        for letter, (first, second) in zip("abcdef", FIGURE_12_FREQUENCIES, strict=True)
+        f"{both[0]:g}_{both[1]:g}_hz": pair_map(rig, free, pair, both, f"({letter}) {{tones}}")
+        for letter, both in zip("abcdef", FIGURE_12_FREQUENCIES, strict=True)
     }
     caption = "Frequencies switched between two diagonal ERAs"
     return _maps("figure_12", panels, columns=3, caption=caption)
@@ -197,13 +196,17 @@ def _switched(rig: Rig, free: FreePlate) -> PaperFigure:
 
 def _stiffnesses(rig: Rig, free: FreePlate) -> PaperFigure:
     """The diagonal pair at 250 Hz on ERAs of 8 and of 16 kN/m."""
-    pair, panels = diagonal_pair(rig.eras), {}
-    for letter, stiffness in zip("ab", FIGURE_13_STIFFNESS, strict=True):
-        on_springs = replace(rig, eras=with_stiffness(rig.eras, stiffness))
-        title = f"({letter}) $k_b$ = {stiffness / 1000:g} kN/m"
-        panels[f"{stiffness / 1000:g}_kn_m"] = pair_map(
-            on_springs, free, pair, (250.0, 250.0), title
+    pair = diagonal_pair(rig.eras)
+    panels = {
+        f"{stiffness / 1000:g}_kn_m": pair_map(
+            replace(rig, eras=with_stiffness(rig.eras, stiffness)),
+            free,
+            pair,
+            (250.0, 250.0),
+            f"({letter}) $k_b$ = {stiffness / 1000:g} kN/m",
         )
+        for letter, stiffness in zip("ab", FIGURE_13_STIFFNESS, strict=True)
+    }
     names = " and ".join(rig.eras[era].name for era in pair)
     return _maps("figure_13_maps", panels, columns=2, caption=f"{names} at 250 Hz")
 

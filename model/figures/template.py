@@ -6,7 +6,7 @@ Lengths are millimetres. A template of the underside is mirrored left to right, 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from math import ceil
+from math import ceil, prod
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,11 @@ from model.files.array_file import whole_or_nothing
 from model.rig.rig import Rig
 
 MM_PER_INCH = 25.4
+POINT = MM_PER_INCH / 72
 BORDER, STRIP = 12.0, 22.0
 """Paper around the board [mm], and below it, with a ruler."""
 RULER = 100  # mm
-A4 = 210.0, 297.0  # mm
+A4 = (210.0, 297.0), (297.0, 210.0)  # mm; upright and across
 NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
 CROSS = 6.0  # mm; half of it
 LETTER, LINE = 1.6, 3.2  # mm, of labels
@@ -112,11 +113,12 @@ def write_template(path: Path, template: Template) -> int:
 def _pages(template: Template) -> Iterator[Figure]:
     """Yield A4 pages of the way round that takes fewer of them, from the top left on."""
     low, high, bottom, top = template.paper
-    options = []
-    for width, height in (A4, A4[::-1]):
-        across, down = width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP
-        options.append((ceil((high - low) / across), ceil((top - bottom) / down), across, down))
-    columns, rows, across, down = min(options, key=lambda each: each[0] * each[1])
+    sizes = [(width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP) for width, height in A4]
+    counts = [
+        (ceil((high - low) / width), ceil((top - bottom) / height)) for width, height in sizes
+    ]
+    pages, (across, down) = min(zip(counts, sizes, strict=True), key=lambda each: prod(each[0]))
+    columns, rows = pages
     for row, column in product(range(rows), range(columns)):
         upper = top - row * down
         # Columns are counted as they lie, whichever way x runs.
@@ -155,11 +157,8 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
     axes.add_patch(Rectangle((0, 0), length, width, fill=False, lw=0.7, gid="board"))
     axes.plot([0, length], [width / 2] * 2, [length / 2] * 2, [0, width], c="0.8", lw=0.3, ls="-.")
     for name, (x, y), radius, style in template.places():
-        if style == "dotted":  # a sensor
-            axes.plot(x, y, "x", c="black", ms=6, mew=0.5)
-        else:
-            ends = [x - CROSS, x + CROSS], [y, y], [x, x], [y - CROSS, y + CROSS]
-            axes.plot(*ends, c="black", lw=0.4)
+        mark, size = ("x", 6.0) if style == "dotted" else ("+", 2 * CROSS / POINT)
+        axes.plot(x, y, mark, c="black", ms=size, mew=0.4)
         if radius:
             axes.add_patch(Circle((x, y), radius, fill=False, lw=0.7, ls=style, gid=name))
         lines = template.label(name, (x, y))
@@ -167,30 +166,31 @@ def _draw(axes: Axes, template: Template, box: Box) -> None:
         axes.annotate(
             "\n".join(lines),
             (x, y),
-            (right * away, up * away),
+            (right * away / POINT, up * away / POINT),
             textcoords="offset points",
             size=7,
             ha="left" if right > 0 else "right",
             va="bottom" if up > 0 else "top",
             annotation_clip=True,
         )
-    if template.grain:
-        _draw_grain(
-            axes,
-            template.grain,
-            (max(low, 0), min(high, length)),
-            (max(bottom, 0), min(top, width)),
-        )
+    if template.grain:  # an arrow at the lower end of what is seen of the board
+        dx, dy = (GRAIN / 2 * each for each in template.grain)
+        x, y = (max(low, 0) + min(high, length)) / 2, max(bottom, 0) + CROSS + dy
+        arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
+        axes.annotate("", (x - dx, y - dy), (x + dx, y + dy), arrowprops=arrow)
+        axes.annotate("grain", (x, y), (3, 3), textcoords="offset points", size=8, color="0.6")
     axes.text(-5, -8, "0, 0", size=8, ha="center", clip_on=True)
-    arrow: dict[str, Any] = {"arrowprops": {"arrowstyle": "<-", "lw": 0.5}, "annotation_clip": True}
+    pointing: dict[str, Any] = {"arrowprops": {"arrowstyle": "<-", "lw": 0.5}}
     for name, start, end in (("x", (0, -4), (16, -4)), ("y", (-4, 0), (-4, 16))):
-        axes.annotate(name, start, end, size=8, va="center", ha="center", **arrow)
+        axes.annotate(
+            name, start, end, size=8, va="center", ha="center", annotation_clip=True, **pointing
+        )
 
 
 def _beside(
     at: tuple[float, float], radius: float, lines: Sequence[str], template: Template, box: Box
 ) -> tuple[tuple[int, int], float]:
-    """Where a label is: rightwards and upwards on paper, 1 or -1; its distance [points].
+    """Where a label is: rightwards and upwards on paper, 1 or -1; its distance [mm].
 
     On the side of the board's middle, unless a frame is there.
     """
@@ -206,19 +206,4 @@ def _beside(
         if low < x + across * to_right * (away + wide) < high
         and bottom < y + up * (away + tall) < top
     ]
-    return (free or ways)[0], away * 72 / MM_PER_INCH
-
-
-def _draw_grain(
-    axes: Axes,
-    direction: tuple[float, float],
-    across: tuple[float, float],
-    along: tuple[float, float],
-) -> None:
-    """An arrow along the grain at the lower end of what a page shows of the board."""
-    (dx, dy), half = direction, GRAIN / 2
-    x, y = sum(across) / 2, along[0] + CROSS + half * dy
-    ends = (x - half * dx, y - half * dy), (x + half * dx, y + half * dy)
-    arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
-    axes.annotate("", ends[0], ends[1], arrowprops=arrow)
-    axes.annotate("grain", (x, y), (3, 3), textcoords="offset points", size=8, color="0.6")
+    return (free or ways)[0], away

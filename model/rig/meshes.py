@@ -2,14 +2,15 @@
 
 import re
 
-from model.config.units import LENGTH, quantity
+from model.config.sections import Quantity
+from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError
 from model.fem.mesh import MITC4, Mesh, element_of
 from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
 from model.structure.plate import Plate
 
 _MAX_ELEMENTS_PER_SIDE = 1000
-_MIN_PERCENT, _MAX_PERCENT = 0.05, 10.0
+_ACCURACY = Quantity(RATIO, at_least=0.0005, at_most=0.1)
 _DEFAULT_ACCURACY = 0.01  # places within 0.1 mm of an ERA's change the response as much
 _MAX_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
 
@@ -34,7 +35,11 @@ def mesh_of(
         if isinstance(mesh, Mesh) and mesh.node_count > _MAX_NODES:
             raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")
         return mesh
-    accuracy = _accuracy(" ".join(words[1:])) if words[1:] else _DEFAULT_ACCURACY
+    asked = " ".join(words[1:]) or _DEFAULT_ACCURACY
+    try:
+        accuracy = _ACCURACY.read(asked)
+    except ValueError as error:
+        raise InputError(f"mesh: the accuracy of auto {error}; for example auto 1 %") from None
     polynomials = SpectralMesh.accurate(
         plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness, foot=foot
     )
@@ -45,18 +50,6 @@ def mesh_of(
             "limits.frequency, or ask for less accuracy"
         )
     return polynomials
-
-
-def _accuracy(text: str) -> float:
-    """The share that a percentage names."""
-    match = re.fullmatch(r"(\d{1,3}(?:\.\d{1,6})?) ?%", text, re.ASCII)
-    percent = float(match[1]) if match else 0.0
-    if not _MIN_PERCENT <= percent <= _MAX_PERCENT:
-        raise InputError(
-            f"mesh: the accuracy of auto must be {_MIN_PERCENT:g} % to {_MAX_PERCENT:g} %, for "
-            f"example auto 1 %, got {text[:40]!r}"
-        )
-    return percent / 100
 
 
 def parse_mesh(text: str, plate: Plate) -> PlateMesh:

@@ -3,7 +3,7 @@
 Bounds are wide: they catch values in the wrong unit.
 """
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -12,6 +12,8 @@ from pydantic import (
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
     Strict,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
 )
 from pydantic_core import CoreSchema, core_schema
 
@@ -57,7 +59,7 @@ from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 class _MaterialByName:
     """Annotation of a material that may be given by name."""
 
-    def read(self, value: object, section: core_schema.ValidatorFunctionWrapHandler) -> object:
+    def read(self, value: object, section: ValidatorFunctionWrapHandler) -> object:
         """Look up a material by its name: its numbers may depend on the thickness."""
         return known_material(value) if isinstance(value, str) else section(value)
 
@@ -77,22 +79,9 @@ def _modulus(at_least: float = 1e3) -> Quantity:
     return Quantity(MODULUS, at_least=at_least, at_most=1e13)
 
 
-class _OrNone:
-    """Annotation of a section in place of which `none` may stand: pydantic names both in errors."""
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        section = handler.generate_schema(get_args(source)[0])
-        return core_schema.no_info_wrap_validator_function(self._read, section)
-
-    def _read(self, value: object, section: core_schema.ValidatorFunctionWrapHandler) -> object:
-        return value if value == "none" else section(value)
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        return {"anyOf": [handler(schema), {"const": "none"}]}
+def _or_none(value: object, section: ValidatorFunctionWrapHandler) -> object:
+    """A section, or `none` in its place: of a union pydantic would name both in errors."""
+    return value if value == "none" else section(value)
 
 
 ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI]
@@ -534,7 +523,10 @@ class RigSection(Section):
     uncertainty: UncertaintySection = UncertaintySection()
     """How well the rig is known, see [uncertainty](#uncertainty)."""
 
-    fingertip: Annotated[FingertipSection | Literal["none"], _OrNone()] = FingertipSection()
+    fingertip: Annotated[
+        FingertipSection,
+        WrapValidator(_or_none, json_schema_input_type=FingertipSection | Literal["none"]),
+    ] = FingertipSection()
     """Load of each finger on the plate, see [fingertip](#fingertip); `none` for weightless ones.
 
     Limits: a mapping, or `none`

@@ -12,8 +12,9 @@ The plate on its attachments is a low-rank correction of the free plate (Woodbur
 
 import cmath
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
@@ -71,11 +72,14 @@ class InTime:
     inertance: float = 0.0
 
 
-class Source(Support, Protocol):
-    """What drives the plate, and supports it: an actuator.
+@dataclass(frozen=True)
+class Source(ABC):
+    """What drives the plate, and supports it: an actuator. It is a `Support`, too.
 
-    Errors of its spring and damper act on the plate with the change of D times the base less the
-    plate's motion.
+    name: in the rig; x, y [m], foot [m]: as of a support; stiffness [N/m], damping [N s/m]: of its
+    spring and damper. gains: measured complex gain of its drive, at ascending frequencies, empty
+    for a gain of 1. Errors of its spring and damper act on the plate with the change of D times the
+    base less the plate's motion.
     """
 
     LEARNED: ClassVar[tuple[str, ...]]
@@ -84,71 +88,41 @@ class Source(Support, Protocol):
     UNIT: ClassVar[str]
     """Of its drive: m of an ERA's base, V of an exciter."""
 
-    @property
-    def name(self) -> str:
-        """Its name in the rig."""
+    name: str
+    x: float
+    y: float
+    stiffness: float
+    damping: float
+    gains: tuple[Gain, ...] = field(default=(), kw_only=True)
+    foot: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Keep gains as tuples: a file gives lists, which cannot be compared and hashed."""
+        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
+        object.__setattr__(self, "gains", gains)
 
     @property
+    @abstractmethod
     def full_level(self) -> float:
         """Amplitude of its drive at level 1."""
 
     @property
-    def gains(self) -> tuple[Gain, ...]:
-        """Its measured gain."""
-
-    @property
+    @abstractmethod
     def support(self) -> "PointLoad":
         """What it is at rest to a plate that moves slowly."""
 
     @property
+    @abstractmethod
     def in_time(self) -> InTime:
         """Its equations in time."""
 
     @property
     def excursion(self) -> float:
-        """Largest motion between its ends [m], infinite where nothing limits it."""
+        """Largest motion between its ends [m]: infinite where nothing limits it."""
+        return math.inf
 
     def gain(self, frequencies: FloatArray) -> ComplexArray:
-        """Complex gain of its drive at frequencies [Hz], of their shape."""
-
-    def force(self, omega: FloatArray) -> ComplexArray:
-        """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
-
-    def deviating(
-        self, omega: FloatArray, stiffness: Factor, damping: Factor
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Dynamic stiffness [N/m], and force by its drive without its gain, of one that deviates.
-
-        stiffness, damping: by factors; all arguments broadcast.
-        """
-
-    def base(self, omega: FloatArray) -> ComplexArray:
-        """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
-
-    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
-        """The source with another stiffness and damping, by factors."""
-
-    def loosened(self, share: float) -> Self:
-        """The source where it is held by a share of its contact."""
-
-    @property
-    def fields(self) -> Mapping[str, str]:
-        """Its fields that an identification may change, by the kind of parameter."""
-
-    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
-        """Changes of D [N/m] and of the force [N] with its values, by kind, each as omega.
-
-        With damping [N s/m] and bolt_mass [kg], of all others with the logarithm.
-        """
-
-
-class MeasuredGains:
-    """The measured gain of a source: gains at ascending frequencies, empty for a gain of 1."""
-
-    gains: tuple[Gain, ...]
-
-    def gain(self, frequencies: FloatArray) -> ComplexArray:
-        """Complex gain at frequencies [Hz], of their shape; 1 without measured gains.
+        """Complex gain of its drive at frequencies [Hz], of their shape; 1 without measured gains.
 
         Linear between measured frequencies, constant outside. At negative frequencies, as in the
         lower sideband of a fast ramp, the conjugate: what is driven is real.
@@ -160,37 +134,61 @@ class MeasuredGains:
         found = np.interp(np.abs(frequencies), measured, values)
         return np.asarray(np.where(np.asarray(frequencies) < 0, found.conj(), found))
 
-    def _tuples_of_gains(self) -> None:
-        """Keep gains as tuples: a file gives lists, which cannot be compared and hashed."""
-        gains = tuple((float(f), float(size), float(phase)) for f, size, phase in self.gains)
-        object.__setattr__(self, "gains", gains)
+    @abstractmethod
+    def force(self, omega: FloatArray) -> ComplexArray:
+        """Force [N] at full level on a plate that is held, at omega [rad/s], of its shape."""
+
+    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
+        """D [N/m] at omega [rad/s], of its shape."""
+        return self.deviating(omega, 1.0, 1.0)[0]
+
+    @abstractmethod
+    def deviating(
+        self, omega: FloatArray, stiffness: Factor, damping: Factor
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Dynamic stiffness [N/m], and force by its drive without its gain, of one that deviates.
+
+        stiffness, damping: by factors; all arguments broadcast.
+        """
+
+    @abstractmethod
+    def base(self, omega: FloatArray) -> ComplexArray:
+        """Motion of its base at full level [m] at omega [rad/s], its own gain included."""
+
+    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
+        """The source with another stiffness and damping, by factors."""
+        return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
+
+    @abstractmethod
+    def loosened(self, share: float) -> Self:
+        """The source where it is held by a share of its contact."""
+
+    @property
+    @abstractmethod
+    def fields(self) -> Mapping[str, str]:
+        """Its fields that an identification may change, by the kind of parameter."""
+
+    @abstractmethod
+    def slopes(self, omega: FloatArray) -> Mapping[str, tuple[ComplexArray, ComplexArray]]:
+        """Changes of D [N/m] and of the force [N] with its values, by kind, each as omega.
+
+        With damping [N s/m] and bolt_mass [kg], of all others with the logarithm.
+        """
 
 
 @dataclass(frozen=True)
-class Era(MeasuredGains):
+class Era(Source):
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
-    x, y: position of its bolt [m]; stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg];
-    stroke: the largest base amplitude [m]; foot [m]: radius of the disc on which it acts, 0 for a
-    point. An ERA that is not driven still supports and damps.
-    gains: measured complex gain of its base, at ascending frequencies; empty for a gain of 1.
+    stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg]; stroke: the largest base amplitude
+    [m]. An ERA that is not driven still supports and damps.
     """
 
     LEARNED: ClassVar[tuple[str, ...]] = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
-    """Fields that measurements of a plate change."""
-
     UNIT: ClassVar[str] = "m"
-    """Of its drive."""
 
-    name: str
-    x: float
-    y: float
-    stiffness: float
-    damping: float
     bolt_mass: float
     stroke: float
-    gains: tuple[Gain, ...] = ()
-    foot: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -201,17 +199,12 @@ class Era(MeasuredGains):
             at_least="damping bolt_mass foot",
             finite="x y",
         )
-        self._tuples_of_gains()
+        super().__post_init__()
 
     @property
     def full_level(self) -> float:
         """Amplitude of its base at level 1, its stroke [m]."""
         return self.stroke
-
-    @property
-    def excursion(self) -> float:
-        """Infinite: the stroke limits its base alone."""
-        return math.inf
 
     @property
     def support(self) -> "PointLoad":
@@ -224,14 +217,10 @@ class Era(MeasuredGains):
         k, c = self.stiffness, self.damping
         return InTime(self.bolt_mass, k, c, by_drive=k, by_rate=c)
 
-    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """D = k_b + i omega c - omega² m_b [N/m] at omega [rad/s], of its shape."""
-        return self.support.dynamic_stiffness(omega)
-
     def deviating(
         self, omega: FloatArray, stiffness: Factor, damping: Factor
     ) -> tuple[ComplexArray, ComplexArray]:
-        """D and k_b + i omega c [N/m] of one with another stiffness and damping, by factors."""
+        """D = k_b + i omega c - omega² m_b, and k_b + i omega c [N/m], by factors of k_b and c."""
         spring = stiffness * self.stiffness + 1j * omega * (damping * self.damping)
         return np.asarray(spring - omega**2 * self.bolt_mass), np.asarray(spring)
 
@@ -242,10 +231,6 @@ class Era(MeasuredGains):
     def force(self, omega: FloatArray) -> ComplexArray:
         """Force (k_b + i omega c) times the base's motion at full stroke [N] (paper Eq. 25)."""
         return np.asarray((self.stiffness + 1j * omega * self.damping) * self.base(omega))
-
-    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
-        """An ERA that is stiffer and damps more by factors."""
-        return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
 
     def loosened(self, share: float) -> Self:
         """An ERA with a share of its stiffness, which damps less, too."""

@@ -27,35 +27,27 @@ import numpy as np
 from model.arguments import expect_values
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.structure.attachments import Factor, InTime, MeasuredGains, PointLoad
+from model.structure.attachments import Factor, InTime, PointLoad, Source
 
 _MAX_LAG = 0.1
 
 
 @dataclass(frozen=True)
-class Exciter(MeasuredGains):
+class Exciter(Source):
     """One exciter whose coil is glued to the plate.
 
-    x, y [m], foot [m]: as of an ERA; stiffness k [N/m] and damping c [N s/m]: of the suspension;
-    magnet_mass M, coil_mass m_c [kg]; force_factor Bl [N/A]; resistance R_e, source_resistance R_g
-    [ohm]; inductance L [H]; voltage: amplitude [V] at full level; excursion: largest amplitude of
-    the coil in the magnet [m], infinite where no sheet says; held: whether a frame holds the
-    magnet; gains: measured complex gain of its amplifier and converter.
+    stiffness k [N/m] and damping c [N s/m]: of the suspension; magnet_mass M, coil_mass m_c [kg];
+    force_factor Bl [N/A]; resistance R_e, source_resistance R_g [ohm]; inductance L [H]; voltage:
+    amplitude [V] at full level; excursion: largest amplitude of the coil in the magnet [m],
+    infinite where no sheet says; held: whether a frame holds the magnet; gains: of its amplifier
+    and converter.
     """
 
     LEARNED: ClassVar[tuple[str, ...]] = (
         *("x", "y", "stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "gains"),
     )
-    """Fields that measurements of a plate change."""
-
     UNIT: ClassVar[str] = "V"
-    """Of its drive."""
 
-    name: str
-    x: float
-    y: float
-    stiffness: float
-    damping: float
     magnet_mass: float
     coil_mass: float
     force_factor: float
@@ -65,8 +57,6 @@ class Exciter(MeasuredGains):
     inductance: float = 0.0
     excursion: float = math.inf
     held: bool = False
-    gains: tuple[tuple[float, float, float], ...] = ()
-    foot: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -77,7 +67,7 @@ class Exciter(MeasuredGains):
             at_least="damping coil_mass source_resistance inductance foot",
             finite="x y",
         )
-        self._tuples_of_gains()
+        super().__post_init__()
         lag, allowed = -self.in_time.inertance, _MAX_LAG * self.magnet_mass
         if lag > allowed:
             raise InputError(
@@ -128,10 +118,6 @@ class Exciter(MeasuredGains):
             inertance=-(self.force_factor**2) * delay / total,
         )
 
-    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """D = S T - omega² m_c [N/m] at omega [rad/s], of its shape."""
-        return self.deviating(omega, 1.0, 1.0)[0]
-
     def force(self, omega: FloatArray) -> ComplexArray:
         """F = T Bl V / Z at full level on a plate that is held [N], its own gain included."""
         w = np.asarray(omega)
@@ -140,7 +126,7 @@ class Exciter(MeasuredGains):
     def deviating(
         self, omega: FloatArray, stiffness: Factor, damping: Factor
     ) -> tuple[ComplexArray, ComplexArray]:
-        """D [N/m] and T Bl / Z [N/V] of one with another suspension, by factors."""
+        """D = S T - omega² m_c [N/m] and T Bl / Z [N/V], by factors of k and c."""
         w = np.asarray(omega)
         spring = self._spring(w, stiffness, damping)
         share = self._share(w, spring)
@@ -177,10 +163,6 @@ class Exciter(MeasuredGains):
         """Coil in the magnet T w [m] by the plate's motion w (f, ...) [m] at omega (f,) [rad/s]."""
         share = self._share(np.asarray(omega))
         return np.asarray(share.reshape(-1, *[1] * (moved.ndim - 1)) * moved)
-
-    def varied(self, *, stiffness: float = 1.0, damping: float = 1.0) -> Self:
-        """An exciter whose suspension is stiffer and damps more by factors."""
-        return replace(self, stiffness=stiffness * self.stiffness, damping=damping * self.damping)
 
     def loosened(self, share: float) -> Self:
         """An exciter that acts with a share of its dynamic stiffness, by its glue, and less force.

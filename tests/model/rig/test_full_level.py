@@ -11,7 +11,6 @@ from benchmarks.direct_plate import direct_acceleration
 from exciter_rig import exciter_rig, exciter_rig_text
 from model.answer.fingers import Placement
 from model.config.document import ConfigError
-from model.errors import InputError
 from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
@@ -175,39 +174,11 @@ def test_particular_solution_is_the_same_for_negative_frequency(
     np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_load_rig_reads_gains_and_refuses_invalid_rows(tmp_path: Path) -> None:
-    """Rows are frequency, magnitude and degrees; an invalid one is refused with its line."""
-    text = """\
-plate: {length: 0.3, width: 0.2, thickness: 1.5 mm, material: steel}
-mesh: 12x9
-limits: {frequency: [40, 200]}
-eras:
-  A: {at: [0, 0], stiffness: 9000, amplifier: m, channel: 0, gains: [[50, 0.9, 90], [60, 1, 0]]}
-  B: {at: [0.3, 0], stiffness: 9000, amplifier: m, channel: 1}
-  C: {at: [0, 0.2], stiffness: 9000, amplifier: m, channel: 2}
-amplifiers: {m: {url: "sim://"}}
-"""
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    rig = load_rig(path)
-    assert rig.eras[0].gains == ((50.0, 0.9, math.pi / 2), (60.0, 1.0, 0.0))
-    assert rig.eras[1].gains == ()
-    for row, said in (("[60, 0, 0]", "magnitude"), ("[40, 1, 0]", "ascend")):
-        path.write_text(text.replace("[60, 1, 0]", row))
-        with pytest.raises(InputError, match=rf"rig\.yaml:5: eras\.A\.gains: .*{said}"):
-            load_rig(path)
-
-
-def test_corners_layout_is_that_of_the_paper():
-    """The layout `corners` on the paper's plate is the paper's own rig."""
+def test_corners_and_pairs_are_those_of_the_paper():
+    """`corners` are its own rig, of which SW and SE share the long edge, and SW and NE not."""
     rig = make_paper_rig(12, 9)
     corners = next(layout for layout in FOUR_ERA_LAYOUTS if layout.name == "corners")
     expected = [(era.x, era.y) for era in rig.eras]
     np.testing.assert_allclose(corners.positions(rig.plate), expected)
-
-
-def test_edge_and_diagonal_pairs_of_the_paper():
-    """On the paper's rig: SW and SE share the long edge, SW and NE are diagonal."""
-    eras = make_paper_rig(12, 9).eras
-    assert [eras[era].name for era in edge_pair(eras)] == ["SW", "SE"]
-    assert [eras[era].name for era in diagonal_pair(eras)] == ["SW", "NE"]
+    pairs = [[rig.eras[era].name for era in of(rig.eras)] for of in (edge_pair, diagonal_pair)]
+    assert pairs == [["SW", "SE"], ["SW", "NE"]]

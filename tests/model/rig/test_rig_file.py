@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.kind import RIG
 from model.rig.meshes import parse_mesh
-from model.rig.rig import Channel
+from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Fingertip, PointLoad
 from model.structure.materials import material
@@ -126,6 +127,8 @@ def check_refusal(
         (10, "    stiffness: 17 N", "10 eras.SW.stiffness"),
         (10, "", "8 eras.SW.stiffness"),
         (11, "    stroke: 100", "11 eras.SW.stroke"),
+        (11, "    gains: [[50, 0.9, 90], [60, 0, 0]]", "11 eras.SW.gains"),
+        (11, "    gains: [[50, 0.9, 90], [40, 1, 0]]", "11 eras.SW.gains"),
         (12, "", "8 eras.SW.amplifier"),
         (13, "    channel: 0.5", "13 eras.SW.channel"),
         (13, "    channel: '0'", "13 eras.SW.channel"),
@@ -149,6 +152,14 @@ def check_refusal(
         (23, f"{FOOT}: {{at: [0, 1], kind: foam}}", "25 supports.a.at"),
         (23, f"{FOOT}: {{at: [0, 0], kind: foams}}", "25 supports.a.kind, foam"),
         (23, f"{FOOT}: {{at: [0, 0], stiffness: 2 MN/m}}", "25 supports.a.foot"),
+        (10, "    stiffness: 1 MN/m", "8 eras.SW.foot"),
+        (23, "  level: 0.5\nuncertainty: {damping: 0.5}", "24 uncertainty.damping"),
+        (23, "  level: 0.5\nuncertainty: {thickness: 0.1}", "24 uncertainty.thickness"),
+        (23, "  level: 0.5\nuncertainty: {gain: -0.1}", "24 uncertainty.gain"),
+        (23, "  level: 0.5\nuncertainty: {mass: 1}", "24 uncertainty.mass"),
+        (23, "  level: 0.5\nfingertip: heavy", "24 fingertip"),
+        (23, "  level: 0.5\nfingertip: {damping: 0}", "24 fingertip.damping"),
+        (23, "  level: 0.5\nthreshold: loud", "24 threshold"),
         (23, f"{FOOT}: {{along: edges, kind: foam}}", "25 supports.a.kind"),
         (23, f"{FOOT}: {{along: edges}}", "25 supports.a.stiffness_per_length"),
         (23, "  level: 0.5\nplates: 2", "24 plates, plate"),
@@ -207,199 +218,194 @@ def test_parse_mesh_accepts_common_spellings(text: str) -> None:
     assert (mesh.nx, mesh.ny, mesh.length, mesh.width) == (48, 36, 0.4, 0.3)
 
 
-def test_load_rig_reads_units_defaults_wiring_and_limits(tmp_path: Path) -> None:
+CAMERA, PLUG = "camera: {at: [50 mm, 9 in], mass: 20 g}", "plug: {at: [0, 0], mass: 5 g}"
+RATIO = 2 * math.sqrt(17000 * 2700 * 0.3048 * 0.2286 * 0.0015 / 2)  # c = zeta 2 sqrt(k m / n)
+OVER_TIME = "  slew: 2 %/ms\n  power: 150 %\n  on_time: 0.5 min\n  duty: 25 %\n"
+FIRM = "fingertip: {stiffness: 2 kN/m, contact_mass: 0.3 g}\n"
+ONE_LAYER = GOOD.replace(
+    "  thickness: 1.5 mm\n  material: aluminium",
+    "  layers: [{material: aluminium, thickness: 1.5 mm}]",
+)
+UNMESHED = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startswith("mesh"))
+
+
+@pytest.mark.parametrize(
+    ("text", "read", "expected"),
+    [
+        (
+            GOOD,
+            lambda rig: (rig.plate.length, rig.plate.width, rig.plate.thickness),
+            (0.3048, 0.2286, 0.0015),
+        ),
+        (GOOD, lambda rig: (rig.plate.loss_factor, rig.mesh.nx, rig.mesh.ny), (0.01, 48, 36)),
+        (GOOD, lambda rig: (rig.mesh.length, rig.mesh.width), (0.3048, 0.2286)),
+        (
+            GOOD,
+            lambda rig: (rig.eras[0].name, rig.eras[0].damping, rig.eras[1].name),
+            ("SW", 2.0, "NE"),
+        ),
+        (
+            GOOD,
+            lambda rig: (rig.eras[1].x, rig.eras[1].y, rig.eras[1].stiffness),
+            (0.3048, 0.2286, 17000),
+        ),
+        (GOOD, lambda rig: (rig.eras[1].bolt_mass, rig.eras[1].stroke, rig.masses), (0, 1e-4, ())),
+        (GOOD, lambda rig: (rig.wiring,), ({"SW": Channel("main", 0), "NE": Channel("main", 1)},)),
+        (GOOD, lambda rig: (rig.amplifiers,), ({"main": "sim://"},)),
+        (
+            GOOD,
+            lambda rig: (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level),
+            (40, 500, 0.5),
+        ),
+        # what arithmetic adds to a corner's coordinate is taken off again
+        (
+            GOOD.replace("[0.3048,", "[0.30480000000000007,"),
+            lambda rig: (rig.eras[1].x,),
+            (0.3048,),
+        ),
+        (
+            GOOD.replace("damping: 2.0", "gains: [[50, 0.9, 90], [60, 1, 0]]"),
+            lambda rig: (rig.eras[0].gains, rig.eras[1].gains),
+            (((50.0, 0.9, math.pi / 2), (60.0, 1.0, 0.0)), ()),
+        ),
+        (
+            GOOD.replace("damping: 2.0", "damping_ratio: 10 %"),
+            lambda rig: (rig.eras[0].damping, rig.eras[1].damping),
+            (pytest.approx(0.1 * RATIO, rel=1e-12), pytest.approx(0.05 * RATIO, rel=1e-12)),
+        ),
+        (
+            GOOD + OVER_TIME,
+            lambda rig: (
+                rig.limits.slew,
+                rig.limits.power,
+                rig.limits.on_time,
+                rig.limits.duty,
+                rig.limits.rate,
+            ),
+            (20.0, 1.5, 30.0, 0.25, math.inf),
+        ),
+        (
+            GOOD + "  rate: 0.1 kHz\n",
+            lambda rig: (rig.limits.rate, rig.limits.slew, rig.limits.duty),
+            (100, math.inf, 1),
+        ),
+        (
+            UNMESHED,
+            lambda rig: (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level),
+            (40, 500, 1),
+        ),
+        # by hand 2.7 + 0.2 + 2.38 kg/m²
+        (
+            LAMINATE,
+            lambda rig: (rig.plate.mass,),
+            (pytest.approx(5.28 * 0.3048 * 0.2286, rel=1e-9),),
+        ),
+        (
+            LAMINATE,
+            lambda rig: (rig.laminate.thickness, rig.laminate.bond),
+            (pytest.approx(3.2e-3), "full"),
+        ),
+        (
+            f"{GOOD}masses:\n  {CAMERA}\n  {PLUG}\n",
+            lambda rig: (rig.masses,),
+            ((PointLoad(0.05, 0.2286, mass=0.02), PointLoad(0.0, 0.0, mass=0.005)),),
+        ),
+        # of a plate that was not measured; 0, or a factor 1, is exact
+        (GOOD, lambda rig: (rig.uncertainty,), (Uncertainty(0.05, 5.0, 0.02, 0.1, 1.5, 0.5),)),
+        (GOOD + "uncertainty: {}\n", lambda rig: (rig.uncertainty,), (Uncertainty(),)),
+        (
+            GOOD + "uncertainty: {gain: 1 %, damping: 1, thickness: 0}\n",
+            lambda rig: (rig.uncertainty, rig.uncertainty.exactly_known),
+            (Uncertainty(0.01, 5.0, 0.0, 0.1, 1.0, 0.5), ("thickness", "damping")),
+        ),
+        (GOOD, lambda rig: (rig.fingertip,), (Fingertip(1000, 2, 0.0002, 0.005, 500, 2),)),
+        (GOOD + FIRM, lambda rig: (rig.fingertip,), (Fingertip(2000, 2, 0.0003, 0.005, 500, 2),)),
+        (GOOD + "fingertip: none\n", lambda rig: (rig.fingertip,), (None,)),
+    ],
+)
+def test_load_rig_reads_what_a_file_says(
+    tmp_path: Path, text: str, read: Callable[[Rig], object], expected: object
+) -> None:
     """Units are converted, defaults filled in, wiring and limits taken over."""
-    rig = load_rig(write(tmp_path, GOOD))
-    assert (rig.plate.length, rig.plate.width, rig.plate.thickness) == (0.3048, 0.2286, 0.0015)
-    assert rig.plate.loss_factor == 0.01
-    assert (rig.mesh.nx, rig.mesh.ny) == (48, 36)
-    assert (rig.mesh.length, rig.mesh.width) == (0.3048, 0.2286)
-    assert [era.name for era in rig.eras] == ["SW", "NE"]
-    with pytest.raises(InputError):
-        rig.era("X")
-    north_east = rig.era("NE")
-    assert (north_east.x, north_east.y) == (0.3048, 0.2286)
-    assert (north_east.stiffness, north_east.bolt_mass, north_east.stroke) == (17000, 0, 1e-4)
-    assert rig.era("SW").damping == 2.0
+    assert read(load_rig(write(tmp_path, text))) == expected
+
+
+def test_an_unknown_era_is_named_with_what_was_meant(tmp_path: Path) -> None:
+    """By the names that there are."""
     with pytest.raises(InputError, match=r"'sww'; did you mean SW\? choose from SW, NE"):
-        rig.era("sww")
-    assert rig.wiring == {"SW": Channel("main", 0), "NE": Channel("main", 1)}
-    assert rig.amplifiers == {"main": "sim://"}
-    assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 0.5)
+        load_rig(write(tmp_path, GOOD)).era("sww")
 
 
-def test_load_rig_converts_damping_ratios(tmp_path: Path) -> None:
-    """c = 2 zeta sqrt(k m / n), by hand: m = 2700 * 0.3048 * 0.2286 * 0.0015 kg, two ERAs."""
-    rig = load_rig(write(tmp_path, GOOD.replace("damping: 2.0", "damping_ratio: 10 %")))
-    mass = 2700 * 0.3048 * 0.2286 * 0.0015
-    assert rig.era("SW").damping == pytest.approx(0.2 * math.sqrt(17000 * mass / 2), rel=1e-12)
-    assert rig.era("NE").damping == pytest.approx(0.1 * math.sqrt(17000 * mass / 2), rel=1e-12)
-
-
-def test_load_rig_reads_limits_over_time(tmp_path: Path) -> None:
-    """2 % a millisecond is 20 a second, half a minute 30 s; what is not given is no limit."""
-    text = GOOD + "  slew: 2 %/ms\n  power: 150 %\n  on_time: 0.5 min\n  duty: 25 %\n"
-    limits = load_rig(write(tmp_path, text)).limits
-    assert (limits.slew, limits.power, limits.on_time, limits.duty) == (20.0, 1.5, 30.0, 0.25)
-    assert limits.rate == math.inf
-    rate = load_rig(write(tmp_path, GOOD + "  rate: 0.1 kHz\n")).limits
-    assert (rate.rate, rate.slew, rate.power, rate.on_time, rate.duty) == (100, *[math.inf] * 3, 1)
-
-
-def test_load_rig_chooses_mesh_and_limits_when_missing(tmp_path: Path) -> None:
-    """Without them the mesh is chosen for 500 Hz, which is the default limit."""
-    without = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startswith("mesh"))
-    rig = load_rig(write(tmp_path, without))
-    assert (rig.limits.frequency_min, rig.limits.frequency_max, rig.limits.level) == (40, 500, 1)
-    with_them = GOOD.replace("mesh: 48x36", "mesh: auto")
-    assert rig.mesh == load_rig(write(tmp_path, with_them)).mesh
+def test_load_rig_chooses_a_mesh_when_missing(tmp_path: Path) -> None:
+    """It is chosen for 500 Hz, which is the default limit."""
+    rig = load_rig(write(tmp_path, UNMESHED))
+    with_it = GOOD.replace("mesh: 48x36", "mesh: auto")
+    assert rig.mesh == load_rig(write(tmp_path, with_it)).mesh
     # D = E h^3 / 12 (1 - nu^2) = 22.0935 N m; wavelength = 2 pi (D / rho h w^2)^(1/4) = 0.1713 m
     assert rig.mesh.shortest_wavelength < 0.1713
 
 
-def test_a_stiff_mount_says_how_large_it_is(tmp_path: Path) -> None:
-    """From 1 MN/m `foot` is required; a point, said to be one, costs a warning with its size.
-
-    Of 1.5 mm of aluminium a tenfold smaller point gives 11.1 nm/N: ln 10 / (2 pi 5/6 26.3 GPa h).
-    """
-    third = "  SE: {at: [12 in, 0], stiffness: 17 kN/m, amplifier: main, channel: 2}\namplifiers:"
-    stiff = GOOD.replace("    stiffness: 17000\n", "    stiffness: 1 MN/m\n")
-    stiff = stiff.replace("48x36", "auto").replace("amplifiers:", third)
-    assert refused(tmp_path, stiff)[0][1] == "eras.NE.foot"
-    for foot, warnings in (("0", 1), ("5 mm", 0)):
-        text = stiff.replace("1 MN/m\n", f"1 MN/m\n    foot: {foot}\n")
-        checked = RIG.check(read_document(write(tmp_path, text)))
-        found = [each for each in checked.warnings if each.startswith("eras.NE.foot")]
-        assert len(found) == warnings
-        assert all("1.1 %" in each for each in found)
-
-
 @pytest.mark.parametrize(
-    ("gap", "warned"),
+    ("one", "other"),
     [
-        ("1.8 mm", None),
-        ("1.6 mm", "10 %"),
-        ("0.1 mm", "half of it or more"),
-        ("0.5 mm, closed: true", None),
-        ("0.2 mm, closed: true", "10 %"),
-        ("0.05 mm, closed: true", "half of it or more"),
+        (GOOD, ONE_LAYER),
+        (
+            f"{GOOD}masses:\n  {CAMERA}\n  {PLUG}\n",
+            f"{GOOD}masses:\n  {PLUG}\n  {CAMERA.replace('camera', 'eye')}\n",
+        ),
     ],
+    ids=["a single layer", "names and order of masses"],
 )
-def test_check_warns_of_an_air_gap_whose_friction_couples_modes(
-    tmp_path: Path, gap: str, warned: str | None
-) -> None:
-    """By boundary layers, by hand sqrt(2 1.82e-5 / (1.204 2 pi 40)) = 0.35 mm at 40 Hz."""
-    text = LAMINATE.replace("  bond: full\n", f"  air_gap: {{depth: {gap}}}\n")
-    text = text.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
-    checked = RIG.check(read_document(write(tmp_path, text)))
-    found = [each for each in checked.warnings if each.startswith("plate.air_gap")]
-    assert len(found) == (warned is not None)
-    assert all(f"off by {warned}" in each for each in found)
+def test_what_is_no_physics_leaves_the_fingerprint(tmp_path: Path, one: str, other: str) -> None:
+    """A laminate of one layer is that plate, a mass by another name is that mass."""
+    found = [load_rig(write(tmp_path, text)).fingerprint for text in (one, other)]
+    assert found[0] == found[1]
 
 
-def test_check_warns_of_a_plate_as_thick_as_one_in_another_unit(tmp_path: Path) -> None:
-    """6.4 cm in place of 6.4 mm of plywood, and no board of a shop."""
-    text = GOOD.replace("48x36", "auto").replace("aluminium", "plywood")
-    text = text.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
-    for thickness, count in (("6.4 cm", 1), ("18 mm", 0)):
-        path = write(tmp_path, text.replace("1.5 mm", thickness))
-        warnings = RIG.check(read_document(path)).warnings
-        assert sum(each.startswith("plate.thickness: 64 mm") for each in warnings) == count
-
-
-def test_check_warns_of_layers_that_slide_within_the_frequencies(tmp_path: Path) -> None:
-    """Aluminium 0.5 mm on both sides of 50 mm of foam of G 40 kPa: by hand 151 Hz.
-
-    1.35 kg/m² of each face and a sixth of the foam's 2.5, since it turns about its middle:
-    sqrt(2 x 40e3 / (0.05 x 1.767)) / 2 pi.
-    """
-    layers = """  layers:
+THIRD = "  SE: {at: [12 in, 0], stiffness: 17 kN/m, amplifier: main, channel: 2}\namplifiers:"
+STIFF = GOOD.replace("    stiffness: 17000\n", "    stiffness: 1 MN/m\n    foot: FOOT\n")
+GAP = LAMINATE.replace("  bond: full\n", "  air_gap: {depth: GAP}\n")
+THICK = GOOD.replace("aluminium", "plywood")
+FOAM = """  layers:
     - {material: aluminium, thickness: 0.5 mm}
     - {material: {name: foam, E: MODULUS, rho: 50, nu: 0.25}, thickness: 50 mm}
     - {material: aluminium, thickness: 0.5 mm}
 """
-    head, tail = LAMINATE[: LAMINATE.index("  layers:")], LAMINATE[LAMINATE.index("eras:") :]
-    tail = tail.replace("amplifiers:", "  SE: {at: [12 in, 0], stiffness: 17 kN/m}\namplifiers:")
-    for modulus, warned in (("0.1 MPa", True), ("100 MPa", False)):
-        text = head + layers.replace("MODULUS", modulus) + tail
-        checked = RIG.check(read_document(write(tmp_path, text)))
-        found = [each for each in checked.warnings if each.startswith("plate.layers")]
-        assert len(found) == warned
-        assert all("at 15" in each and "above 7" in each for each in found)
+FOAMED = LAMINATE[: LAMINATE.index("  layers:")] + FOAM + LAMINATE[LAMINATE.index("mesh:") :]
 
 
-def test_load_rig_reads_a_laminate(tmp_path: Path) -> None:
-    """The plate has the stack's mass, by hand 2.7 + 0.2 + 2.38 kg/m², and the bond is read."""
-    rig = load_rig(write(tmp_path, LAMINATE))
-    assert rig.plate.mass == pytest.approx(5.28 * 0.3048 * 0.2286, rel=1e-9)
-    assert rig.laminate is not None
-    assert [layer.thickness for layer in rig.laminate.layers] == [1e-3, 0.2e-3, 2e-3]
-    assert rig.laminate.bond == "full"
-    assert rig.plate.laminate == rig.laminate
-    firmer = load_rig(write(tmp_path, LAMINATE.replace("1 MPa", "10 MPa")))
-    assert firmer.plate.flexural_rigidity > rig.plate.flexural_rigidity
-    assert firmer.fingerprint != rig.fingerprint
-
-
-def test_fingerprint_is_the_same_for_one_layer_and_a_plain_plate(tmp_path: Path) -> None:
-    """A laminate of one layer has the numbers of that plate, and so its fingerprint."""
-    one = GOOD.replace(
-        "  thickness: 1.5 mm\n  material: aluminium",
-        "  layers: [{material: aluminium, thickness: 1.5 mm}]",
-    )
-    assert load_rig(write(tmp_path, one)).fingerprint == load_rig(write(tmp_path, GOOD)).fingerprint
-
-
-def test_load_rig_reads_masses_and_fingerprints_them(tmp_path: Path) -> None:
-    """A mass is read with its unit; its name and order are no physics, its weight and place are."""
-    bare = load_rig(write(tmp_path, GOOD))
-    assert bare.masses == ()
-    camera = "  camera: {at: [50 mm, 9 in], mass: 20 g}\n"
-    plug = "  plug: {at: [0, 0], mass: 5 g}\n"
-    rig = load_rig(write(tmp_path, GOOD + "masses:\n" + camera + plug))
-    assert rig.masses == (PointLoad(0.05, 0.2286, mass=0.02), PointLoad(0.0, 0.0, mass=0.005))
-    turned = (GOOD + "masses:\n" + plug + camera).replace("camera", "eye")
-    assert load_rig(write(tmp_path, turned)).fingerprint == rig.fingerprint
-    heavier = load_rig(
-        write(tmp_path, (GOOD + "masses:\n" + camera + plug).replace("20 g", "21 g"))
-    )
-    assert len({bare.fingerprint, rig.fingerprint, heavier.fingerprint}) == 3
-
-
-def test_load_rig_reads_uncertainty(tmp_path: Path) -> None:
-    """A key left out has the value of a plate that was not measured; 0, or a factor 1, is exact."""
-    built = Uncertainty(
-        gain=0.05, phase_deg=5, thickness=0.02, stiffness=0.1, damping=1.5, fingertip=0.5
-    )
-    for empty in ("", "uncertainty: {}\n"):
-        assert load_rig(write(tmp_path, GOOD + empty)).uncertainty == built
-    known = load_rig(write(tmp_path, GOOD + "uncertainty: {gain: 1 %, damping: 1, thickness: 0}\n"))
-    assert known.uncertainty == Uncertainty(0.01, 5.0, 0.0, 0.1, 1.0, 0.5)
-    assert known.uncertainty.exactly_known == ("thickness", "damping")
-    for wrong in ("damping: 0.5", "thickness: 0.1", "gain: -0.1", "mass: 1"):
-        with pytest.raises(ConfigError):
-            load_rig(write(tmp_path, GOOD + f"uncertainty: {{{wrong}}}\n"))
-
-
-def test_load_rig_reads_fingertip_and_threshold(tmp_path: Path) -> None:
-    """A finger that presses lightly by default, one by its values, or none; all are answers'."""
-    light = load_rig(write(tmp_path, GOOD))
-    assert light.fingertip == Fingertip(1000, 2, 0.0002, 0.005, 500, 2)
-    firm = load_rig(write(tmp_path, GOOD + "fingertip: {stiffness: 2 kN/m, contact_mass: 0.3 g}\n"))
-    assert firm.fingertip == Fingertip(2000, 2, 0.0003, 0.005, 500, 2)
-    none = load_rig(write(tmp_path, GOOD + "fingertip: none\n"))
-    assert none.fingertip is None
-    known = load_rig(write(tmp_path, GOOD + "uncertainty: {field: 0.1}\n"))
-    assert len({rig.fingerprint for rig in (light, firm, none, known)}) == 4
-    for wrong in ("fingertip: heavy", "fingertip: {damping: 0}", "threshold: loud"):
-        with pytest.raises(ConfigError):
-            load_rig(write(tmp_path, GOOD + wrong + "\n"))
-
-
-def test_load_rig_moves_an_era_within_rounding_onto_the_edge(tmp_path: Path) -> None:
-    """What arithmetic adds to a corner's coordinate is taken off again."""
-    rig = load_rig(write(tmp_path, GOOD.replace("[0.3048,", "[0.30480000000000007,")))
-    assert rig.era("NE").x == 0.3048
+@pytest.mark.parametrize(
+    ("text", "key", "said"),
+    [
+        # Of 1.5 mm of aluminium a tenfold smaller point gives 11.1 nm/N: ln 10 / (2 pi 5/6 G h).
+        (STIFF.replace("FOOT", "0"), "eras.NE.foot", "1.1 %"),
+        (STIFF.replace("FOOT", "5 mm"), "eras.NE.foot", None),
+        # By boundary layers, by hand sqrt(2 1.82e-5 / (1.204 2 pi 40)) = 0.35 mm at 40 Hz.
+        (GAP.replace("GAP", "1.8 mm"), "plate.air_gap", None),
+        (GAP.replace("GAP", "1.6 mm"), "plate.air_gap", "off by 10 %"),
+        (GAP.replace("GAP", "0.1 mm"), "plate.air_gap", "off by half of it or more"),
+        (GAP.replace("GAP", "0.5 mm, closed: true"), "plate.air_gap", None),
+        (GAP.replace("GAP", "0.2 mm, closed: true"), "plate.air_gap", "off by 10 %"),
+        (GAP.replace("GAP", "0.05 mm, closed: true"), "plate.air_gap", "off by half of it"),
+        # 6.4 cm in place of 6.4 mm of plywood, and no board of a shop.
+        (THICK.replace("1.5 mm", "6.4 cm"), "plate.thickness", "64 mm"),
+        (THICK.replace("1.5 mm", "18 mm"), "plate.thickness", None),
+        # By hand 151 Hz of foam of G 40 kPa: 1.35 kg/m² of each face and a sixth of the foam's 2.5,
+        # since it turns about its middle: sqrt(2 x 40e3 / (0.05 x 1.767)) / 2 pi.
+        (FOAMED.replace("MODULUS", "0.1 MPa"), "plate.layers", "at 151 Hz"),
+        (FOAMED.replace("MODULUS", "0.1 MPa"), "plate.layers", "above 75"),
+        (FOAMED.replace("MODULUS", "100 MPa"), "plate.layers", None),
+    ],
+)
+def test_check_warns_of_what_costs_accuracy(
+    tmp_path: Path, text: str, key: str, said: str | None
+) -> None:
+    """Of stiff points, of friction in an air gap, of another unit, of layers that slide."""
+    text = text.replace("48x36", "auto").replace("amplifiers:", THIRD)
+    warnings = RIG.check(read_document(write(tmp_path, text))).warnings
+    found = [each for each in warnings if each.startswith(key)]
+    assert len(found) == (said is not None)
+    assert all(str(said) in each for each in found)
 
 
 def test_config_check_refuses_an_unsupported_plate(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from model.rig.from_keys import rig as rig_by_keys
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad, footprints_of
 from model.structure.materials import known_material
-from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
+from model.structure.plate import Material, Plate
 from model.structure.support import GRAVITY, static_loads, support_problem
 from model.table.build import TableProblem, solve_table
 from model.table.following import table_following
@@ -137,27 +137,6 @@ def test_acrylic_by_name_is_stiffer_and_loses_less_at_higher_frequencies() -> No
         moduli = [layer.modulus(frequency) for frequency in (10.0, 100.0, 1000.0)]
         expected = [4.2e9 * (1 + 0.075j), 4.6e9 * (1 + 0.06j), 5e9 * (1 + 0.045j)]
         np.testing.assert_allclose(moduli, expected, rtol=1e-9)
-
-
-def test_layers_with_a_grain_are_refused() -> None:
-    """Bounds and waves of a laminate are those of isotropic layers."""
-    layer = LaminateLayer(board().plate.material, 1e-3)
-    with pytest.raises(InputError, match="isotropic"):
-        Laminate((layer, layer))
-
-
-@pytest.mark.parametrize(
-    "changes", [{"nu": 1.7}, {"E": 0.0}, {"orthotropy": (math.nan, 0.1, 0.1, 0.1)}], ids=str
-)
-def test_moduli_of_no_board_are_refused(changes: dict[str, Any]) -> None:
-    """E1 / E2 is 2.646, so that nu12 must be less than 1.627; and no modulus is 0 or NaN."""
-    good = board().plate.material
-    if "orthotropy" in changes:
-        with pytest.raises(InputError):
-            Orthotropy(*changes["orthotropy"])
-        return
-    with pytest.raises(InputError, match=next(iter(changes))):
-        replace(good, **changes)
 
 
 def test_feet_hold_the_weight_of_board_and_frame() -> None:

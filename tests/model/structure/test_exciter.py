@@ -8,7 +8,6 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from exciter_rig import exciter_rig
 from model.arrays import lattice
-from model.errors import InputError
 from model.fem.plate import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import Fingertip, FingertipLoad
@@ -50,13 +49,6 @@ def test_force_and_dynamic_stiffness_by_hand(
     exciter = replace(BY_HAND, held=held)
     assert exciter.force(omega)[0] == pytest.approx(force, rel=1e-4)
     assert exciter.dynamic_stiffness(omega)[0] == pytest.approx(stiffness, rel=1e-4)
-
-
-def test_resonance_quality_and_force_of_the_glued_magnet() -> None:
-    """f_m = f_s sqrt(m_s / M) of 224 Hz, 1.61 g and 109.29 g; Q and force at 1 W as worked out."""
-    assert BY_HAND.magnet_frequency == pytest.approx(224 * np.sqrt(1.61 / 109.29), rel=1e-4)
-    assert BY_HAND.quality == pytest.approx(5, abs=0.1)
-    assert BY_HAND.largest_force == pytest.approx(2.5, abs=0.05)
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -103,10 +95,3 @@ def test_response_on_a_board_against_magnet_and_current_solved_beside_it(magnet:
     )
     apart = np.linalg.norm(found - expected, axis=2) / np.linalg.norm(expected, axis=2)
     assert apart.max() < 3e-3
-
-
-@pytest.mark.parametrize("key", ["stiffness", "magnet_mass", "force_factor", "resistance"])
-def test_values_that_no_exciter_has_are_refused(key: str) -> None:
-    """By name and key."""
-    with pytest.raises(InputError, match=f"exciter SW: {key}"):
-        replace(BY_HAND, **{key: 0.0})

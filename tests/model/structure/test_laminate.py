@@ -8,7 +8,6 @@ import pytest
 
 from benchmarks.layers.elasticity import wave_number
 from long_form import in_turn
-from model.errors import InputError
 from model.structure.laminate_section import (
     bending,
     equivalent_plate,
@@ -151,14 +150,6 @@ def test_modulus_by_frequency_is_a_power_law_between_rows():
     assert layer.modulus(100.0) == pytest.approx(70e6 * (1 + 0.4j))
     assert layer.modulus(1.0) == pytest.approx(0.25 * 70e6 * (1 + 0.2j))
     assert layer.modulus(5e3) == pytest.approx(4 * 70e6 * (1 + 0.6j))
-
-
-def test_laminate_refuses_no_layers_and_losses_of_layers_that_slide():
-    """Neither has a meaning."""
-    with pytest.raises(InputError, match=r"^laminate: .*layer"):
-        Laminate(())
-    with pytest.raises(InputError, match=r"^laminate: .*bond none"):
-        Laminate((PANEL[0], replace(PANEL[1], loss_factor=0.1)), Bond.NONE)
 
 
 def test_sliding_layers_add_their_rigidities():

@@ -7,8 +7,9 @@ import pytest
 
 from model.errors import InputError
 from model.structure.attachments import Era, Fingertip, PointLoad
+from model.structure.exciter import Exciter
 from model.structure.materials import material
-from model.structure.plate import AirGap, LaminateLayer, Material, Plate
+from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Material, Orthotropy, Plate
 from paper_plate import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
@@ -72,6 +73,12 @@ def test_material_refuses_an_unknown_name_with_a_suggestion(name, message):
             },
         ),
         (Era("A", 0.1, 0.1, 1e4, 1.0, 0.0, 1e-4), {"stroke": [0.0], "foot": [-1e-3, math.nan]}),
+        (
+            Exciter("SW", 0.1, 0.1, 3e3, 0.8, 0.1, 2e-3, 3.6, 4.3, 3.0),
+            {key: [0.0] for key in ("stiffness", "magnet_mass", "force_factor", "resistance")},
+        ),
+        (Orthotropy(0.4, 0.1, 0.1, 0.1), {"e2": [math.nan, 0.0], "g13": [-1.0]}),
+        (replace(GLASS, orthotropy=Orthotropy(0.4, 0.1, 0.1, 0.1)), {"E": [0.0]}),
         (Fingertip(), {"damping": [0.0], "stiffness": [-1.0], "phalanx_mass": [math.nan, 0.0]}),
         (AirGap(1e-3), {"depth": [0.0, -1e-3, math.nan]}),
     ],
@@ -85,20 +92,44 @@ def test_value_refuses_numbers_out_of_range(good, values):
                 replace(good, **{key: number})
 
 
-def test_rig_refuses_eras_and_masses_off_the_plate():
-    """Not only a rig file is checked: a rig put together by a program is, too."""
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda rig: {"eras": (*rig.eras, Era("out", 0.31, 0.1, 17000.0, 0.0, 0.0, 1e-4))},
+            r"ERA out .*\(0.31, 0.1\)",
+        ),
+        (lambda _: {"masses": (PointLoad(0.1, -0.01, mass=0.005),)}, r"mass.*\(0.1, -0.01\)"),
+        (lambda rig: {"eras": (*rig.eras, replace(rig.era("SW"), name="again"))}, "SW and again"),
+        (lambda rig: {"eras": (*rig.eras, replace(rig.era("SW"), x=0.1))}, r"name.*SW|SW.*name"),
+    ],
+    ids=["ERA off the plate", "mass off the plate", "one place", "one name"],
+)
+def test_rig_of_a_program_is_checked(change, said):
+    """Not only a rig file is: two bolts cannot share a hole, and a name means one ERA."""
     rig = make_paper_rig(12, 9)
-    outside = Era("out", 0.31, 0.1, 17000.0, 0.0, 0.0, 1e-4)
-    with pytest.raises(InputError, match=r"ERA out .*\(0.31, 0.1\)"):
-        replace(rig, eras=(*rig.eras, outside))
-    with pytest.raises(InputError, match=r"mass.*\(0.1, -0.01\)"):
-        replace(rig, masses=(PointLoad(0.1, -0.01, mass=0.005),))
+    with pytest.raises(InputError, match=said):
+        replace(rig, **change(rig))
 
 
-def test_rig_refuses_eras_of_one_position_or_name():
-    """Two bolts cannot share a hole, and a name means one ERA."""
-    rig = make_paper_rig(12, 9)
-    with pytest.raises(InputError, match="SW and again"):
-        replace(rig, eras=(*rig.eras, replace(rig.era("SW"), name="again")))
-    with pytest.raises(InputError, match=r"name.*SW|SW.*name"):
-        replace(rig, eras=(*rig.eras, replace(rig.era("SW"), x=0.1)))
+GRAINED = LaminateLayer(replace(GLASS, orthotropy=Orthotropy(0.4, 0.1, 0.1, 0.1)), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: Laminate(()), r"^laminate: .*layer"),
+        (
+            lambda: Laminate((replace(GRAINED, material=GLASS, loss_factor=0.1),) * 2, Bond.NONE),
+            r"^laminate: .*bond none",
+        ),
+        (lambda: Laminate((GRAINED, GRAINED)), "isotropic"),
+        # 1 / sqrt(0.4) = 1.58
+        (lambda: replace(GRAINED.material, nu=1.6), "nu12 must be less than .*1.58"),
+    ],
+    ids=["no layers", "losses of layers that slide", "layers with a grain", "no elastic energy"],
+)
+def test_plates_of_no_meaning_are_refused(made, said):
+    """Bounds and waves of a laminate are those of isotropic layers."""
+    with pytest.raises(InputError, match=said):
+        made()

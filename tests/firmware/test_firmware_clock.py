@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cobs import cobs
 
 import hand_written as hand
 from drivers.protocol.table import MESSAGES
@@ -206,39 +205,6 @@ def test_commit_of_no_moment_ahead_starts_at_once(rate: int, built: Path, ahead:
     assert np.flatnonzero(firmware.samples()[:, 0])[0] == math.floor(0.01234 * rate)
 
 
-LATER = hand.tone(1, 200, 0.25, 90)
-WAITING = {
-    "silence": (request(hand.SILENCE, SESSION, 0), False),
-    "stop": (request(hand.STOP, 0), False),
-    "disarm": (request(hand.DISARM, 0), False),
-    "interlock": (b"", False),
-    "commit": (commit(2, 0), True),
-    "now": (request(hand.SET, *hand.part(3, hand.layer(1, LATER, ramp=0), now=True)), True),
-    "refused": (commit(7, 0), None),
-}
-"""What comes while a set waits: it is dropped, starts with it, or goes on waiting (None)."""
-
-
-@pytest.mark.parametrize("what", WAITING)
-def test_set_that_waits_for_its_moment(replaying: Path, what: str) -> None:
-    """A newer set starts it first, silence and faults drop it, and another is staged beside it."""
-    firmware = MovedFirmware(replaying)
-    firmware.receive(SERIAL, arm())
-    firmware.receive(SERIAL, staged(1, hand.layer(0, TONE, ramp=0)))
-    firmware.receive(SERIAL, commit(1, 300))  # 91.6 ms
-    firmware.receive(SERIAL, staged(2, hand.layer(1, LATER, ramp=0)))
-    firmware.move(0.05)
-    frame, starts = WAITING[what]
-    if what == "interlock":
-        firmware.set_interlock(is_open=True)
-    firmware.receive(SERIAL, frame)
-    firmware.move(0.2)
-    samples = firmware.samples()
-    sounding = [np.flatnonzero(samples[:, channel])[:1].tolist() for channel in range(2)]
-    alone = [[first_at(300, 0, 16_000)], []]
-    assert sounding == {False: [[], []], True: [[800], [800]], None: alone}[starts]
-
-
 def test_set_starts_though_a_layer_ends_at_its_moment(replaying: Path) -> None:
     """Its voice goes on from its amplitude: keep phase, and 625 samples are 128 steps."""
     firmware = MovedFirmware(replaying)
@@ -279,17 +245,3 @@ def test_mark_keeps_the_clock_of_its_last_byte(replaying: Path, line: int) -> No
     assert not any(said)  # but heartbeats
     assert apart(seconds(firmware), 0.0123456 - 1 / 16_000) == pytest.approx(0, abs=CLOCK_ERROR)
     assert apart(seconds(firmware), 0.05 - 1 / 16_000) == pytest.approx(0, abs=CLOCK_ERROR)
-
-
-def test_mark_of_one_address_is_replied_to_by_its_status(replaying: Path) -> None:
-    """With the clock of the moment, which no later one shows."""
-    firmware = MovedFirmware(replaying)
-    firmware.move(0.0123456)
-    firmware.receive(SERIAL, request(MARK))
-    reply = cobs.decode(firmware.sent(SERIAL).strip(b"\0"))
-    clock = int.from_bytes(reply[19:21], "little") << 16 | int.from_bytes(reply[21:23], "little")
-    assert reply[0] == hand.REPLY | MARK
-    off = apart(clock / 2**32 * TURN, 0.0123456 - 1 / 16_000)
-    assert off == pytest.approx(0, abs=CLOCK_ERROR)
-    firmware.move(0.02)
-    assert apart(seconds(firmware), 0.02 - 1 / 16_000) == pytest.approx(0, abs=CLOCK_ERROR)

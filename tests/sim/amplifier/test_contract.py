@@ -7,6 +7,7 @@ import pytest
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import FAULTS, STATES
+from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.amplifier.contract import Amplifier
 
 ARM = {"session": 7, "watchdog": 250, "shift": 0}
@@ -146,3 +147,33 @@ def test_shift_is_of_a_new_session() -> None:
     assert status["clock"] == 3 * 65536 + round(0.1 * 2**32 / 20)
     amplifier.restart(5.0)
     assert amplifier.handle("GetStatus", {}, 5.0)["clock"] == 0
+
+
+def play_from(amplifier: Amplifier, token: int, level: int, at: float, moment: int) -> None:
+    """Stage a set of channel 0 at a time [s], and commit it for a high word of the clock."""
+    one = LayerSet(0, 0, 0, (tone(level=level),))
+    amplifier.handle("Set", part_of(token, one, now=False), at)
+    amplifier.handle("Commit", {"session": 7, "token": token, "at": moment % 65536}, at)
+
+
+@pytest.mark.parametrize(
+    ("moment", "waits"), [(99, False), (100, False), (101, True), (1738, True), (1739, False)]
+)
+def test_moments_beyond_half_a_second_are_now(moment: int, waits: bool) -> None:
+    """The present high word, one that has passed, or one more than 1638 steps ahead: at once."""
+    amplifier, at = armed(), 100.5 * 20 / 65536
+    play_from(amplifier, 1, 5000, at, moment)
+    assert (levels(amplifier, at) == [0, 0]) is waits
+
+
+def test_ping_in_the_very_moment_does_not_put_it_off_by_a_turn() -> None:
+    """In the last floating-point number before each of 50 moments, by a rate for each."""
+    amplifier = Amplifier("a", channels=2)
+    amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 0.0)
+    amplifier.clock = AmplifierClock(Crystal(error=4e-5, warm_up=1e-6))
+    for number in range(1, 51):
+        at = number / 2
+        play_from(amplifier, number, 100 * number, at, (amplifier.clock.reading(at) >> 16) + 300)
+        moment = math.nextafter(amplifier.next_event, 0.0)
+        amplifier.handle("Ping", {"session": 7, "rate": 600 * number}, moment)
+        assert levels(amplifier, moment + 0.001) == [100 * number, 0]

@@ -293,7 +293,10 @@ def _in_gpa(moduli: dict[str, float]) -> str:
 
 
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
-    """Show material and rigidity of a rig's plate, and what its exciters reach."""
+    """Show material and rigidity of a rig's plate, and what its exciters reach.
+
+    Reached is by the board of the file; one whose parts deviate reaches more or less.
+    """
     from model.quantities import in_display_unit
     from model.rig.file import load_rig
     from model.rig.plate_summary import FURTHER, plate_summary
@@ -301,11 +304,13 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     rig = load_rig(rig_file)
     summary = plate_summary(rig)
     if summary["exciters"]:
+        from model.reduction.free_plate import solve_free_plate
         from model.transients.excursions import excursions_of
         from model.transients.reach import reach_of
 
-        summary["reach"] = reach_of(rig).as_json()
-        moved = excursions_of(rig)
+        free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
+        summary["reach"] = reach_of(rig, free).as_json()
+        moved = excursions_of(rig, free)
         for each, excursion in zip(summary["exciters"], moved.at_lowest.tolist(), strict=True):
             each["excursion_at_lowest_m"] = excursion
         summary["magnets_allow_from_hz"] = moved.allowed
@@ -427,7 +432,7 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
             f"{1e3 * each['excursion_at_lowest_m']:.2g}{of} mm"
         )
     level, start = f"{reach['level_db_sl']:g} dB SL", reach["from_hz"]
-    everywhere = "everywhere but 2 cm at the edges, under a finger"
+    everywhere = "everywhere but 2 cm at the edges, under a finger, by the board of the file"
     from_where = "at no frequency" if start is None else f"from {start:g} Hz"
     yield f"    {level} {everywhere}: {from_where}"
     rows = zip(reach["frequencies_hz"], reach["share_of_places"], strict=True)

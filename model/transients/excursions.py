@@ -164,12 +164,12 @@ def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> Comp
     return moved
 
 
-def excursions_of(rig: Rig) -> Excursions:
-    """The excursions within the rig's frequencies and by its level."""
+def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
+    """The excursions within the rig's frequencies and by its level; free: its plate, if solved."""
     limits, exciters = rig.limits, exciters_of(rig)
     low, high = limits.frequency_min, limits.frequency_max
     frequencies = np.append(np.arange(low, high, _CHECKED), high)
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=high)
+    free = free or solve_free_plate(rig.plate, rig.mesh, frequency_max=high)
     settled = np.abs(relative_motions(rig, free, frequencies[:1])).sum(axis=1)[0]
     largest = np.zeros((len(frequencies), len(exciters)))
     some = [number for number, one in enumerate(exciters) if math.isfinite(one.excursion)]

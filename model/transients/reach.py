@@ -13,7 +13,7 @@ import numpy as np
 from model.arrays import FloatArray, lattice
 from model.finger.fingertip import FIVE_POINTS, fingertips_on
 from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
-from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
 from model.transients.excursions import magnets_of
 
@@ -62,12 +62,11 @@ class Reach:
         }
 
 
-def reach_of(rig: Rig) -> Reach:
-    """Reach of a rig up to UP_TO within its limits."""
+def reach_of(rig: Rig, free: FreePlate) -> Reach:
+    """Reach of a rig as its file has it up to UP_TO within its limits; free: its plate."""
     plate, limits = rig.plate, rig.limits
     low = limits.frequency_min
     frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, STEP)
-    free = solve_free_plate(plate, rig.mesh, frequency_max=limits.frequency_max)
     margins = [(side, min(MARGIN, side / 4)) for side in (plate.length, plate.width)]
     places = lattice(
         *(

@@ -236,7 +236,8 @@ def test_show_prints_exciters_and_what_they_reach(
     assert found["exciters"][0].keys() >= {"magnet_resonance_hz", "q", "force_at_1_w_n"}
     show(str(path), as_json=False)
     text = capsys.readouterr().out
-    assert "20 dB SL everywhere but 2 cm at the edges, under a finger: from 40 Hz" in text
+    everywhere = "20 dB SL everywhere but 2 cm at the edges, under a finger"
+    assert f"{everywhere}, by the board of the file: from 40 Hz" in text
 
 
 def test_config_check_warns_and_the_schema_knows_both_kinds(tmp_path: Path) -> None:

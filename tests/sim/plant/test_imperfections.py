@@ -21,7 +21,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import Fingertip
+from model.structure.attachments import Fingertip, PointLoad
 from plate_in_time import lock_in
 from sim.amplifier.clock import StraightClock
 from sim.bench.bench import Bench
@@ -30,6 +30,7 @@ from sim.plant.imperfections import (
     Imperfections,
     PlateErrors,
     draw_imperfections,
+    draw_of_ensemble,
 )
 from sim.plant.voiced_base import motion_of
 
@@ -157,10 +158,11 @@ def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> N
         modulus=0.02,
         place=0.003,
         harmonic=0.1,
+        supports=0.25,
     )
-    drawn = [
-        draw_imperfections(replace(coarse_rig, uncertainty=std), seed=seed) for seed in range(500)
-    ]
+    foot = PointLoad(0.1, 0.08, stiffness=2e3, is_foot=True)
+    rig = replace(coarse_rig, uncertainty=std, masses=(PointLoad(0.2, 0.1, mass=0.01), foot))
+    drawn = [draw_imperfections(rig, seed=seed) for seed in range(500)]
     names = [era.name for era in coarse_rig.eras]
     found = np.array(
         [
@@ -175,20 +177,33 @@ def test_draw_imperfections_is_within_the_rigs_uncertainty(coarse_rig: Rig) -> N
                 *(1e2 * at for name in names for at in one.plate.places[name]),
                 *(each.harmonic.real for each in one.channels.values()),
                 *(each.harmonic.imag for each in one.channels.values()),
+                np.log(one.plate.realised(rig).masses[1].stiffness / 2e3),
             )
             for one in drawn
         ]
     )
-    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0, 1] + 16 * [0])
+    centres = np.array([1, 0, 0, 1, 1, 1, 1, 0, 0, 1] + 17 * [0])
     spreads = np.array(
         [0.01, np.log(1.3), np.log(1.3), 0.2, 0.2, 0.2, 0.2, 0.4, 0.4, 0.02]
         + 8 * [0.3]
         + 8 * [0.1 * math.sqrt(0.5)]
+        + [0.25]
     )
     assert_allclose(found.mean(axis=0), centres, atol=0.15 * spreads.max(), rtol=0.01)
     assert_allclose(found.std(axis=0), spreads, rtol=0.1)
     alike = np.corrcoef(found.T) - np.eye(len(spreads))
     assert np.abs(alike).max() < 0.2
+
+
+def test_plates_as_promises_are_checked_on_have_other_feet(coarse_rig: Rig) -> None:
+    """Over five hundred plates their logarithms spread by 0.3, and weights stay as they are."""
+    weight = PointLoad(0.2, 0.1, mass=0.01)
+    foot = PointLoad(0.1, 0.08, stiffness=2e3, damping=1.0, is_foot=True)
+    rig = replace(coarse_rig, masses=(weight, foot), uncertainty=Uncertainty(supports=0.3))
+    found = [draw_of_ensemble(rig, seed=n).plate.realised(rig).masses for n in range(500)]
+    logs = np.log([other.stiffness / 2e3 for _, other in found])
+    assert (logs.mean(), logs.std()) == pytest.approx((0, 0.3), abs=0.03)
+    assert all(each == (weight, replace(foot, stiffness=each[1].stiffness)) for each in found)
 
 
 def test_draw_imperfections_of_a_known_rig_has_none(coarse_rig: Rig) -> None:

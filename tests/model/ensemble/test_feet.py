@@ -18,7 +18,6 @@ from only import only
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 
 
-@pytest.mark.usefixtures("kernels_or_numpy")
 def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_plates() -> None:
     """On 60 plates each, solved exactly, all else known to 1 %, 24 answers: 86 to 95 % of all.
 

@@ -100,7 +100,7 @@ def test_response_on_a_board_against_magnet_and_current_solved_beside_it(magnet:
 
 
 def test_damping_of_suspension_and_current_act_alike() -> None:
-    """What one damps 40 % more the current damps less, at as much force: fields within 0.15 %.
+    """What one damps 40 % more the current damps less, at as much force: fields within 0.2 %.
 
     From 40 to 300 Hz, on four coin exciters with 0.6 of c + Bl² / R in the suspension; the
     suspension's alone changes them by 10 % and more.
@@ -123,5 +123,5 @@ def test_damping_of_suspension_and_current_act_alike() -> None:
     as_is, alike, other = (fields(each) for each in (rig.eras, swapped, damped))
     size = np.linalg.norm(as_is, axis=(1, 2))
     apart, alone = (np.linalg.norm(each - as_is, axis=(1, 2)) / size for each in (alike, other))
-    assert apart.max() < 1.5e-3
+    assert apart.max() < 2e-3
     assert alone.max() > 0.1

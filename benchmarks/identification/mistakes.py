@@ -83,6 +83,10 @@ def _states(state: str) -> Callable[[Verdict, int], bool]:
     return lambda verdict, exciter: state in verdict.channels[exciter].states
 
 
+def _on_glue(stiffness: float) -> Callable[[Any, int], HalfGlued]:
+    return lambda own, _: behind_glue(own, stiffness)
+
+
 def _acts_less(verdict: Verdict, exciter: int) -> bool:
     """Whether it is said to be loose or weak, of which the remedies name the mounting."""
     return bool({"loose", "weak"} & {*verdict.channels[exciter].states})
@@ -133,7 +137,7 @@ def _mistakes() -> Iterator[tuple[str, Mistake]]:
     for glue in STIFFER:
         yield (
             f"on glue of {glue:g} N/m",
-            Mistake(_states("loose"), mount=lambda own, _, glue=glue: behind_glue(own, glue)),
+            Mistake(_states("loose"), mount=_on_glue(glue)),
         )
 
 

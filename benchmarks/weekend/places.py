@@ -72,12 +72,11 @@ def known_by(board: int, count: int) -> Known:
 def row(count: int, found: Sequence[Known]) -> str:
     """A line of the table."""
     good = [each for each in found if not each.refused]
-    errors, stated = (
-        np.array([getattr(each, key) for each in good]) for key in ("error", "stated")
-    )
-    shown = " | ".join(
-        f"{100 * value:.1f} %" for value in (np.median(errors), errors.max(), np.median(stated))
-    )
+    shown = "– | – | –"
+    if good:
+        errors, stated = np.transpose([(each.error, each.stated) for each in good])
+        values = (np.median(errors), errors.max(), np.median(stated))
+        shown = " | ".join(f"{100 * value:.1f} %" for value in values)
     return f"| {count} | {len(found)}, {len(found) - len(good)} | {shown} |"
 
 

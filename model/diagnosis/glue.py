@@ -41,7 +41,7 @@ def behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> ND
         return found
     sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
     omega = match.plate.model.omega
-    for channel in np.flatnonzero(driven):
+    for channel in np.flatnonzero(driven).tolist():
         era = match.rig.eras[drives[channel]]
         if not isinstance(era, Era):
             others = driven & (np.arange(len(drives)) != channel)

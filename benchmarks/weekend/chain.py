@@ -5,7 +5,8 @@
 
 Each is the board of examples/weekend/rig.yaml as it may be built: exciters, drives, board and feet
 drawn within the rig's uncertainty, force factors and magnets by 10 %. The sensor of
-examples/weekend/places.csv reads its responses there, with noise; `era calibrate` fits the rig. Of
+examples/weekend/places.csv reads its responses there, with noise, put by hand (half a millimetre
+off, and reading 1 % more or less at each place); `era calibrate` fits the rig. Of
 a table of the rig as bought, of the one fitted, and of the board as it is, exactly known but for
 the loads of fingers, the same random touches are answered, and felt on the board in the steady
 state: contrast beyond 25 dB counts as 25. In memory,
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 
 import era_haptics as era
+from benchmarks.calibration.hidden_plates import FORM
 from benchmarks.page import write_parts
 from benchmarks.setting import random_contacts, use_one_thread
 from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
@@ -31,7 +33,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses
-from model.calibration.sensor_file import read_sensors
+from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.finger.fingertip import fingertips_on
@@ -89,12 +91,14 @@ class BuiltBoard:
 
     def measured(self, frequencies: FloatArray, seed: int) -> Responses:
         """Responses by one sensor that is moved, with its noise."""
-        places = read_sensors(FOLDER / "places.csv", self.rig.plate, may_move=True)
-        points = np.array([[at.x, at.y] for at in places])
+        places = sensor_places(self.rig)
         found = np.concatenate(
             [
-                self.responses(point[None], frequencies, [PointLoad(at.x, at.y, mass=at.mass)])
-                for point, at in zip(points, places, strict=True)
+                self.responses(
+                    np.array([[at.x, at.y]]), frequencies, [PointLoad(at.x, at.y, mass=at.mass)]
+                )
+                * (at.sensitivity / meant.sensitivity)
+                for at, meant in zip(put_by_hand(places, seed), places, strict=True)
             ],
             axis=2,
         )
@@ -103,7 +107,7 @@ class BuiltBoard:
         real, imaginary = np.random.default_rng([SEED, seed, 1]).standard_normal((2, *found.shape))
         return Responses(
             tuple(at.name for at in places),
-            points,
+            np.array([[at.x, at.y] for at in places]),
             frequencies,
             found + NOISE * rms * (real + 1j * imaginary),
             masses=np.array([at.mass for at in places]),
@@ -131,6 +135,24 @@ class BuiltBoard:
             return np.asarray(self.responses(at, np.array([frequency]), loads)[0])
 
         return sensed(answer, self.rig, response, weights)
+
+
+def sensor_places(rig: Rig) -> Sequence[WiredSensor]:
+    """Where the sensor of the example is to be put."""
+    return read_sensors(FOLDER / "places.csv", rig.plate, may_move=True)
+
+
+def put_by_hand(places: Sequence[WiredSensor], seed: int) -> Sequence[WiredSensor]:
+    """Where a hand puts the sensor, and what it reads there: with its wax, and not quite upright.
+
+    Off by what hidden plates have their sensors off by.
+    """
+    off = np.random.default_rng([SEED, seed, 3]).standard_normal((len(places), 3))
+    off *= [FORM["sensor_place"], FORM["sensor_place"], FORM["sensor_scale"]]
+    return [
+        replace(at, x=at.x + x, y=at.y + y, sensitivity=at.sensitivity * (1 + scale))
+        for at, (x, y, scale) in zip(places, off.tolist(), strict=True)
+    ]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@
 The boards and touches of `python -m benchmarks.weekend.chain`. Each board is a process that moves
 in time, with viscous losses and amplifiers that lag, on a JACK server of the dummy driver: `era
 measure` with one sensor that is moved, `era calibrate`, `era table build`, then `era soft-amp` and
-`era daemon`, which is told of the fingers that are put on the board. What these feel is kept by the
-board, half a second after it begins. As bought and exactly known is answered in memory, and felt in
+`era daemon`, which is told of the fingers that are put on the board. The sensor is put beside its
+places, and reads the same at all of them. What fingers feel is kept by the board, half a second
+after it begins. As bought and exactly known is answered in memory, and felt in
 the steady state. Five minutes a board.
 """
 
@@ -20,6 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from sim.sensors.sensor_file import WiredSensor
 
 from benchmarks.desk.session import Desk, desk
 from benchmarks.desk.touches import REPEAT, hold, playing, sizes, until_ready
@@ -37,8 +39,10 @@ from benchmarks.weekend.chain import (
     frequencies_of,
     phased_table,
     promised_by,
+    put_by_hand,
     random_fingers,
     rig_as_bought,
+    sensor_places,
     table,
 )
 from controller.api.client import Client
@@ -83,6 +87,7 @@ def played(number: int, count: int) -> Played:
     with tempfile.TemporaryDirectory(prefix="weekend") as name:
         folder = Path(name)
         (folder / "built.yaml").write_text(text, "utf-8")
+        (folder / "put.csv").write_text(_as_csv(put_by_hand(sensor_places(rig), number)), "utf-8")
         with desk(
             folder,
             seed=number,
@@ -90,7 +95,7 @@ def played(number: int, count: int) -> Played:
             block=BLOCK,
             rig=(FOLDER / "rig.yaml").read_text("utf-8"),
             sensors=(FOLDER / "places.csv").read_text("utf-8"),
-            options=["--y-cable", "--built", "built.yaml"],
+            options=["--y-cable", "--built", "built.yaml", "--sensors", "put.csv"],
         ) as board:
             begin = time.monotonic()
             repeated = board.measure_by_moving(
@@ -118,6 +123,15 @@ def played(number: int, count: int) -> Played:
         for each, pair in zip(drawn, felt, strict=True)
     )
     return Played(Outcome(number, touches), measure_s, repeated, lost, xruns)
+
+
+def _as_csv(sensors: Sequence[WiredSensor]) -> str:
+    """The file of a sensor's places, where it reads the same everywhere."""
+    rows = [
+        f"{at.name},{at.x},{at.y},{at.input},{1e3 * sensors[0].sensitivity},1,{1e3 * at.mass}"
+        for at in sensors
+    ]
+    return "\n".join(["sensor,x_m,y_m,input,mv_per_m_s2,full_scale_v,mass_g", *rows, ""])
 
 
 def _with_lags(built: BuiltBoard) -> BuiltBoard:

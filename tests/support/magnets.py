@@ -16,6 +16,7 @@ from scipy.signal import cont2discrete
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
+from model.rig.exciter_checks import exciters_of
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import Motion
@@ -81,20 +82,30 @@ class Magnets:
         B = np.vstack([np.zeros((r, count)), inverse @ apart.T])
         self._out = np.hstack([apart, np.zeros((count, r))])
         self._a, self._b, *_ = cont2discrete((A, B, self._out, np.zeros((count, count))), STEP)
+        self._exciters = exciters_of(rig)
         parts = [era.in_time for era in eras]
         self._by_drive, self._by_rate = (
             np.array([getattr(each, key) for each in parts]) for key in ("by_drive", "by_rate")
         )
 
-    def moved(self, volts: FloatArray | ComplexArray) -> FloatArray:
-        """Motion of each magnet against its coil (n, exciters) [m], by Bl (u - L u' / R) / R.
+    def moved(self, volts: ComplexArray) -> ComplexArray:
+        """Motion of each coil in its magnet (n, exciters) [m] by voltages, phasors as these.
 
-        Of phasors the magnitude: what it is at the worst phase of all tones together.
+        By Bl (u - L u' / R) / R. Their magnitude is what it is at the worst phase of all tones
+        together.
         """
         forces = volts * self._by_drive + np.gradient(volts, STEP, axis=0) * self._by_rate
-        both = np.stack([forces.real, forces.imag], axis=2)
-        state, found = np.zeros((len(self._a), 2)), np.empty(both.shape)
-        for number, force in enumerate(both):
+        state, found = np.zeros(len(self._a), dtype=complex), np.empty_like(forces)
+        for number, force in enumerate(forces):
             found[number] = self._out @ state
             state = self._a @ state + self._b @ force
-        return np.hypot(found[..., 0], found[..., 1])
+        return found
+
+    def heat(self, volts: ComplexArray, moved: ComplexArray) -> FloatArray:
+        """Power in each coil (n, exciters) [W], a mean over a cycle, back EMF included."""
+        rates = np.gradient(moved, STEP, axis=0)
+        found = []
+        for number, one in enumerate(self._exciters):
+            current = volts[:, number] - one.force_factor * rates[:, number]
+            found.append(np.abs(current / one.loop_resistance) ** 2 * one.resistance / 2)
+        return np.stack(found, axis=1)

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -13,15 +12,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.desk.capture import open_client
 from benchmarks.desk_plate.jack_plate import JackPlate
-from drivers.errors import LinkError
 from exciter_circuit import ExciterCircuit
 from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
 from model.rig.file import parse_rig
 from sim.desk.impedance_cli import app
-from sim.desk.libjack import JackClient
 from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
 
@@ -167,7 +165,7 @@ def test_parts_are_found_through_a_real_server(
     monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
     with jack_server(name) as server:
         for is_glued in (False, True):
-            with closing(_client("desk")) as client:
+            with closing(open_client("desk")) as client:
                 circuit = ExciterCircuit(is_glued=is_glued, rate=RATE)
                 plate = JackPlate(client, circuit)  # type: ignore[arg-type]  # called by JACK
                 plate.start()
@@ -179,14 +177,3 @@ def test_parts_are_found_through_a_real_server(
                 )  # fmt: skip
                 plate.wait(0)
     _check(json.loads(done.stdout))
-
-
-def _client(name: str) -> JackClient:
-    end = time.monotonic() + 20
-    while True:
-        try:
-            return JackClient(name, is_only=True)
-        except LinkError:
-            if time.monotonic() > end:
-                raise
-            time.sleep(0.05)

@@ -140,47 +140,33 @@ def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     assert check["phase_rms_deg"] < 1.0
 
 
-def test_lost_block_repeats_its_run(rig: Rig, truth: Truth, undisturbed: Measured) -> None:
-    """128 samples are missing in run 1, which nothing reports: it is played again."""
-    desk = Desk(rig, SENSORS)
-    sound = card(truth, lost=[1])
-    found = measure(desk, sound, sines(desk))
-    assert (found.repeated, sound.runs) == (1, 6)
-    difference = found.responses.values - undisturbed.responses.values
-    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
-
-
-def test_delay_that_differs_between_runs_repeats_a_run(
-    rig: Rig, truth: Truth, undisturbed: Measured
+@pytest.mark.parametrize(
+    ("wires", "repeated"),
+    [({"lost": [1]}, 1), ({"late": [2]}, 1), ({"reported": 1}, 0)],
+    ids=["1", "2", "none"],
+)
+def test_run_that_lost_a_block_is_played_again(
+    rig: Rig, truth: Truth, undisturbed: Measured, wires: dict[str, object], repeated: int
 ) -> None:
-    """As where a block of inputs was lost between two; the runs would not be orthogonal."""
+    """128 samples are missing in a run, or before it, which nothing reports.
+
+    Runs would not be orthogonal. Losses that a driver alone reports, as PortAudio does over a
+    synchronous server, repeat nothing.
+    """
     desk = Desk(rig, SENSORS)
-    found = measure(desk, card(truth, late=[2]), sines(desk))
+    sound = card(truth, **wires)
+    found = measure(desk, sound, sines(desk))
+    assert (found.repeated, sound.runs) == (repeated, 5 + repeated)
     difference = found.responses.values - undisturbed.responses.values
-    assert found.repeated == 1
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
-
-
-def test_losses_that_were_none_repeat_nothing(rig: Rig, truth: Truth) -> None:
-    """A driver reports them, as PortAudio over a synchronous server; the cable shows none."""
-    desk = Desk(rig, SENSORS)
-    sound = card(truth, reported=1)
-    assert measure(desk, sound, sines(desk)).repeated == 0
-    assert sound.runs == 5
-
-
-def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None:
-    """Three attempts, then no file."""
-    desk = Desk(rig, SENSORS)
-    with pytest.raises(LinkError, match="lost"):
-        measure(desk, card(truth, lost=range(99)), sines(desk))
 
 
 @pytest.mark.parametrize(
     ("wires", "error", "cause"),
     [
         ({"on_inputs": [0, 3, 2, 1]}, InputError, "at input 2.*P2"),
-        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "output 2 of ERA SE"),
+        ({"lost": range(99)}, LinkError, "lost in 3 attempts"),
+        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "0.9 of output 2 of ERA SE"),
         ({"gain": 50.0}, InputError, "clipping"),
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
         ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back"),
@@ -193,7 +179,7 @@ def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None
 def test_wrong_desks_are_refused_with_their_cause(
     rig: Rig, truth: Truth, wires: dict[str, object], error: type[Exception], cause: str
 ) -> None:
-    """Inputs, outputs swapped; clipped; off; no cable for the loop-back; noise; two clocks."""
+    """Inputs swapped; blocks lost each time; outputs swapped; clipped; off; no cable; noise; clocks."""
     desk = Desk(rig, SENSORS)
     played = sines(desk)
     if "noise" in wires:

@@ -179,7 +179,7 @@ def test_run_that_lost_a_block_is_played_again(
 def test_wrong_desks_are_refused_with_their_cause(
     rig: Rig, truth: Truth, wires: dict[str, object], error: type[Exception], cause: str
 ) -> None:
-    """Inputs swapped; blocks lost each time; outputs swapped; clipped; off; no cable; noise; clocks."""
+    """Inputs or outputs swapped, blocks lost, clipped, off, no cable, noise, two clocks."""
     desk = Desk(rig, SENSORS)
     played = sines(desk)
     if "noise" in wires:

@@ -36,30 +36,18 @@ PARTS = {
 
 
 class MemoryCard(SoundCard):
-    """The circuit as a sound card; inputs: which of its two voltages each input has."""
+    """The circuit as a sound card; inputs: which of its two voltages each has, run by run."""
 
-    def __init__(self, circuit: ExciterCircuit, inputs: Sequence[int] = (0, 1)) -> None:
+    def __init__(self, circuit: ExciterCircuit, *inputs: Sequence[int]) -> None:
         self.circuit, self.name, self.rate, self.gaps = circuit, "memory", float(RATE), 0
-        self.inputs = inputs
+        self.inputs = iter(inputs or [(0, 1)])
 
     def run(self, played: FloatArray) -> Float32Array:
         """Advance the circuit."""
-        return self.circuit.advance(played)[:, list(self.inputs)].astype(np.float32)
+        return self.circuit.advance(played)[:, list(next(self.inputs))].astype(np.float32)
 
     def close(self) -> None:
         """Nothing is open."""
-
-
-class MovedCard(MemoryCard):
-    """One input, which is before the exciter in the first run, and over the resistor then."""
-
-    runs = 0
-
-    def run(self, played: FloatArray) -> Float32Array:
-        """Advance the circuit."""
-        found = super().run(played)[:, [self.runs]]
-        self.runs += 1
-        return found
 
 
 def measured(
@@ -88,7 +76,7 @@ def test_parts_come_from_two_runs_and_a_scale(
     assert width == pytest.approx(0.245, abs=0.001)
     circuit = ExciterCircuit(is_glued=True, rate=RATE)
     status, told = measured(
-        monkeypatch, MovedCard(circuit), "-o", glued, "--free", free, "--weight", WEIGHT,
+        monkeypatch, MemoryCard(circuit, [0], [1]), "-o", glued, "--free", free, "--weight", WEIGHT,
         "--inputs", "1", "--series-error", "0.1", typed="\n\n",
     )  # fmt: skip
     assert status == 0

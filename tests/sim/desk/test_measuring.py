@@ -265,12 +265,9 @@ class CallbackCard(SoundCard):
         super().__init__(outputs=1, inputs=1, limit=1.0)
         self._flags = flags
 
-    def start(self, blocks: int) -> np.ndarray:
-        """Let blocks of zeros be played; returns the memory that is recorded to."""
-        return self.begin(np.zeros((blocks * FRAMES, 1)))
-
-    def call(self) -> int:
-        """All blocks; returns the gaps that were counted."""
+    def call(self) -> tuple[int, bool]:
+        """Three blocks; returns the gaps that were counted, and whether all was recorded."""
+        heard = self.begin(np.zeros((3 * FRAMES, 1)))
         kind = ctypes.CFUNCTYPE(
             ctypes.c_int,
             ctypes.c_void_p,
@@ -286,7 +283,7 @@ class CallbackCard(SoundCard):
         recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()
         for flags in self._flags:
             assert callback(recorded, played, FRAMES, None, flags, given) == 0
-        return self._transfer.gaps
+        return self._transfer.gaps, bool(heard.all())
 
     def close(self) -> None:
         """Nothing is open."""
@@ -304,10 +301,7 @@ class CallbackCard(SoundCard):
 )
 def test_lost_blocks_are_gaps_while_something_plays(flags: list[int], gaps: int) -> None:
     """Each block with a flag of a loss, from the second to the last, is one gap."""
-    card = CallbackCard(flags)
-    heard = card.start(3)
-    assert card.call() == gaps
-    assert heard.all()
+    assert CallbackCard(flags).call() == (gaps, True)
 
 
 @pytest.mark.parametrize("sample", [1.01, np.nan])

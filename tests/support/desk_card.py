@@ -40,7 +40,7 @@ class DeskCard(SoundCard):
         self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", reported
         self._lost, self._late, self._gain, self.runs = lost, late, gain, 0
         self._drifts, self._factors, self._amplified = drifts, factors, amplified
-        self.loudest = np.zeros(plate.outputs)
+        self.loudest = np.zeros(1)
         self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
         self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
 

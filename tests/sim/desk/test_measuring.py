@@ -197,15 +197,11 @@ def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
         measure(desk, card(replace(truth, actuators=tuple(off)), noise=5e-3), sines(desk))
 
 
-@pytest.mark.parametrize("level", [0.0, 1.5])
-def test_levels_beyond_the_rigs_limits_are_refused(rig: Rig, level: float) -> None:
-    """By the option that sets them."""
-    with pytest.raises(InputError, match="--level"):
-        Desk(rig, SENSORS).check(level)
-
-
-def test_frequencies_that_no_period_has_are_refused() -> None:
-    """Half a hertz is no line of a second; 4 kHz is beyond what 8 kHz carry."""
+def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> None:
+    """A level beyond the rig's limits; half a hertz, no line of a second; 4 kHz at 8 kHz."""
+    for level in (0.0, 1.5):
+        with pytest.raises(InputError, match="--level"):
+            Desk(rig, SENSORS).check(level)
     for frequency in (61.5, 3999.0):
         with pytest.raises(InputError, match="frequencies"):
             Multisine(np.array([frequency]), 5, RATE, LEVEL)

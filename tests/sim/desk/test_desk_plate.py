@@ -77,27 +77,6 @@ def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> N
     np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        ("sensor,x_m,y_m,input\nP1,0,0,1\n", ":1:"),
-        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\nP2,9,0.1,2,10\n", ":3:"),
-        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", ":3:"),
-        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,0\n", ":2:"),
-        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,x,1,10\n", ":2:"),
-        ("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.1,0.1,1,10,2\n", ":2:"),
-    ],
-)
-def test_sensor_files_are_refused_with_their_line(
-    rig: Rig, tmp_path: Path, text: str, place: str
-) -> None:
-    """A missing column, off the plate, an input twice, no sensitivity, no number, one too many."""
-    path = tmp_path / "sensors.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=f"sensors.csv{place}"):
-        read_sensors(path, rig.plate)
-
-
 def test_sensitivity_is_in_full_scale(rig: Rig, tmp_path: Path) -> None:
     """A charge of 5 pC/(m/s²), amplified by 2 mV/pC, at 4 V full scale: 2.5e-3 a m/s²."""
     path = tmp_path / "sensors.csv"

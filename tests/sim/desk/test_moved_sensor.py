@@ -31,6 +31,7 @@ Places = Mapping[str, tuple[float, float]]
 PLACES: Places = {"P1": (0.03, 0.05), "P2": (0.20, 0.11), "P3": (0.29, 0.20)}
 FREQUENCIES = np.array([61.0, 141.0, 221.0, 301.0])
 HEAD = "sensor,x_m,y_m,input,mv_per_m_s2,mass_g\n"
+PLAIN = "sensor,x_m,y_m,input,mv_per_m_s2\n"
 KEPT = "of 3 places are measured, in measured"
 GO_ON = "go on with --resume"
 
@@ -301,21 +302,36 @@ def test_plate_is_identified_better_with_the_mass_of_the_sensor(
 
 
 def test_sensors_file_of_one_sensor(rig: Rig, tmp_path: Path) -> None:
-    """One input in all lines; its mass from the file or the option; never several masses at once.
-
-    Nor two sensitivities of one sensor.
-    """
+    """One input in all lines; its mass from the file or the option."""
     path = tmp_path / "sensors.csv"
     path.write_text(HEAD + "P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,10,2.5\n")
     places = read_sensors(path, rig.plate, may_move=True)
     assert [place.mass for place in places] == [2.5e-3, 2.5e-3]
     assert read_sensors(path, rig.plate, may_move=True, mass=1.0)[1].mass == 1e-3
-    for lines, may_move, cause in (
-        ("P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,10,2.5\n", False, ":3: input"),
-        ("P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,11,2.5\n", True, ":3: .*sensitivity"),
-        ("P1,0.1,0.1,1,10,2.5\nP2,0.2,0.1,2,10,0\n", True, "mass_g"),
-        ("P1,0.1,0.1,1,10,2500\n", True, ":2: mass_g .*grams"),
-    ):
-        path.write_text(HEAD + lines)
-        with pytest.raises(InputError, match=cause):
-            read_sensors(path, rig.plate, may_move=may_move)
+
+
+@pytest.mark.parametrize(
+    ("text", "may_move", "cause"),
+    [
+        ("sensor,x_m,y_m,input\nP1,0,0,1\n", False, ":1:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,9,0.1,2,10\n", False, ":3:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", False, ":3: input"),
+        (f"{PLAIN}P1,0.1,0.1,1,0\n", False, ":2:"),
+        (f"{PLAIN}P1,0.1,x,1,10\n", False, ":2:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10,2\n", False, ":2:"),
+        (f"{HEAD}P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,11,2.5\n", True, ":3: .*sensitivity"),
+        (f"{HEAD}P1,0.1,0.1,1,10,2.5\nP2,0.2,0.1,2,10,0\n", True, ": mass_g"),
+        (f"{HEAD}P1,0.1,0.1,1,10,2500\n", True, ":2: mass_g .*grams"),
+    ],
+)
+def test_sensors_files_are_refused_with_their_line(
+    rig: Rig, tmp_path: Path, text: str, may_move: bool, cause: str
+) -> None:
+    """A missing column, off the plate, an input twice, no sensitivity, no number, one too many.
+
+    Two sensitivities of one sensor that is moved, several masses at once, a mass in other units.
+    """
+    path = tmp_path / "sensors.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"sensors.csv{cause}"):
+        read_sensors(path, rig.plate, may_move=may_move)

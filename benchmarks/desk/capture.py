@@ -21,7 +21,7 @@ class Capture(SoundCard):
 
     def __init__(self, name: str, channels: int, *, longest: float = 600.0) -> None:
         super().__init__(outputs=0, inputs=channels, limit=0)
-        self._client = _client(name)
+        self._client = open_client(name)
         self.rate, self.block = float(self._client.rate), self._client.block
         activate(self, self._client, outputs=0, inputs=channels)
         frames = round(longest * self.rate)
@@ -63,7 +63,8 @@ class Capture(SoundCard):
         return np.flatnonzero(loud) + since
 
 
-def _client(name: str) -> JackClient:
+def open_client(name: str) -> JackClient:
+    """A client, as soon as the server is up."""
     end = time.monotonic() + _START
     while True:
         try:

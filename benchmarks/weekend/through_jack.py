@@ -21,7 +21,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from sim.sensors.sensor_file import WiredSensor
 
 from benchmarks.desk.session import Desk, desk
 from benchmarks.desk.touches import REPEAT, hold, playing, sizes, until_ready
@@ -49,6 +48,7 @@ from controller.api.client import Client
 from controller.api.client_protocol import LeaseLost
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
+from model.calibration.sensor_file import WiredSensor
 from model.finger.fingertip import fingertips_on
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig

@@ -110,7 +110,7 @@ def impedance(
     from model.files.replacing import check_ending, check_place
     from sim.desk.measuring.impedance import NAMES, Bench, exciter_values, fitted
     from sim.desk.measuring.impedance_run import (
-        default_lines,
+        LINES,
         measured_impedance,
         read_impedance,
         write_impedance,
@@ -159,7 +159,7 @@ def impedance(
         f"{series:g}",
     )  # fmt: skip
     rows = [
-        f"{len(default_lines())} frequencies; wrote {output}" if output else None,
+        f"{len(LINES)} frequencies; wrote {output}" if output else None,
         *_rows(circuits, values, bench),
         *_warnings(circuits, values, by_light),
         again if "measured" in circuits else None,

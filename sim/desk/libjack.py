@@ -4,7 +4,6 @@ import ctypes
 import ctypes.util
 import re
 from collections.abc import Iterable
-from contextlib import closing
 from functools import cache
 
 from drivers.errors import LinkError
@@ -176,19 +175,15 @@ class JackClient:
             raise LinkError(f"jack: {theirs} could not be connected; it may have gone")
 
     def close(self) -> None:
-        """Leave the server."""
-        libjack().jack_client_close(self.pointer)
+        """Leave the server, once."""
+        if self.pointer:
+            libjack().jack_client_close(self.pointer)
+        self.pointer = 0
 
 
 def jack_name(other: str) -> str:
     """How a client is named as a device; "" for the hardware."""
     return f"jack:{other}" if other else "jack"
-
-
-def check_free(other: str, channels: int) -> None:
-    """Raise LinkError where another program plays to one of the first ports of a client."""
-    with closing(JackClient("era-check")) as client:
-        client.check_free(client.ports_of(other, IS_INPUT)[:channels], device=other)
 
 
 def _names(listed: "ctypes._Pointer[_Text]") -> list[str]:

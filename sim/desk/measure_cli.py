@@ -1,5 +1,6 @@
 """`era measure`: frequency responses of a plate through a sound card."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -120,6 +121,7 @@ def measure(
     ):
         if is_wrong:
             raise InputError(f"{option} needs {needs}; leave it out")
+    rows: Sequence[str | None]
     is_whole = True
     if source is not None:
         from sim.desk.measuring.stepped_file import measured_from
@@ -139,5 +141,5 @@ def measure(
             )
     if is_whole:
         next_words = ("calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated"))
-        rows.append(next_line("era", *next_words))
+        rows = [*rows, next_line("era", *next_words)]
     print_report(rows, answer, as_json=as_json)

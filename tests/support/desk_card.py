@@ -1,6 +1,6 @@
 """A sound card in memory in front of a plate on the desk, with what can be wrong with its wires."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -18,7 +18,8 @@ class DeskCard(SoundCard):
     lost: runs in which a block is lost; late: runs in which samples come as late as if a block had
     been lost before; reported: losses that the driver reports in each run; on_outputs,
     on_inputs: order of the cables, by default as they should be; gain: of all inputs;
-    drifts: of the clocks of some inputs, relative.
+    drifts: of the clocks of some inputs, relative; factors: of some inputs; loudest: largest sample
+    of each output so far; amplified: what amplifiers make of samples (n, eras) in a run.
     """
 
     def __init__(
@@ -33,16 +34,21 @@ class DeskCard(SoundCard):
         on_inputs: Sequence[int] | None = None,
         gain: float = 1.0,
         drifts: Mapping[int, float] = MappingProxyType({}),
+        factors: Mapping[int, float] = MappingProxyType({}),
+        amplified: Callable[[FloatArray, int], FloatArray] = lambda played, run: played,
     ) -> None:
         self._plate, self.rate, self.name, self.gaps = plate, rate, "memory", reported
         self._lost, self._late, self._gain, self.runs = lost, late, gain, 0
-        self._drifts = drifts
+        self._drifts, self._factors, self._amplified = drifts, factors, amplified
+        self.loudest = np.zeros(1)
         self._on_outputs = range(plate.outputs) if on_outputs is None else on_outputs
         self._on_inputs = range(plate.inputs) if on_inputs is None else on_inputs
 
     def run(self, played: FloatArray) -> Float32Array:
         """Advance the plate by so many samples."""
-        blocks = np.split(played[:, self._on_outputs], range(BLOCK, len(played), BLOCK))
+        self.loudest = np.maximum(self.loudest, np.abs(played).max(axis=0))
+        amplified = np.column_stack([self._amplified(played[:, :-1], self.runs), played[:, -1]])
+        blocks = np.split(amplified[:, self._on_outputs], range(BLOCK, len(played), BLOCK))
         heard = np.concatenate([self._plate.advance(block) for block in blocks])
         if self.runs in self._lost:
             middle = round(2 * self.rate)  # a block in the middle is missing, and nothing says so
@@ -54,6 +60,8 @@ class DeskCard(SoundCard):
         for number, drift in self._drifts.items():
             column = heard[:, number - 1]
             heard[:, number - 1] = np.interp(samples * (1 + drift), samples, column)
+        for number, factor in self._factors.items():
+            heard[:, number - 1] *= factor
         return np.clip(self._gain * heard[:, self._on_inputs], -1, 1).astype(np.float32)
 
     def close(self) -> None:

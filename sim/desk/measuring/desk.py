@@ -47,8 +47,7 @@ class Desk:
     @property
     def eras(self) -> list[tuple[str, int]]:
         """Name and output of each ERA."""
-        rig = self.rig
-        return [(era.name, rig.wiring[era.name].number + 1) for era in rig.eras]
+        return [(era.name, self.rig.wiring[era.name].number + 1) for era in self.rig.eras]
 
     @property
     def output(self) -> int:
@@ -134,8 +133,7 @@ class Desk:
 
     def check(self, level: float) -> None:
         """Raise InputError for several amplifiers, and a level beyond the rig's limits."""
-        rig = self.rig
-        if len({rig.wiring[era.name].amplifier for era in rig.eras}) > 1:
+        if len({self.rig.wiring[era.name].amplifier for era in self.rig.eras}) > 1:
             raise InputError(
                 "all ERAs must be on one sound card, got several amplifiers in the rig"
             )

@@ -151,8 +151,8 @@ def _fit(f: FloatArray, impedance: ComplexArray) -> Circuit:
     best = min(range(len(tried)), key=lambda n: float(linear[n][1].sum()))
     first = np.array([*linear[best][0], *tried[best]])
     done = least_squares(residual, first, x_scale=np.maximum(np.abs(first), 1e-6), method="lm")
-    variance = 2 * done.cost / max(2 * len(f) - len(first), 1)
     slopes: FloatArray = np.asarray(done.jac)
+    variance = 2 * done.cost / (2 * len(f) - len(first))
     covariance = np.asarray(np.linalg.pinv(slopes.T @ slopes) * variance)
     return Circuit(done.x, covariance, float(np.sqrt((done.fun**2).mean())))
 
@@ -168,10 +168,9 @@ def exciter_values(
 
     Raises InputError for runs that are exchanged or not of one exciter.
     """
-    circuit = glued or free
-    if circuit is None:
-        raise InputError("--free or --glued is missing; measure one of them, or give its file")
     runs = [each for each in (free, glued) if each is not None]
+    if not runs:
+        raise InputError("--free or --glued is missing; measure one of them, or give its file")
     if len(runs) == 2 and bench.coil is not None:
         raise InputError("--coil-mass follows from --free and --glued; remove it, or one of them")
     x = np.concatenate([*(each.values for each in runs), bench.values])

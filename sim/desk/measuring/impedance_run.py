@@ -21,14 +21,12 @@ from sim.desk.measuring.multisine import Multisine
 from sim.desk.measuring.runs import play_on_one
 from sim.desk.measuring.sound_card import SoundCard
 
-_LINES = 120
 _PLACES = ("before the exciter", "over the resistor")
 _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
 
 
-def default_lines() -> FloatArray:
-    """Whole frequencies [Hz] from 10 to 1000, nearly at equal ratios."""
-    return np.unique(np.geomspace(LOW, HIGH, _LINES).round())
+LINES: FloatArray = np.unique(np.geomspace(LOW, HIGH, 120).round())
+"""Whole frequencies [Hz] from 10 to 1000, nearly at equal ratios."""
 
 
 def measured_impedance(
@@ -45,7 +43,7 @@ def measured_impedance(
     inputs: before and over the resistor, counted from 1, or one that is moved: move is then called
     with where to, before each run. Raises InputError, LinkError.
     """
-    sines = Multisine(default_lines(), 1, card.rate, level)
+    sines = Multisine(LINES, 1, card.rate, level)
     voltages = list[ComplexArray]()
     for at, place in zip((inputs[0], inputs[-1]), _PLACES, strict=True):
         if len(inputs) == 1:

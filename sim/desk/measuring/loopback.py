@@ -94,9 +94,8 @@ def certain_drift(multisine: Multisine, runs: Sequence[FloatArray]) -> float:
     rest = phases - slopes * relative
     error = np.sqrt(float((weights**2 * slopes**2 * rest**2).sum())) / moment
     alike = np.abs((turned * np.exp(-1j * slopes * relative)).sum()) / max(weights.sum(), 1e-300)
-    size = abs(relative)
-    is_certain = TOLERANCE < size < _MAX_DRIFT and size > _SURE * error and alike > _ALIKE
-    return relative if is_certain else 0.0
+    is_large = max(TOLERANCE, _SURE * error) < abs(relative) < _MAX_DRIFT
+    return relative if is_large and alike > _ALIKE else 0.0
 
 
 _FULL = 0.999  # of full scale
@@ -180,9 +179,8 @@ def check_coherence(
     found: of what was recorded, runs (n, inputs) each; is_heard: whether every ERA was heard at
     another place.
     """
-    columns = desk.columns
-    coherence = np.median(found.coherence[:, columns], axis=0)
-    peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
+    coherence = np.median(found.coherence[:, desk.columns], axis=0)
+    peaks = np.max([np.abs(each[:, desk.columns]).max(axis=0) for each in recorded], axis=0)
     for are_faint, remedy in (
         (True, "too low a level: choose a higher --level, or turn up the gain of the input"),
         (False, "fix these sensors to the plate, check their cables and mains hum"),
@@ -197,7 +195,7 @@ def check_coherence(
                 f"coherence must be at least {_COHERENT:g} in the median, got "
                 f"{', '.join(incoherent)}; {remedy}"
             )
-    moved = np.abs(found.values[:, columns]) / found.std[:, columns, None]
+    moved = np.abs(found.values[:, desk.columns]) / found.std[:, desk.columns, None]
     for (name, at), each in zip(desk.eras, np.median(moved, axis=0).max(axis=0), strict=False):
         if each < _MOVED:
             raise LinkError(

@@ -94,8 +94,7 @@ def _asked(
             while (said := typer.prompt(question, err=True).strip().lower()) not in {
                 *names, _NONE, _AGAIN
             }:  # fmt: skip
-                hint = did_you_mean(said, names.values())
-                typer.echo(f"{said!r} is none of them; {hint}".strip(), err=True)
+                typer.echo(f"{said!r} is none of {left}; {did_you_mean(said, names)}", err=True)
         era = names.pop(said, None)
         found.append(Heard(number, era, verdict="ok" if era else "moves nothing"))
     return found

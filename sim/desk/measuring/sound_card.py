@@ -163,28 +163,22 @@ class JackCard(SoundCard):
         super().__init__(outputs=outputs, inputs=inputs, limit=limit)
         self.name = jack_name(other)
         self._client = JackClient(CLIENT)
-        self._is_open = True
         try:
             self.rate = float(self._client.rate)
-            self._start(other, outputs, inputs)
+            takers = self._client.first_ports(other, IS_INPUT, outputs)
+            givers = self._client.first_ports(other, IS_OUTPUT, inputs)
+            out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
+            for port, taker in zip(out, takers, strict=True):
+                self._client.connect(port, taker)
+            for giver, port in zip(givers, into, strict=True):
+                self._client.connect(giver, port)
         except BaseException:
             self.close()
             raise
 
-    def _start(self, other: str, outputs: int, inputs: int) -> None:
-        takers = self._client.first_ports(other, IS_INPUT, outputs)
-        givers = self._client.first_ports(other, IS_OUTPUT, inputs)
-        out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
-        for port, taker in zip(out, takers, strict=True):
-            self._client.connect(port, taker)
-        for giver, port in zip(givers, into, strict=True):
-            self._client.connect(giver, port)
-
     def close(self) -> None:
         """Leave the server."""
-        if self._is_open:
-            self._is_open = False
-            self._client.close()
+        self._client.close()
 
 
 _BLOCK = 512  # frames; late samples are worse than a delay, which is measured
@@ -195,7 +189,6 @@ class PortAudioCard(SoundCard):
 
     def __init__(self, device: str, *, outputs: int, inputs: int, limit: float) -> None:
         super().__init__(outputs=outputs, inputs=inputs, limit=limit)
-        library = sounddevice()
         found = portaudio_device(device, outputs=outputs, inputs=inputs)
         self.name, self.rate = found["name"], float(found["default_samplerate"])
         try:
@@ -209,7 +202,7 @@ class PortAudioCard(SoundCard):
                 blocksize=_BLOCK,
                 latency="high",
             )
-        except library.PortAudioError as problem:
+        except sounddevice().PortAudioError as problem:
             raise LinkError(
                 f"--device {self.name}: cannot be opened: {problem.args[0]}; end the program that "
                 "uses it"

@@ -21,7 +21,8 @@ from types import FrameType
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.desk.libjack import NoSound
-from sim.desk.soft_amp.engine import Counters, Engine, counters_in
+from sim.desk.soft_amp.engine import Counters, counters_in, start_engine, take_over
+from sim.desk.soft_amp.library import library
 from sim.desk.soft_amp.output import Output, open_output
 from sim.desk.soft_amp.settings import Settings
 
@@ -46,7 +47,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: that is for the parent
     counters = counters_in(counters_file)
     start = partial(
-        Engine,
+        start_engine,
         settings,
         counters=counters,
         terminal=terminal,
@@ -54,33 +55,31 @@ def main() -> None:
         parent=parent,
     )
     output: Output | None = None
-    engine = None
     try:
         with suppress(NoSound):
             output = None if rate else open_output(settings)
         if output is not None:
-            engine = start(rate=output.rate, is_recovering=False)
+            start(rate=output.rate, is_recovering=False)
         else:  # hosts are to hear of the fault before the device is there
             assumed = rate or settings.rate or _DEFAULT_RATE
-            engine = start(rate=assumed, is_recovering=True)
+            start(rate=assumed, is_recovering=True)
             output = _awaited(settings, rate=assumed)
             if output.rate != assumed:
                 _tell(event="other rate", rate=output.rate)
                 output.close()
                 os._exit(OTHER_RATE)
-        output.start(engine)
-        engine.take_over()
+        output.start()
+        take_over()
         _wait_for_sound(counters, output)
         _tell(event="ready", device=output.name, rate=output.rate, block=output.block)
         while not counters.is_lost and output.is_playing():
             time.sleep(_POLL)
-        engine.lost()
+        library().sound_lost()  # the fault reaction
         time.sleep(_FADE)
         os._exit(LOST)  # not by way of a library whose device has gone
     except _Ended:
-        if engine is not None:
-            engine.end()
-            time.sleep(_FADE)
+        library().sound_end()
+        time.sleep(_FADE)
         if output is not None:
             output.close()
         os._exit(0)

@@ -87,57 +87,42 @@ class JackCalls(ctypes.Structure):
     )
 
 
-class Engine:
-    """The amplifiers at a rate [Hz] and their lines, which start; descriptors: -1 for none.
+def start_engine(
+    settings: Settings,
+    *,
+    rate: int,
+    counters: Counters,
+    is_recovering: bool,
+    terminal: int,
+    listening: int,
+    parent: int,
+) -> None:
+    """Start the amplifiers at a rate [Hz] and their lines; descriptors: -1 for none.
 
     Raises InputError, LinkError.
     """
+    sound = _SoundSettings(
+        rate,
+        settings.channels,
+        list(Law).index(settings.law),
+        settings.protocol,
+        settings.limit,
+        settings.max_gaps,
+        is_recovering,
+        settings.serial_number.encode(),
+    )
+    lines = _LinesSettings(terminal, listening, parent)
+    problem = library().sound_start(
+        ctypes.byref(sound), ctypes.byref(lines), ctypes.byref(counters)
+    )
+    if problem:
+        raise LinkError(f"soft-amp: cannot start: {os.strerror(abs(problem))}")
 
-    def __init__(
-        self,
-        settings: Settings,
-        *,
-        rate: int,
-        counters: Counters,
-        is_recovering: bool,
-        terminal: int,
-        listening: int,
-        parent: int,
-    ) -> None:
-        self._library = library()
-        sound = _SoundSettings(
-            rate,
-            settings.channels,
-            list(Law).index(settings.law),
-            settings.protocol,
-            settings.limit,
-            settings.max_gaps,
-            is_recovering,
-            settings.serial_number.encode(),
-        )
-        lines = _LinesSettings(terminal, listening, parent)
-        problem = self._library.sound_start(
-            ctypes.byref(sound), ctypes.byref(lines), ctypes.byref(counters)
-        )
-        if problem:
-            raise LinkError(f"soft-amp: cannot start: {os.strerror(abs(problem))}")
 
-    def take_over(self) -> None:
-        """Let the sound thread render from now on."""
-        end = time.monotonic() + _HANDOVER
-        while not self._library.sound_take_over():
-            if time.monotonic() > end:
-                raise LinkError(f"soft-amp: its lines did not respond within {_HANDOVER:g} s")
-            time.sleep(_POLL)
-
-    def end(self) -> None:
-        """Fall silent along a ramp of 5 ms."""
-        self._library.sound_end()
-
-    def lost(self) -> None:
-        """Enter the fault reaction, since the device has gone."""
-        self._library.sound_lost()
-
-    def use_jack(self, calls: JackCalls) -> None:
-        """Set what the callbacks of JACK call."""
-        self._library.sound_use_jack(ctypes.byref(calls))
+def take_over() -> None:
+    """Let the sound thread render from now on."""
+    end = time.monotonic() + _HANDOVER
+    while not library().sound_take_over():
+        if time.monotonic() > end:
+            raise LinkError(f"soft-amp: its lines did not respond within {_HANDOVER:g} s")
+        time.sleep(_POLL)

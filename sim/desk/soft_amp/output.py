@@ -3,6 +3,7 @@
 import ctypes
 import os
 import resource
+from contextlib import closing
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -14,12 +15,12 @@ from sim.desk.libjack import (
     IS_OUTPUT,
     JackClient,
     NoSound,
-    check_free,
     jack_name,
     libjack,
 )
-from sim.desk.soft_amp.engine import Engine, JackCalls
+from sim.desk.soft_amp.engine import JackCalls
 from sim.desk.soft_amp.library import address_of
+from sim.desk.soft_amp.library import library as engine
 from sim.desk.soft_amp.settings import Settings, check_rate
 
 CLIENT = "era-soft-amp"
@@ -41,38 +42,35 @@ class JackOutput:
     def __init__(self, settings: Settings, *, destination: str) -> None:
         self._client = JackClient(CLIENT)
         try:
-            self._prepare(settings, destination)
+            self.rate = check_rate(self._client.rate, what="JACK server")
+            if settings.rate not in (None, self.rate):
+                raise InputError(
+                    f"--rate must be {self.rate} Hz, that of the JACK server, got {settings.rate}; "
+                    f"start the server with -r {settings.rate}, or omit --rate"
+                )
+            self.block = self._client.block
+            if settings.block not in (None, self.block):
+                raise InputError(
+                    f"--block must be {self.block} frames, those of the JACK server, got "
+                    f"{settings.block}; start the server with -p {settings.block}, or omit --block"
+                )
+            self.name = jack_name(destination)
+            self._inputs = self._client.first_ports(destination, IS_INPUT, settings.channels)
+            self._ports = self._client.register(
+                (f"out_{n + 1}" for n in range(settings.channels)), IS_OUTPUT
+            )
         except BaseException:
             self.close()
             raise
 
-    def _prepare(self, settings: Settings, destination: str) -> None:
-        rate = self._client.rate
-        if settings.rate not in (None, rate):
-            raise InputError(
-                f"--rate must be {rate} Hz, that of the JACK server, got {settings.rate}; start "
-                f"the server with -r {settings.rate}, or omit --rate"
-            )
-        self.rate = check_rate(rate, what="JACK server")
-        self.block = self._client.block
-        if settings.block not in (None, self.block):
-            raise InputError(
-                f"--block must be {self.block} frames, those of the JACK server, got "
-                f"{settings.block}; start the server with -p {settings.block}, or omit --block"
-            )
-        self.name = jack_name(destination)
-        self._inputs = self._client.first_ports(destination, IS_INPUT, settings.channels)
-        names = [f"out_{n}" for n in range(1, settings.channels + 1)]
-        self._ports = self._client.register(names, IS_OUTPUT)
-
-    def start(self, engine: Engine) -> None:
+    def start(self) -> None:
         """Connect, and let JACK call the engine; raises LinkError."""
         library = libjack()
         calls = JackCalls(client=self._client.pointer)
         calls.ports[: len(self._ports)] = self._ports
         for field, name in _CALLED_BY_ENGINE.items():
             setattr(calls, field, ctypes.cast(getattr(library, name), ctypes.c_void_p))
-        engine.use_jack(calls)
+        engine().sound_use_jack(ctypes.byref(calls))
         set_ = {
             "sound_jack_process": library.jack_set_process_callback,
             "sound_jack_xrun": library.jack_set_xrun_callback,
@@ -140,7 +138,9 @@ def portaudio_device(device: str, *, outputs: int, inputs: int = 0) -> Any:
                 "with era soft-amp --list"
             )
     if outputs and "JACK" in library.query_hostapis(found["hostapi"])["name"]:
-        check_free(found["name"], outputs)
+        with closing(JackClient("era-check")) as client:
+            ports = client.ports_of(found["name"], IS_INPUT)[:outputs]
+            client.check_free(ports, device=found["name"])
     return found
 
 
@@ -227,7 +227,7 @@ class PortAudioOutput:
             f"--device {self.name}: cannot be opened: {text}; end the program that plays on it"
         )
 
-    def start(self, engine: Engine) -> None:
+    def start(self) -> None:
         """Let PortAudio call the engine; raises LinkError."""
         try:
             self._stream = portaudio_stream(

@@ -35,8 +35,6 @@ _PRIORITY = 2  # SCHED_RR
 _BLOCKS = 4  # that a stall lasts at least
 _ENDED = {LOST: "the device was lost", OTHER_RATE: "the device has another rate"}
 
-Report = Callable[[str], None]
-
 
 class Supervisor:
     """Run an amplifier at a place; report: takes a line for each event.
@@ -45,7 +43,7 @@ class Supervisor:
     InputError, LinkError.
     """
 
-    def __init__(self, settings: Settings, place: Place, *, report: Report) -> None:
+    def __init__(self, settings: Settings, place: Place, *, report: Callable[[str], None]) -> None:
         self._settings = settings
         self._place = place
         self._report = report
@@ -65,14 +63,12 @@ class Supervisor:
         while time.monotonic() < end:
             for event in self._events(_POLL):
                 if event["event"] == "refused":
-                    self.end()
                     kind = InputError if event["is_input"] else LinkError
                     raise kind(event["reason"])
                 self._take(event)
                 return
             if self._process.poll() is not None:
                 break
-        self.end()
         raise LinkError(f"soft-amp: {self._settings.device} was not opened in {_START:g} s")
 
     def watch(self, *, until: int | None) -> None:

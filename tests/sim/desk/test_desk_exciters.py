@@ -16,7 +16,7 @@ from model.calibration.responses_file import read_measured
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.sensor_file import WiredSensor
 from model.identification.identify import identify
-from model.rig.file import load_rig
+from model.rig.file import parse_rig
 from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
@@ -50,11 +50,9 @@ POINTS = np.array([[0.05, 0.05], [0.15, 0.11], [0.27, 0.2]])
 
 
 @pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+def board() -> Rig:
     """Acrylic on feet of foam, with four exciters."""
-    path = tmp_path_factory.mktemp("board") / "rig.yaml"
-    path.write_text(BOARD, "utf-8")
-    return replace(load_rig(path), masses=FEET)
+    return replace(parse_rig("board.yaml", BOARD), masses=FEET)
 
 
 def test_exciters_in_time_are_those_of_the_direct_solution(board: Rig) -> None:

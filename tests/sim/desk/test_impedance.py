@@ -58,15 +58,18 @@ TRUE = {
 
 
 @pytest.mark.parametrize(
-    ("series_error", "input_error"), [(0.0, 0.0), (0.05, 0.01)], ids=["noise", "bounds"]
+    ("series_error", "input_error", "most"),
+    [(0.0, 0.0, 188), (0.05, 0.01, 196)],
+    ids=["noise", "bounds"],
 )
 def test_parts_are_within_their_intervals_in_nine_of_ten_draws(
-    series_error: float, input_error: float
+    series_error: float, input_error: float, most: int
 ) -> None:
     """Noise of 0.1 %, a scale of 0.1 g, glued to 300 g; resistor and inputs anywhere within bounds.
 
-    Of 200 draws 180 ± 2 sigma are expected. Inputs measure S (g V_1 / V_2 - 1) of the circuit's own
-    voltages, V_1 / V_2 = Z / (s S) + 1.
+    Of 200 draws 180 ± 2 sigma are expected of noise; 190 ± 2 sigma at most of a bound alone, of
+    whose half width 1.645 / sqrt 3 = 0.95 are within.
+    Inputs measure S (g V_1 / V_2 - 1) of the circuit's own voltages, V_1 / V_2 = Z / (s S) + 1.
     """
     exact = [
         np.array([impedance(f, is_glued=is_glued, base=BASE) for f in F])
@@ -86,7 +89,7 @@ def test_parts_are_within_their_intervals_in_nine_of_ten_draws(
         bench = Bench(weight, None, base, SCALE, SERIES, series_error, input_error)
         for name, (value, width) in exciter_values(*runs, bench).items():
             inside[name] += abs(value - TRUE[name]) <= width
-    assert all(172 <= count <= 188 for count in inside.values()), inside
+    assert all(172 <= count <= most for count in inside.values()), inside
 
 
 def test_parts_are_those_of_the_circuit() -> None:

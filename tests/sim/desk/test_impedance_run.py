@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -13,15 +12,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.desk.capture import open_client
 from benchmarks.desk_plate.jack_plate import JackPlate
-from drivers.errors import LinkError
 from exciter_circuit import ExciterCircuit
 from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
 from model.rig.file import parse_rig
 from sim.desk.impedance_cli import app
-from sim.desk.libjack import JackClient
 from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
 
@@ -38,30 +36,18 @@ PARTS = {
 
 
 class MemoryCard(SoundCard):
-    """The circuit as a sound card; inputs: which of its two voltages each input has."""
+    """The circuit as a sound card; inputs: which of its two voltages each has, run by run."""
 
-    def __init__(self, circuit: ExciterCircuit, inputs: Sequence[int] = (0, 1)) -> None:
+    def __init__(self, circuit: ExciterCircuit, *inputs: Sequence[int]) -> None:
         self.circuit, self.name, self.rate, self.gaps = circuit, "memory", float(RATE), 0
-        self.inputs = inputs
+        self.inputs = iter(inputs or [(0, 1)])
 
     def run(self, played: FloatArray) -> Float32Array:
         """Advance the circuit."""
-        return self.circuit.advance(played)[:, list(self.inputs)].astype(np.float32)
+        return self.circuit.advance(played)[:, list(next(self.inputs))].astype(np.float32)
 
     def close(self) -> None:
         """Nothing is open."""
-
-
-class MovedCard(MemoryCard):
-    """One input, which is before the exciter in the first run, and over the resistor then."""
-
-    runs = 0
-
-    def run(self, played: FloatArray) -> Float32Array:
-        """Advance the circuit."""
-        found = super().run(played)[:, [self.runs]]
-        self.runs += 1
-        return found
 
 
 def measured(
@@ -90,7 +76,7 @@ def test_parts_come_from_two_runs_and_a_scale(
     assert width == pytest.approx(0.245, abs=0.001)
     circuit = ExciterCircuit(is_glued=True, rate=RATE)
     status, told = measured(
-        monkeypatch, MovedCard(circuit), "-o", glued, "--free", free, "--weight", WEIGHT,
+        monkeypatch, MemoryCard(circuit, [0], [1]), "-o", glued, "--free", free, "--weight", WEIGHT,
         "--inputs", "1", "--series-error", "0.1", typed="\n\n",
     )  # fmt: skip
     assert status == 0
@@ -167,7 +153,7 @@ def test_parts_are_found_through_a_real_server(
     monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
     with jack_server(name) as server:
         for is_glued in (False, True):
-            with closing(_client("desk")) as client:
+            with closing(open_client("desk")) as client:
                 circuit = ExciterCircuit(is_glued=is_glued, rate=RATE)
                 plate = JackPlate(client, circuit)  # type: ignore[arg-type]  # called by JACK
                 plate.start()
@@ -179,14 +165,3 @@ def test_parts_are_found_through_a_real_server(
                 )  # fmt: skip
                 plate.wait(0)
     _check(json.loads(done.stdout))
-
-
-def _client(name: str) -> JackClient:
-    end = time.monotonic() + 20
-    while True:
-        try:
-            return JackClient(name, is_only=True)
-        except LinkError:
-            if time.monotonic() > end:
-                raise
-            time.sleep(0.05)

@@ -93,15 +93,18 @@ def test_unsuitable_cards_are_refused(server: JackServer, tmp_path: Path) -> Non
 
 
 def test_card_that_is_played_to_is_busy(server: JackServer) -> None:
-    """For measurement and amplifier, also by PortAudio: JACK would add up what two play."""
+    """For measurement and amplifier, also by PortAudio: JACK would add up what two play.
+
+    A device that there is not is one message, too.
+    """
     playing = card("jack:card")
     with pytest.raises(LinkError, match="busy"):
         card("jack:card")
     with pytest.raises(LinkError, match="busy"):
         open_output(SETTINGS)
-    status, message = refusal(server, "soft-amp", "--device", "card", "--channels", "2")
-    assert (status, message.count("\n")) == (3, 1)
-    assert "busy" in message
+    for device, status, cause in (("card", 3, "busy"), ("no such device", 2, "no such device")):
+        done = refusal(server, "soft-amp", "--device", device, "--channels", "2")
+        assert (done[0], done[1].count("\n"), cause in done[1]) == (status, 1, True)
     playing.close()
 
 

@@ -140,47 +140,33 @@ def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     assert check["phase_rms_deg"] < 1.0
 
 
-def test_lost_block_repeats_its_run(rig: Rig, truth: Truth, undisturbed: Measured) -> None:
-    """128 samples are missing in run 1, which nothing reports: it is played again."""
-    desk = Desk(rig, SENSORS)
-    sound = card(truth, lost=[1])
-    found = measure(desk, sound, sines(desk))
-    assert (found.repeated, sound.runs) == (1, 6)
-    difference = found.responses.values - undisturbed.responses.values
-    assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
-
-
-def test_delay_that_differs_between_runs_repeats_a_run(
-    rig: Rig, truth: Truth, undisturbed: Measured
+@pytest.mark.parametrize(
+    ("wires", "repeated"),
+    [({"lost": [1]}, 1), ({"late": [2]}, 1), ({"reported": 1}, 0)],
+    ids=["1", "2", "none"],
+)
+def test_run_that_lost_a_block_is_played_again(
+    rig: Rig, truth: Truth, undisturbed: Measured, wires: dict[str, object], repeated: int
 ) -> None:
-    """As where a block of inputs was lost between two; the runs would not be orthogonal."""
+    """128 samples are missing in a run, or before it, which nothing reports.
+
+    Runs would not be orthogonal. Losses that a driver alone reports, as PortAudio does over a
+    synchronous server, repeat nothing.
+    """
     desk = Desk(rig, SENSORS)
-    found = measure(desk, card(truth, late=[2]), sines(desk))
+    sound = card(truth, **wires)
+    found = measure(desk, sound, sines(desk))
+    assert (found.repeated, sound.runs) == (repeated, 5 + repeated)
     difference = found.responses.values - undisturbed.responses.values
-    assert found.repeated == 1
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
-
-
-def test_losses_that_were_none_repeat_nothing(rig: Rig, truth: Truth) -> None:
-    """A driver reports them, as PortAudio over a synchronous server; the cable shows none."""
-    desk = Desk(rig, SENSORS)
-    sound = card(truth, reported=1)
-    assert measure(desk, sound, sines(desk)).repeated == 0
-    assert sound.runs == 5
-
-
-def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None:
-    """Three attempts, then no file."""
-    desk = Desk(rig, SENSORS)
-    with pytest.raises(LinkError, match="lost"):
-        measure(desk, card(truth, lost=range(99)), sines(desk))
 
 
 @pytest.mark.parametrize(
     ("wires", "error", "cause"),
     [
         ({"on_inputs": [0, 3, 2, 1]}, InputError, "at input 2.*P2"),
-        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "output 2 of ERA SE"),
+        ({"lost": range(99)}, LinkError, "lost in 3 attempts"),
+        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "0.9 of output 2 of ERA SE"),
         ({"gain": 50.0}, InputError, "clipping"),
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
         ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back"),
@@ -193,7 +179,7 @@ def test_blocks_that_are_always_lost_are_refused(rig: Rig, truth: Truth) -> None
 def test_wrong_desks_are_refused_with_their_cause(
     rig: Rig, truth: Truth, wires: dict[str, object], error: type[Exception], cause: str
 ) -> None:
-    """Inputs, outputs swapped; clipped; off; no cable for the loop-back; noise; two clocks."""
+    """Inputs or outputs swapped, blocks lost, clipped, off, no cable, noise, two clocks."""
     desk = Desk(rig, SENSORS)
     played = sines(desk)
     if "noise" in wires:
@@ -211,15 +197,11 @@ def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
         measure(desk, card(replace(truth, actuators=tuple(off)), noise=5e-3), sines(desk))
 
 
-@pytest.mark.parametrize("level", [0.0, 1.5])
-def test_levels_beyond_the_rigs_limits_are_refused(rig: Rig, level: float) -> None:
-    """By the option that sets them."""
-    with pytest.raises(InputError, match="--level"):
-        Desk(rig, SENSORS).check(level)
-
-
-def test_frequencies_that_no_period_has_are_refused() -> None:
-    """Half a hertz is no line of a second; 4 kHz is beyond what 8 kHz carry."""
+def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> None:
+    """A level beyond the rig's limits; half a hertz, no line of a second; 4 kHz at 8 kHz."""
+    for level in (0.0, 1.5):
+        with pytest.raises(InputError, match="--level"):
+            Desk(rig, SENSORS).check(level)
     for frequency in (61.5, 3999.0):
         with pytest.raises(InputError, match="frequencies"):
             Multisine(np.array([frequency]), 5, RATE, LEVEL)
@@ -279,12 +261,9 @@ class CallbackCard(SoundCard):
         super().__init__(outputs=1, inputs=1, limit=1.0)
         self._flags = flags
 
-    def start(self, blocks: int) -> np.ndarray:
-        """Let blocks of zeros be played; returns the memory that is recorded to."""
-        return self.begin(np.zeros((blocks * FRAMES, 1)))
-
-    def call(self) -> int:
-        """All blocks; returns the gaps that were counted."""
+    def call(self) -> tuple[int, bool]:
+        """Three blocks; returns the gaps that were counted, and whether all was recorded."""
+        heard = self.begin(np.zeros((3 * FRAMES, 1)))
         kind = ctypes.CFUNCTYPE(
             ctypes.c_int,
             ctypes.c_void_p,
@@ -300,7 +279,7 @@ class CallbackCard(SoundCard):
         recorded, played, given = block.ctypes.data, out.ctypes.data, self.given()
         for flags in self._flags:
             assert callback(recorded, played, FRAMES, None, flags, given) == 0
-        return self._transfer.gaps
+        return self._transfer.gaps, bool(heard.all())
 
     def close(self) -> None:
         """Nothing is open."""
@@ -318,10 +297,7 @@ class CallbackCard(SoundCard):
 )
 def test_lost_blocks_are_gaps_while_something_plays(flags: list[int], gaps: int) -> None:
     """Each block with a flag of a loss, from the second to the last, is one gap."""
-    card = CallbackCard(flags)
-    heard = card.start(3)
-    assert card.call() == gaps
-    assert heard.all()
+    assert CallbackCard(flags).call() == (gaps, True)
 
 
 @pytest.mark.parametrize("sample", [1.01, np.nan])

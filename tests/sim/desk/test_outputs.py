@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
@@ -22,9 +21,9 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
+from sim.cli import app
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, matched, tone
-from sim.desk.outputs_cli import outputs
 
 RATE = 8000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
@@ -163,11 +162,9 @@ def test_said_channels_are_written(
     card = cabled(truth)
     monkeypatch.setattr("sim.desk.measuring.outputs_run.open_card", lambda *_, **__: card)
     output = tmp_path / "wired.yaml"
-    app = typer.Typer()
-    app.command()(outputs)
     done = CliRunner().invoke(
         app,
-        [str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
+        ["outputs", str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
         input=said,
     )
     assert done.exit_code == status

@@ -13,7 +13,7 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from sim.desk.soft_amp.engine import Counters, Engine, JackCalls
+from sim.desk.soft_amp.engine import Counters, JackCalls, start_engine, take_over
 from sim.desk.soft_amp.library import library
 from sim.desk.soft_amp.settings import Protocol, Settings
 
@@ -80,12 +80,12 @@ def play(results: Connection) -> None:
     host, terminal = socket.socketpair()
     terminal.setblocking(False)
     settings = Settings("jack", 2, Protocol.SERIAL, "S")
-    engine = Engine(
+    start_engine(
         settings, rate=RATE, counters=counters, is_recovering=False,
         terminal=terminal.fileno(), listening=-1, parent=-1,
     )  # fmt: skip
-    engine.use_jack(jack.calls())
-    engine.take_over()
+    library().sound_use_jack(ctypes.byref(jack.calls()))
+    take_over()
 
     def run(served: int) -> int:
         """Let the server go on until so many requests were served; return the last frame."""

@@ -131,17 +131,6 @@ async def test_silence_is_an_open_output_of_zeros(
     here.close()
 
 
-def test_refused_device_is_one_message(
-    sound: tuple[Capture, dict[str, str]], tmp_path: Path
-) -> None:
-    """And an exit status, and no URL; PortAudio knows no device of this name."""
-    options = ("--device", "no such device", "--channels", "2")
-    soft_amp = SoftAmp(*options, environment=sound[1], log=tmp_path / "log")
-    soft_amp.end()
-    assert (soft_amp.url, soft_amp.process.returncode) == ("", 2)
-    assert soft_amp.log.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     ("changed", "key"),
     [

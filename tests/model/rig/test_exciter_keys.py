@@ -78,6 +78,8 @@ def test_what_is_wrong_is_found_at_its_key() -> None:
     assert "free, of the light coil" in refused(f"{OWN}, resonance: 224 Hz")["resonance_is"]
     assert refused("type: DAEX25CT-4, resonance: 60").keys() >= {"resonance_is"}
     assert refused(OWN)["resonance"] == "missing; add it, or a type that has it"
+    both = refused(f"{OWN}, resonance: 224 Hz, resonance_is: free, stiffness: 3 kN/m")
+    assert both.keys() == {"stiffness", "resonance_is"}
     misspelt = refused("type: DAEX25CT-5")
     assert "did you mean DAEX25CT-4" in misspelt.pop("type")
     assert all(key.startswith("eras.") for key in misspelt)  # each of the others once

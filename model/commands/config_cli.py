@@ -27,10 +27,19 @@ def init(
 
     made = kind_called(kind)
     check_ending(file, ".yaml", ".yml", what=f"a {kind} file")
+    if file.exists():
+        raise InputError(f"{file} exists already; choose another name")
     schema = file.with_suffix(".schema.json")
-    _write_new(file, f"# yaml-language-server: $schema={schema.name}\n{made.example()}")
-    with whole_or_nothing(schema) as stream:
-        stream.write(json.dumps(made.schema(), indent=2).encode() + b"\n")
+    texts = {
+        file: f"# yaml-language-server: $schema={schema.name}\n{made.example()}",
+        schema: json.dumps(made.schema(), indent=2) + "\n",
+    }
+    try:
+        for path, text in texts.items():
+            with whole_or_nothing(path) as stream:
+                stream.write(text.encode())
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be written: {error.strerror}") from error
     typer.echo(f"wrote {file}, to be edited, and {schema}")
     typer.echo(next_line("era", "config", "check", file))
 
@@ -63,19 +72,3 @@ def check(
     rows = [f"{file}: {good.line}", *(f"warning: {warning}" for warning in warnings)]
     answer = {"ok": True, "errors": [], "warnings": warnings, **good.more}
     print_report(rows, answer, as_json=as_json)
-
-
-def _write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist; leave none behind if that fails."""
-    try:
-        stream = path.open("x", encoding="utf-8")
-    except FileExistsError as error:
-        raise InputError(f"{path} exists already; choose another name") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from error
-    try:
-        with stream:
-            stream.write(text)
-    except OSError as error:
-        path.unlink()
-        raise InputError(f"{path} cannot be written: {error.strerror}") from error

@@ -75,15 +75,17 @@ def query(
         }
         _query_batch(table_file, batch, defaults)
         return
-    if swap_bands and not own:
-        raise InputError("--swap-bands must be given with --own")
-    if own and target:
-        raise InputError("--own must be given without --target")
-    if not (target or own):
-        raise InputError(
-            "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
-            "--batch FILE"
-        )
+    no_target = (
+        "targets must be at least one, got none; give --target X,Y or --own X,Y, metres, or "
+        "--batch FILE"
+    )
+    for is_wrong, said in (
+        (swap_bands and not own, "--swap-bands must be given with --own"),
+        (own and target, "--own must be given without --target"),
+        (not (target or own), no_target),
+    ):
+        if is_wrong:
+            raise InputError(said)
     given = {
         "targets": [parse_point(text, what="--target") for text in target or []],
         "own": [_own(text) for text in own or []],

@@ -132,11 +132,9 @@ def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
 
 
 def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_max: float) -> None:
-    text = validation.mapping(()).get("mesh", "auto")
-    if not isinstance(text, str):
-        return
+    text = validation.field(("mesh",), RigSection)
     try:
-        mesh = mesh_of(text, plate, frequency_max=frequency_max)
+        mesh = mesh_of(text or "auto", plate, frequency_max=frequency_max)
     except InputError as error:
         validation.add(("mesh",), str(error))
         return

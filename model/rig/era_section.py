@@ -53,14 +53,10 @@ class EraSection(ActuatorSection):
 
     def made(self, name: str, plate: Plate, count: int) -> Era:
         """An ERA; its damping from a ratio depends on plate and count."""
-        damping = self.damping
-        if damping is None:
-            damping = damping_from_ratio(
-                self.damping_ratio,
-                stiffness=self.stiffness,
-                plate_mass=plate.mass,
-                era_count=count,
-            )
+        by_ratio = damping_from_ratio(
+            self.damping_ratio, stiffness=self.stiffness, plate_mass=plate.mass, era_count=count
+        )
+        damping = by_ratio if self.damping is None else self.damping
         at, same = place_on(plate, self.at), self.model_dump(include=_SAME)
         return Era(name, *at, damping=damping, gains=gains_of(self.gains), **same)
 

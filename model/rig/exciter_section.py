@@ -145,19 +145,16 @@ class ExciterSection(ActuatorSection):
     def made(self, name: str, plate: Plate, count: int) -> Exciter:
         """An exciter; nothing of it depends on the count."""
         values = self.values
-        stiffness, damping = self.stiffness, self.damping
         moving = values["coil_mass"] if values["resonance_is"] == "free" else values["weight"]
-        if stiffness is None:
-            stiffness = moving * (2 * math.pi * values["resonance"]) ** 2
-        if damping is None:
-            damping = math.sqrt(stiffness * moving) / values["q"]
+        k = self.stiffness or moving * (2 * math.pi * values["resonance"]) ** 2
+        c = math.sqrt(k * moving) / values["q"] if self.damping is None else self.damping
         resistance, source = values["resistance"], self.source_resistance
         heated = (resistance + source) * math.sqrt(2 * values["power"] / resistance)
         return Exciter(
             name,
             *place_on(plate, self.at),
-            stiffness=stiffness,
-            damping=damping,
+            stiffness=k,
+            damping=c,
             magnet_mass=values["weight"],
             coil_mass=values["coil_mass"],
             force_factor=values["force_factor"],

@@ -43,16 +43,20 @@ def _check(document: Document) -> CheckedFile:
         rig = rig_of(document)
     except ConfigError as error:
         problems += error.problems
-    wrong, warnings = check_amplifiers(document, rig)
+    urls = _urls(document)
+    counts = rig.channel_counts if rig else Counter[str]()
+    limits = rig.limits if rig else limits_of(LimitsSection())
+    wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
     if rig is not None:
         support = support_problem(rig.plate, rig.eras, loads=rig.masses)
         problems += [] if support is None else [document.problem(("eras",), support)]
     known = {problem.key for problem in problems}
-    problems += [problem for problem in wrong if problem.key not in known]
+    of_urls = [document.problem(("amplifiers", name, "url"), what) for name, what in wrong.items()]
+    problems += [problem for problem in of_urls if problem.key not in known]
     if rig is None or problems:
         raise ConfigError(document.source, problems)
     note = rig.uncertainty.note
-    line, lost, more = clock_costs(rig, _urls(document))
+    line, lost, more = clock_costs(rig, urls)
     warnings = [*exciter_notes(rig), *warnings]
     costs = [*lost, *gain_notes(rig), *_plate_notes(rig), *_mount_notes(rig)]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
@@ -233,19 +237,6 @@ _CHECK = "drivers.by_hand.rig_check:check_links"
 Of URLs by the amplifier's name, numbers of channels that are wired, and the rig's limits; it gives
 errors by the amplifier's name, and warnings, and opens none.
 """
-
-
-def check_amplifiers(document: Document, rig: Rig | None) -> tuple[list[ConfigProblem], list[str]]:
-    """Problems and warnings; rig: of the document, None if it is invalid."""
-    urls = _urls(document)
-    counts = rig.channel_counts if rig else Counter[str]()
-    limits = rig.limits if rig else limits_of(LimitsSection())
-    wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
-    problems = [
-        document.problem(("amplifiers", amplifier, "url"), what)
-        for amplifier, what in wrong.items()
-    ]
-    return problems, [*warnings]
 
 
 def _urls(document: Document) -> dict[str, str]:

@@ -51,7 +51,9 @@ def plate_summary(rig: Rig) -> dict[str, Any]:
         "surface_density_kg_m2": plate.surface_density,
         "flexural_rigidity_n_m": plate.flexural_rigidity,
         "bending_wavelength_m": {
-            f"{frequency:g}_hz": _wavelength(plate, frequency)
+            f"{frequency:g}_hz": 2 * math.pi / wavenumber_of(plate.laminate, frequency).real
+            if plate.laminate
+            else plate.bending_wavelength(frequency)
             for frequency in (limits.frequency_min, limits.frequency_max)
         },
         "air_gap": None if gap is None else _air_gap(gap, limits),
@@ -86,13 +88,6 @@ def _grain(plate: Plate) -> dict[str, float] | None:
         "flexural_rigidity_along_n_m": float(along),
         "flexural_rigidity_across_n_m": float(across),
     }
-
-
-def _wavelength(plate: Plate, frequency: float) -> float:
-    """Of a free bending wave [m], without air."""
-    if plate.laminate is None:
-        return plate.bending_wavelength(frequency)
-    return 2 * math.pi / wavenumber_of(plate.laminate, frequency).real
 
 
 def _air_gap(gap: AirGap, limits: GuardLimits) -> dict[str, Any]:

@@ -314,16 +314,12 @@ class Fingertip:
 
 @dataclass(frozen=True)
 class FingertipLoad:
-    """A fingertip that rests on the plate at x, y [m]; it acts at a point."""
+    """A fingertip that rests on the plate at x, y [m]; it acts at a point, of foot 0."""
 
     x: float
     y: float
     fingertip: Fingertip
-
-    @property
-    def foot(self) -> float:
-        """Radius of the disc on which it acts [m]: 0, a point."""
-        return 0.0
+    foot: ClassVar[float] = 0.0
 
     def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
         """Dynamic stiffness [N/m] at omega [rad/s], of the same shape."""

@@ -118,6 +118,7 @@ def check_refusal(
         (6, "mesh: 11x8", "6 mesh"),
         (6, "mehs: 48x36", "6 mehs, mesh"),
         ((7, 18), "eras: {}", "7 eras"),
+        ((12, 18), "  NE: {at: [12 in, 9 in], stiffness: 17000}", "7 eras"),
         ((7, 18), "", "1 eras"),
         (9, "    at: [0, 0, 0]", "9 eras.SW.at"),
         (9, "    at: [0]", "9 eras.SW.at[1]"),

@@ -108,24 +108,28 @@ def test_default_drive_frequencies_are_within_the_limits(low, high, expected):
     np.testing.assert_array_equal(found, list(expected))
 
 
+FOIL = {"length": 3.0, "width": 3.0, "thickness": 0.0001}
+
+
 @pytest.mark.parametrize(
-    "frequencies",
-    [[], [100.0, 100.0], [200.0, 100.0], [10.0], [100.0, 900.0], [100.0, float("nan")]],
+    ("frequencies", "plate", "said"),
+    [
+        *(
+            (each, {}, "frequencies")
+            for each in ([], [100, 100], [200, 100], [10], [100, 900], [100, math.nan])
+        ),
+        ([100.0, 500.0], FOIL, "GB"),
+    ],
 )
-def test_build_refuses_impossible_frequencies(frequencies):
-    """None, unordered, outside the rig's limits, not a number."""
-    with pytest.raises(InputError, match="frequencies"):
-        build_table(make_paper_rig(12, 9), frequencies=np.array(frequencies))
+def test_what_makes_no_table_is_refused(frequencies, plate, said):
+    """No frequencies, unordered, outside the rig's limits, not a number; a foil of 9 m².
 
-
-def test_what_makes_no_table_is_refused():
-    """A foil of three by three metres has some ten thousand modes; five points carry no quintic."""
+    That has some ten thousand modes, and is refused before it is solved.
+    """
     rig = make_paper_rig(48, 36)
-    foil = replace(rig, plate=replace(rig.plate, length=3.0, width=3.0, thickness=0.0001))
-    with pytest.raises(InputError, match="GB"):
-        TableProblem(foil, np.array([100.0, 500.0]), Grid(4, 3))
-    with pytest.raises(InputError, match="6 to"):
-        Raster(5, 9, 0.1, 0.1)
+    rig = replace(rig, plate=replace(rig.plate, **plate))
+    with pytest.raises(InputError, match=said):
+        TableProblem(rig, np.array(frequencies, dtype=float), Grid(4, 3))
 
 
 CONTACTS = [(0.15, 0.11), (0.0, 0.0), (0.3048, 0.1), (0.2, 0.225), (0.006, 0.0031)]
@@ -170,6 +174,8 @@ def test_for_plate_handles_thin_and_small_plates(thickness):
     raster = Raster.for_plate(plate, frequency_max=500.0)
     heights = (3 * raster.points[:, :1] - raster.points[:, 1:]).astype(np.float32)
     np.testing.assert_allclose(raster.at(heights, np.array([[0.011, 0.004]])), [[0.029]], rtol=1e-5)
+    with pytest.raises(InputError, match="6 to"):  # five points carry no quintic
+        Raster(5, 9, 0.1, 0.1)
 
 
 FIVE = np.array([80.0, 145.0, 220.0, 310.0, 450.0])

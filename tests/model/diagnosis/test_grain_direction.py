@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import controller.cli.identify
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
-from controller.cli.commands import app
+from controller.cli.main import run
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses
 from model.diagnosis.consistency import check_consistency
@@ -84,7 +83,12 @@ def test_the_other_side_is_named_and_wiring_is_judged_on_the_board_itself(
     ],
 )
 def test_commands_say_so_and_write_no_rig(
-    command: str, turned: Responses, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str,
+    turned: Responses,
+    rig: Rig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """By a file, and of what amplifiers would have measured."""
     here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
@@ -92,8 +96,6 @@ def test_commands_say_so_and_write_no_rig(
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, turned, rig)
     typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)
-    result = CliRunner().invoke(app, typed.split())
-    assert result.exit_code != 0
-    shown = result.output + str(result.exception)
-    assert "plate.grain must be width, got length" in shown
+    assert run(typed.split()) != 0
+    assert "plate.grain must be width, got length" in "".join(capsys.readouterr())
     assert not made.exists()

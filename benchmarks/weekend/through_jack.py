@@ -205,7 +205,8 @@ def summary(found: Sequence[Played]) -> str:
     return (
         f"{table([each.outcome for each in found])}\n\n"
         f"Measured in {min(seconds):.0f} to {max(seconds):.0f} s a board; "
-        f"{sum(each.repeated for each in found)} places not kept at once; "
+        f"{sum(each.repeated for each in found)} times a place was refused, and left out after the "
+        "second; "
         f"{sum(each.lost for each in found)} touches broken off and repeated; "
         f"{sum(each.xruns for each in found)} blocks that the server had late."
     )

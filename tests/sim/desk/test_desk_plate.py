@@ -62,7 +62,7 @@ def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
 
     What differs is damping, viscous here and hysteretic there.
     """
-    rig, factors, frequency = truth.rig, [0.6, 1.7], 233.0
+    rig, factors, frequency = truth.rig, [0.3, 3.0], 150.0
     sensors = [WiredSensor("P1", 0.03, 0.05, 1, 1e-3)]
     desk = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
     desk.set_fingers(FINGERS, factors)

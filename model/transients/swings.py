@@ -46,8 +46,8 @@ def motions_along(
     settled = plate.following(np.array([s]))[0][0].T[:, :, None] * rows.T[:, None, :]
     near = np.abs(plate.eigenvalues) < 2 * math.pi * (_NEAR * frequency + _BESIDE)
     parts = math.ceil(swing.step / _STEP)
-    step, count = swing.step / parts, len(swing.shares)
-    level = np.interp(np.arange(parts * (count - 1) + 1) / parts, np.arange(count), swing.shares)
+    step, knots = swing.step / parts, len(swing.shares)
+    level = np.interp(np.arange(parts * (knots - 1) + 1) / parts, np.arange(knots), swing.shares)
     rates: ComplexArray = plate.eigenvalues[near] - s
     decays = np.exp(rates * step)
     ends = 1 - (decays - 1) / (rates * step)
@@ -63,8 +63,8 @@ def motions_along(
     largest = np.abs(moved).sum(axis=1).max(axis=0)
     if swing.again < math.inf:  # phases go on from one to the next
         for pause in np.arange(swing.again, swing.again + _PACES, _STEP):
-            turn = math.ceil(pause / step)
-            spare = np.pad(moved, ((0, -len(moved) % turn), (0, 0), (0, 0)))
-            anew = np.abs(spare.reshape(-1, turn, *moved.shape[1:]).sum(axis=0))
+            count = math.ceil(pause / step)
+            spare = np.pad(moved, ((0, -len(moved) % count), (0, 0), (0, 0)))
+            anew = np.abs(spare.reshape(-1, count, *moved.shape[1:]).sum(axis=0))
             largest = np.maximum(largest, anew.sum(axis=1).max(axis=0))
     return np.asarray(largest)

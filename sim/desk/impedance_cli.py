@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 from typer.core import TyperCommand
@@ -251,12 +251,15 @@ def _warnings(
 
 
 class MeasureCommand(TyperCommand):
-    """`era measure`; with --impedance it is another command, with options of its own."""
+    """`era measure`; with a flag it is another command, with options of its own."""
+
+    variants: ClassVar = {FLAG: get_command(app)}
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
-        """The context of this command, or of the one that the flag asks for."""
-        if FLAG in args:
-            return get_command(app).make_context(info_name, args, parent, **extra)
+        """The context of this command, or of the one that a flag asks for."""
+        for flag, variant in self.variants.items():
+            if flag in args:
+                return variant.make_context(info_name, args, parent, **extra)
         return super().make_context(info_name, args, parent, **extra)

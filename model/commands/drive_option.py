@@ -43,7 +43,9 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
             )
         if name in excitation:
             raise InputError(f"--drive {text!r}: ERA {name} must have one tone, got two")
-        frequency, level, phase = (float(match[key] or usual) for key, usual in _NUMBERS.items())
+        frequency, level, phase = (
+            float(match[key] or default) for key, default in _NUMBERS.items()
+        )
         expect_between(level, 0, 1, what=f"--drive {text!r}: level")
         if frequency <= 0:
             raise InputError(f"--drive {text!r}: frequency must be positive, got {frequency:g} Hz")

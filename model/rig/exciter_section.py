@@ -188,9 +188,9 @@ class ExciterSection(ActuatorSection):
             yield "resonance_is", f"missing; add which of both it is: {_EITHER}"
         if {"stiffness", "resonance_is"} <= given.keys():
             yield "resonance_is", "must not be given with stiffness; remove it"
-        most = _of_type(name).get("power", math.inf)
-        if power is not None and power > most:
-            yield "power", f"must be at most {most:g} W, which a {name} bears, got {power:g} W"
+        rated = _of_type(name).get("power", math.inf)
+        if power is not None and power > rated:
+            yield "power", f"must be at most {rated:g} W, which a {name} bears, got {power:g} W"
 
 
 _NEEDED = ("coil_mass", "weight", "force_factor", "resistance", "power", "resonance", "q")

@@ -99,7 +99,7 @@ class SensedPlate:
     @cached_property
     def held(self) -> NDArray[np.bool_]:
         """Which fitted values (n,) a prior holds."""
-        return self.largest_errors != 1
+        return np.asarray(self.largest_errors != 1)
 
     @cached_property
     def largest_errors(self) -> FloatArray:

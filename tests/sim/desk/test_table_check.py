@@ -187,7 +187,7 @@ def test_dead_and_clipped_inputs_keep_no_promise(
     [
         (["--device", "jack"], "--sensors"),
         (["--url", "sim://"], "--device"),
-        ([], "--device"),
+        ([], "rig is missing"),
         (["--device", "memory", "--sensors", "sensors.csv", "--url", "sim://"], "rig is missing"),
         (["--device", "memory", "--sensors", "sensors.csv"], "--level"),
     ],

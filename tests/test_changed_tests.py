@@ -27,7 +27,8 @@ def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
     What the project's file or an example leads to besides comes last.
     """
     reached = nearest([path])
-    beside = {each for each in reached if Path(each).parent == Path("tests") / Path(path).parent}
+    folder = Path("tests") / Path(path).parent
+    beside = {each for each in reached if folder in Path(each).parents}
     direct = importing(path.removesuffix(".py").replace("/", "."))
     assert {each for each in beside | direct if reached[each] <= 1} == beside | direct
     assert {each for each, distance in reached.items() if distance == 0} >= beside

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import KINDS, LEAST_TOLD, VALUE_UNITS, space_by_sheets
+from model.identification.parameters import KINDS, MOST_GUESSED, VALUE_UNITS, space_by_sheets
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -108,8 +108,9 @@ class SensedPlate:
         Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
         """
         by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
+        rows = self.rows
         return np.array(
-            [math.inf if row in by_sheet else LEAST_TOLD if row.foot else 1.0 for row in self.rows]
+            [math.inf if row in by_sheet else MOST_GUESSED if row.foot else 1.0 for row in rows]
         )
 
     @cached_property

@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from model.arrays import ComplexArray, FloatArray
 from model.transients.time_response import PlateInTime
@@ -51,13 +50,10 @@ def motions_along(
     rates: ComplexArray = plate.eigenvalues[near] - s
     decays = np.exp(rates * step)
     ends = 1 - (decays - 1) / (rates * step)
-    follows = np.stack(
-        [
-            lfilter([end, 1 - decay - end], [1, -decay], level)
-            for decay, end in zip(decays, ends, strict=True)
-        ],
-        axis=1,
-    )
+    added = level[1:, None] * ends + level[:-1, None] * (1 - decays - ends)
+    follows = np.zeros((len(level), len(rates)), dtype=complex)
+    for number, each in enumerate(added, 1):
+        follows[number] = decays * follows[number - 1] + each
     moved = np.tensordot(follows, settled[near], axes=1)
     moved += level[:, None, None] * settled[~near].sum(axis=0)
     largest = np.abs(moved).sum(axis=1).max(axis=0)

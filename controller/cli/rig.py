@@ -105,14 +105,14 @@ def check(
         f"{rig_file}: {counted(len(verdict.sensors), 'sensor')}, "
         f"{counted(len(verdict.frequencies), 'frequency', plural='frequencies')} "
         f"from {low:g} to {high:g} Hz, {elapsed:.1f} s",
-        rig.uncertainty.note,
+        rig.uncertainty_note,
         "",
         *diagnosis_report.channel_table(verdict),
         "",
         *diagnosis_report.verdict_rows(verdict),
         *diagnosis_report.difference_rows(verdict),
     ]
-    exactly_known = [*rig.uncertainty.exactly_known]
+    exactly_known = [*rig.exactly_known]
     answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
     print_report(rows, {**diagnosis_report.as_json(verdict), **details, **answer}, as_json=as_json)
     if not verdict.is_well:

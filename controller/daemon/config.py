@@ -328,7 +328,7 @@ def _checked(document: Document) -> CheckedFile:
         f"{', '.join(source.name for source in config.touch) or 'the API only'}; "
         f"socket {config.socket}{hint}"
     )
-    note = rig.uncertainty.note
+    note = rig.uncertainty_note
     held, lost, more = clock_costs(rig, config.urls)
     notes = [*lost, *gain_notes(rig), *([note] if note else [])]
     return CheckedFile(line + held, [*warnings, *notes], more)

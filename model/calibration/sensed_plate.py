@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import KINDS, MOST_GUESSED, VALUE_UNITS, space_by_sheets
+from model.identification.parameters import KINDS, MAX_GUESSED, VALUE_UNITS, space_by_sheets
 from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -110,7 +110,7 @@ class SensedPlate:
         by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
         rows = self.rows
         return np.array(
-            [math.inf if row in by_sheet else MOST_GUESSED if row.foot else 1.0 for row in rows]
+            [math.inf if row in by_sheet else MAX_GUESSED if row.foot else 1.0 for row in rows]
         )
 
     @cached_property

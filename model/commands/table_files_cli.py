@@ -265,7 +265,7 @@ def build(
         f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
         f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
         f"{table.reference_mesh}",
-        rig.uncertainty.note,
+        rig.uncertainty_note,
         f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
         next_line("era", "table", "show", output),
     ]
@@ -279,7 +279,7 @@ def build(
         "mode": table.drive_mode,
         "fingerprint": table.fingerprint,
         "code_version": table.code_version,
-        "exactly_known": [*rig.uncertainty.exactly_known],
+        "exactly_known": [*rig.exactly_known],
         "build_time_s": timed.elapsed,
         "files": [str(output)],
     }

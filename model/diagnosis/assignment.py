@@ -53,7 +53,11 @@ class ShapeMatch:
     def error(self) -> float:
         """Share of the responses, rms over them, that is not of the shapes of the nearest ERAs."""
         alike = self.mac[:, range(self.mac.shape[1]), self.nearest]
-        return math.sqrt(float(np.nanmean(1 - alike))) if np.isfinite(alike).any() else math.inf
+        return (
+            math.sqrt(max(0.0, float(np.nanmean(1 - alike))))
+            if np.isfinite(alike).any()
+            else math.inf
+        )
 
     def confidence(self, channel: int, era: int, other: int) -> float:
         """Confidence 0..1 that the channel drives one ERA and not the other.

@@ -7,7 +7,7 @@ from typing import Any
 
 from model.identification.fit_report import quality_rows, value_rows
 from model.identification.identify import MAX_CHI2, MAX_MODE_SHIFT, Identification
-from model.identification.parameters import KINDS, MOST_GUESSED
+from model.identification.parameters import KINDS, MAX_GUESSED
 from model.identification.promise import ExpectedContrast
 from model.quantities import percent, with_error
 
@@ -114,7 +114,7 @@ def parameter_rows(found: Identification) -> list[str]:
         if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error:
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
             after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
-            if each.kind == "supports" and each.error > MOST_GUESSED * each.before:
+            if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
                 after = "not identified"
             rows.append((each.name, f"± {each.before:.2g}{unit}", after))
     return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))

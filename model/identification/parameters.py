@@ -118,7 +118,7 @@ FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss
 COIL_DEVIATES = 0.2
 """Standard deviation of the mass of an exciter's coil by its sheet, relative: assumed."""
 
-MOST_GUESSED = math.sqrt(0.5)
+MAX_GUESSED = math.sqrt(0.5)
 """Standard error of what a prior holds, in its deviations, beyond which data tell less than it."""
 
 VALUE_UNITS = {

@@ -55,7 +55,7 @@ def _check(document: Document) -> CheckedFile:
     problems += [problem for problem in of_urls if problem.key not in known]
     if rig is None or problems:
         raise ConfigError(document.source, problems)
-    note = rig.uncertainty.note
+    note = rig.uncertainty_note
     line, lost, more = clock_costs(rig, urls)
     warnings = [*exciter_notes(rig), *warnings]
     costs = [*lost, *gain_notes(rig), *_plate_notes(rig), *_mount_notes(rig)]

@@ -136,12 +136,9 @@ def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
 
 
 def uncertainty_of(section: UncertaintySection, feet: Iterable[SupportSection]) -> Uncertainty:
-    """How well the rig is known; its feet by their kind alone as `FEET_DEVIATE`."""
-    stated = section.model_dump(exclude={"supports"})
-    if section.supports is not None:
-        return Uncertainty(**stated, supports=section.supports)
-    by_kind = any(foot.kind is not None and foot.stiffness is None for foot in feet)
-    return Uncertainty(**stated, supports=FEET_DEVIATE if by_kind else 0.0)
+    """How well the rig is known; feet of which it says nothing as `FEET_DEVIATE`."""
+    unknown = {"supports": FEET_DEVIATE} if any(foot.at is not None for foot in feet) else {}
+    return Uncertainty(**(unknown | section.model_dump(exclude_none=True)))
 
 
 def limits_of(section: LimitsSection) -> GuardLimits:

@@ -15,10 +15,11 @@ from model.config.document import Document
 from model.errors import InputError
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
-from model.rig.uncertainty import Uncertainty
+from model.rig.uncertainty import BOUNDS, Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, PointLoad, feet_of
+from model.structure.feet_and_frames import FEET_DEVIATE
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.suggestions import did_you_mean
@@ -126,6 +127,26 @@ class Rig:
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made
+
+    @property
+    def exactly_known(self) -> tuple[str, ...]:
+        """Keys of its uncertainty that are taken as none, though a plate that is built has some."""
+        built = Uncertainty(supports=FEET_DEVIATE if self.feet else 0.0)
+        return tuple(
+            key
+            for key, (exact, _) in BOUNDS.items()
+            if getattr(self.uncertainty, key) == exact != getattr(built, key)
+        )
+
+    @property
+    def uncertainty_note(self) -> str | None:
+        """One line on what is taken as none; None where every parameter is uncertain."""
+        if not self.exactly_known:
+            return None
+        return (
+            f"uncertainty taken as none: {', '.join(self.exactly_known)}; what is promised holds "
+            f"for these known exactly, the rest: {self.uncertainty}"
+        )
 
     @cached_property
     def feet(self) -> tuple[int, ...]:

@@ -414,7 +414,7 @@ class UncertaintySection(Section):
     supports: Annotated[float, _within("supports")] | None = None
     """Of the natural logarithm of the stiffness of each foot.
 
-    Default: 0.3 where a foot is given by its `kind` alone, else 0
+    Default: 0.3 where a rig has feet, else 0
     """
 
 

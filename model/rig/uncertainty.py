@@ -47,8 +47,9 @@ class Uncertainty:
     its root mean square over the plate, beside all others; modulus: of the plate's modulus of
     elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
     [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
-    amplitude, of any phase; supports: of the logarithm of the stiffness of each foot. The defaults
-    are those of a plate as built from its drawing and not measured.
+    amplitude, of any phase; supports: of the logarithm of the stiffness of each foot, 0.3 of a rig
+    file with feet by default. The defaults are those of a plate as built from its drawing and not
+    measured.
     """
 
     gain: float = 0.05
@@ -82,25 +83,6 @@ class Uncertainty:
                 key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])
                 for key, value in estimates.items()
             }
-        )
-
-    @property
-    def exactly_known(self) -> tuple[str, ...]:
-        """Keys of the parameters that are taken as none, though a plate that is built has some."""
-        return tuple(
-            key
-            for key, (exact, _) in BOUNDS.items()
-            if getattr(self, key) == exact != getattr(Uncertainty, key)
-        )
-
-    @property
-    def note(self) -> str | None:
-        """One line on what is taken as none; None where every parameter is uncertain."""
-        if not self.exactly_known:
-            return None
-        return (
-            f"uncertainty taken as none: {', '.join(self.exactly_known)}; what is promised holds "
-            f"for these known exactly, the rest: {self}"
         )
 
     def __str__(self) -> str:

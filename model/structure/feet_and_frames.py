@@ -21,7 +21,11 @@ FEET: Mapping[FootKind, float] = {"foam": 2e3, "rubber": 30e3}
 """Stiffness [N/m] of a foot by its kind: assumed, of some 2 cm; of one's own weigh and press."""
 
 FEET_DEVIATE = 0.3
-"""Standard deviation of that stiffness, relative: assumed."""
+"""Standard deviation of the logarithm of a foot's stiffness, unless a rig says another: assumed.
+
+Also of one that was pressed: that is static, and rubber is stiffer in vibrations, more or less by
+its compound.
+"""
 
 DEFAULT_POINTS = 7
 """Points of each edge."""

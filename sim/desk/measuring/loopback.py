@@ -129,28 +129,38 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
 
 
 def check_wiring(found: Estimate, desk: Desk) -> None:
-    """Raise InputError where the loop-back shows inputs or outputs to be swapped."""
+    """Raise InputError unless the loop-back, and no sensor, has its output by a cable.
+
+    A cable brings back one output alone. Sensors of a single source do so, too, and may.
+    """
     came = np.median(np.abs(found.values), axis=0)  # (inputs, sources)
-    own, at, output = desk.looped, desk.input, desk.output
-    others = np.delete(came, own, axis=1)
-    is_cable = (came[:, own] > _LOOPED) & (others.max(axis=1) < _CROSSTALK * came[:, own])
-    if is_cable[at - 1]:
-        return
-    if is_cable.any():
-        back = int(is_cable.argmax()) + 1
+    own, at, output, named = desk.looped, desk.input, desk.output, desk.named_inputs
+    first, others = came.max(axis=1), np.sort(came, axis=1)[:, :-1].max(axis=1, initial=0.0)
+    may_tell = (len(desk.sources) > 1) | (np.arange(1, 1 + len(came)) == at)
+    is_cable = (first > _LOOPED) & (others < _CROSSTALK * first) & may_tell
+    by_cable = np.where(is_cable, came.argmax(axis=1), -1)  # source at each input, -1 for none
+    looped, heard = came[at - 1, own], came[at - 1] * (np.arange(came.shape[1]) != own)
+    of_eras = [f"output {to} of ERA {name}" for name, to in desk.eras]
+    other = f"{heard.max():.2g} of {of_eras[heard.argmax()]}"
+    back = np.flatnonzero(by_cable == own) + 1
+    what = f"input {at} must bring back output {output} alone, as the loop-back, got"
+    if by_cable[at - 1] not in (own, -1):
+        raise InputError(f"{what} {other}: outputs are swapped; exchange their cables")
+    if back.size and at not in back:
         raise InputError(
             f"the loop-back of output {output} must come back at input {at}, got it at input "
-            f"{back}, {desk.named_inputs.get(back, 'of no sensor')}: inputs are swapped; exchange "
+            f"{back[0]}, {named.get(back[0], 'of no sensor')}: inputs are swapped; exchange "
             "their cables"
         )
-    heard = others[at - 1, : len(desk.eras)]
-    name, other = [each for each in desk.eras if each[1] != output][int(heard.argmax())]
-    raise InputError(
-        f"input {at} must bring back output {output} alone, as the loop-back, got "
-        f"{came[at - 1, own]:.2g} of it and {heard.max():.2g} of output {other} of ERA {name}; "
-        "connect them by a cable, exchange those of outputs that are swapped, and check mixers and "
-        "monitoring of the sound card"
-    )
+    if looped <= _LOOPED:
+        raise InputError(f"{what} {looped:.2g} of it; connect them by a cable")
+    if at not in back:
+        raise InputError(f"{what} {other}, too; check mixers and monitoring of the sound card")
+    for n in (each.input for each in desk.sensors if by_cable[each.input - 1] >= 0):
+        raise InputError(
+            f"input {n} must have {named[n]}, got output {desk.sources[by_cable[n - 1]]} as by a "
+            "cable; check the plug of that sensor, Y cables and monitoring of the sound card"
+        )
 
 
 def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Desk) -> None:

@@ -65,15 +65,20 @@ def read_stepped(source: Path, desk: Desk) -> list[MeasuredValue]:
         files = sorted(each for each in source.iterdir() if each.suffix.lower() in _ENDINGS)
     if not files or any(each.suffix.lower() not in _ENDINGS for each in files):
         raise InputError(f"--from {source}: must be a .csv or .wav file, or a folder with such")
-    found: list[MeasuredValue] = []
+    stated: list[MeasuredValue] = []
+    heard: list[MeasuredValue] = []
     for path in files:
-        read = _of_recording if path.suffix.lower() == ".wav" else _of_lines
-        found += read(path, desk)
+        if path.suffix.lower() == ".wav":
+            heard += _of_recording(path, desk)
+        else:
+            stated += _of_lines(path, desk)
     # Clocks of converters say nearly, and not quite, the same of one tone in several recordings.
-    order = np.unique([each.frequency for each in found])
-    groups = np.split(order, np.flatnonzero(np.diff(order) > CLOSE * order[1:]) + 1)
-    same = {frequency: float(group.mean()) for group in groups for frequency in group.tolist()}
-    return [replace(each, frequency=same[each.frequency]) for each in found]
+    order, same = np.unique([each.frequency for each in heard]), dict[float, float]()
+    while order.size:
+        group = order[order <= order[0] * (1 + CLOSE)]
+        same |= dict.fromkeys(group.tolist(), float(group.mean()))
+        order = order[len(group) :]
+    return [*stated, *(replace(each, frequency=same[each.frequency]) for each in heard)]
 
 
 def _of_lines(path: Path, desk: Desk) -> Iterator[MeasuredValue]:

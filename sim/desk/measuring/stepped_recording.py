@@ -67,7 +67,7 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
         )
     columns = [sensor.input - 1 for sensor in sensors]
     found, number, before = list[Tone](), 0, 0.0
-    for begin, end, coarse in _held(path, references.sum(axis=1), rate):
+    for begin, end in _held(path, references.sum(axis=1), rate):
         place = f"{path} at {begin / rate:.1f} s"
         kept = slice((begin + end) // 2, end)
         sizes = np.linalg.norm(references[kept], axis=0)
@@ -78,7 +78,7 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
                 "sine on one output after another"
             )
         both = np.column_stack([references[kept, loudest], samples[kept][:, columns]])
-        frequency, ratios = _heard(both, coarse, rate)
+        frequency, ratios = _heard(both, rate)
         if references.shape[1] == 1:
             number += frequency <= before * (1 + CLOSE)
         else:
@@ -98,8 +98,8 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
     return found
 
 
-def _held(path: Path, reference: FloatArray, rate: int) -> list[tuple[int, int, float]]:
-    """First and last sample of each tone, and about its frequency [Hz]."""
+def _held(path: Path, reference: FloatArray, rate: int) -> list[tuple[int, int]]:
+    """First and last sample of each tone."""
     factor = max(1, int(rate / (4 * _HIGHEST)))
     slow = signal.decimate(reference, factor, ftype="fir") if factor > 1 else reference
     size = round(_FRAME * rate / factor)
@@ -107,7 +107,8 @@ def _held(path: Path, reference: FloatArray, rate: int) -> list[tuple[int, int, 
     if count == 0 or np.sqrt((reference**2).mean()) < SILENT:
         raise InputError(f"{path}: the reference is silent; connect it with what plays")
     frames = signal.hilbert(slow[: count * size]).reshape(count, size)
-    turns = np.angle((frames[:, 1:] * frames[:, :-1].conj()).sum(axis=1))
+    # The window takes out what harmonics and hum turn to and fro within a frame.
+    turns = np.angle((frames[:, 1:] * frames[:, :-1].conj()) @ signal.windows.hann(size - 1))
     frequencies = turns * rate / factor / (2 * np.pi)
     loud = np.abs(frames).min(axis=1)
     is_on = loud > _LOUD * loud.max()
@@ -121,23 +122,33 @@ def _held(path: Path, reference: FloatArray, rate: int) -> list[tuple[int, int, 
                 f"{path} at {each[0] * _FRAME:.1f} s: each tone must be held, got a sweep from "
                 f"{low:.1f} to {high:.1f} Hz; play a stepped sine, 1.5 s for each tone"
             )
+    is_lost = is_on.copy()
+    is_lost[[frame for each in held for frame in each]] = False
+    runs = np.split(np.arange(count), np.flatnonzero(np.diff(is_lost)) + 1)
+    for each in (run for run in runs if is_lost[run[0]] and len(run) >= _SHORTEST):
+        raise InputError(
+            f"{path} at {each[0] * _FRAME:.1f} s: the reference must be one steady tone or silent, "
+            f"got {frequencies[each].min():.1f} to {frequencies[each].max():.1f} Hz by turns; take "
+            "it from what plays by a cable, without hum and noise, and play a stepped sine"
+        )
     if not held:
         raise InputError(
             f"{path}: tones must be held for {_SHORTEST * _FRAME:g} s and more, better 1.5 s, got "
             "none; play a stepped sine"
         )
     step = size * factor
-    return [
-        (each[0] * step, (each[-1] + 1) * step, float(frequencies[each].mean())) for each in held
-    ]
+    return [(each[0] * step, (each[-1] + 1) * step) for each in held]
 
 
-def _heard(both: FloatArray, coarse: float, rate: int) -> tuple[float, ComplexArray]:
+def _heard(both: FloatArray, rate: int) -> tuple[float, ComplexArray]:
     """Frequency [Hz] of a tone, and sensors by reference, the first column of samples (n, s + 1).
 
-    The frequency by the phase of the reference between both halves; NaN where these do not agree.
+    The frequency by the phase of the reference between both halves, beside the loudest line of its
+    spectrum; NaN where these do not agree.
     """
     half = len(both) // 2
+    spectrum = np.abs(np.fft.rfft(both[:, 0] * signal.windows.hann(len(both))))
+    coarse = float(spectrum.argmax() * rate / len(both))
     halves = both[: 2 * half].reshape(2, half, -1)
     turning = np.exp(-2j * np.pi * coarse * np.arange(half) / rate) * signal.windows.hann(half)
     first, last = turning @ (halves - halves.mean(axis=1, keepdims=True))

@@ -11,6 +11,7 @@ from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses
+from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
 from model.diagnosis.grain_direction import check_grain
@@ -27,6 +28,11 @@ def measured(rig: Rig, seed: int) -> Responses:
     """What one moved sensor reads of a board whose parts deviate, at every place or at four."""
     found = BuiltBoard.drawn(rig, seed).measured(TONES, seed)
     return found if seed % 2 else found.without(np.arange(12) % 3 > 0)
+
+
+def test_shapes_that_are_alike_beyond_rounding_have_no_error() -> None:
+    """A MAC of one place is 1 but for rounding, as 1 + 2.2e-16."""
+    assert ShapeMatch(np.full((3, 1, 1), 1 + 2.3e-16), (0.0, 0.0)).error == 0.0
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def test_derivatives_are_slopes_of_the_responses(magnet: str) -> None:
     found = jacobian(model.at(x))
     size = np.abs(model.at(x).responses).max()
     assert {"magnet mass SW", "force factor NE"} <= {*space.names}
-    assert space.std[space.index("stiffness of foot foam")] == 0.3  # of a kind alone
+    assert space.std[space.index("stiffness of foot foam")] == 0.3
     for number in np.flatnonzero(space.uncertain):
         moved = step * np.eye(space.size)[number]
         slope = (model.at(x + moved).responses - model.at(x - moved).responses) / (2 * step)

@@ -66,6 +66,8 @@ BOARD = (
     "{E1: 12 GPa, E2: 5 GPa, G12: 1 GPa, G13: 1 GPa, G23: 1 GPa, nu12: 0.1, rho: 700}"  # of wood
 )
 AT_EDGE, FOOT = "  level: 0.5\nmasses:\n  a", "  level: 0.5\nsupports:\n  a"
+FEET = "supports:\n  a: {at: [0, 0], stiffness: 3000}\n"
+TAPE = "supports:\n  a: {along: edges, stiffness_per_length: 3000}\n"
 MASS = "masses:\n  cam:\n    at: [0, 0]\n    mass: 5 g"
 
 
@@ -316,8 +318,16 @@ UNMESHED = "\n".join(line for line in GOOD.splitlines()[:20] if not line.startsw
         (GOOD + "uncertainty: {}\n", lambda rig: (rig.uncertainty,), (Uncertainty(),)),
         (
             GOOD + "uncertainty: {gain: 1 %, damping: 1, thickness: 0}\n",
-            lambda rig: (rig.uncertainty, rig.uncertainty.exactly_known),
+            lambda rig: (rig.uncertainty, rig.exactly_known),
             (Uncertainty(0.01, 5.0, 0.0, 0.1, 1.0, 0.5), ("thickness", "damping")),
+        ),
+        # feet are known as little by their stiffness as by their kind, those of edges are none
+        (GOOD + FEET, lambda rig: (rig.uncertainty.supports, rig.exactly_known), (0.3, ())),
+        (GOOD + TAPE, lambda rig: (rig.uncertainty.supports, rig.exactly_known), (0.0, ())),
+        (
+            GOOD + FEET + "uncertainty: {supports: 0}\n",
+            lambda rig: (rig.uncertainty.supports, rig.exactly_known),
+            (0.0, ("supports",)),
         ),
         (GOOD, lambda rig: (rig.fingertip,), (Fingertip(1000, 2, 0.0002, 0.005, 500, 2),)),
         (GOOD + FIRM, lambda rig: (rig.fingertip,), (Fingertip(2000, 2, 0.0003, 0.005, 500, 2),)),

@@ -1,6 +1,7 @@
 """A plate measured through a sound card in memory, and what is refused."""
 
 import ctypes
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -19,9 +20,9 @@ from model.rig.file import parse_rig
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.live_plot import STEPS, plot
-from sim.desk.measuring.loopback import latency
+from sim.desk.measuring.loopback import check_wiring, latency
 from sim.desk.measuring.measure import Measured, check_by_steps, measure
-from sim.desk.measuring.multisine import Multisine, default_frequencies
+from sim.desk.measuring.multisine import Estimate, Multisine, default_frequencies
 from sim.desk.measuring.sound_card import SoundCard
 from sim.desk.soft_amp.library import address_of
 
@@ -166,10 +167,15 @@ def test_run_that_lost_a_block_is_played_again(
     [
         ({"on_inputs": [0, 3, 2, 1]}, InputError, "at input 2.*P2"),
         ({"lost": range(99)}, LinkError, "lost in 3 attempts"),
-        ({"on_outputs": [0, 4, 2, 3, 1]}, InputError, "0.9 of output 2 of ERA SE"),
+        (
+            {"on_outputs": [0, 4, 2, 3, 1]},
+            InputError,
+            "0.9 of output 2 of ERA SE: outputs are swap",
+        ),
+        ({"on_inputs": [0, 1, 3, 3]}, InputError, "input 3 must have sensor P3, got output 5"),
         ({"gain": 50.0}, InputError, "clipping"),
         ({"gain": 0.0}, LinkError, "all inputs are silent"),
-        ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back"),
+        ({"on_inputs": [0, 1, 2, 2]}, InputError, "input 4 must bring back .* by a cable"),
         ({"noise": 1.5}, LinkError, "coherence"),
         ({"drifts": {4: 50e-6}}, InputError, r"clock.* 50 millionths at the loop-back"),
         ({"drifts": dict.fromkeys((1, 2, 3, 4), -9e-6)}, InputError, r"clock.* -9 .*loop-back"),
@@ -186,6 +192,44 @@ def test_wrong_desks_are_refused_with_their_cause(
         played = replace(played, level=0.03)  # as loud as the noise, without clipping
     with pytest.raises(error, match=cause):
         measure(desk, card(truth, **wires), played)  # type: ignore[arg-type]
+
+
+# Inputs of P1, P2, P3 and of the loop-back, by outputs 1 to 5; output 5 has the cable.
+WIRED = np.array([[0.02, 0.03, 0.02, 0.03, 0.0]] * 3 + [[0.0, 0.0, 0.0, 0.0, 0.9]])
+
+
+@pytest.mark.parametrize(
+    ("at", "gains", "cause"),
+    [
+        (4, [0, 0, 0, 0, 0], r"output 5 alone, as the loop-back, got 0 of it; connect them"),
+        (4, [0, 0.03, 0, 0, 0.9], "got 0.03 of output 2 of ERA SE, too; check mixers"),
+        (4, [0, 0.01, 0, 0, 0.9], None),  # 1 % is what cables beside each other have
+        (4, [0, 0.9, 0, 0, 0], "got 0.9 of output 2 of ERA SE: outputs are swapped"),
+        (2, [0, 0, 0, 0, 0.3], "input 2 must have sensor P2, got output 5 as by a cable"),
+        (3, [0, 0.8, 0, 0, 0], "input 3 must have sensor P3, got output 2 as by a cable"),
+        (3, [0.02, 0.03, 0.02, 0.03, 0.3], None),  # monitoring beside a sensor takes nothing away
+    ],
+)
+def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
+    rig: Rig, at: int, gains: list[float], cause: str | None
+) -> None:
+    """One input is changed; its gains say by hand what is connected to it."""
+    came = WIRED.copy()
+    came[at - 1] = gains
+    each = np.broadcast_to(came, (len(FREQUENCIES), *came.shape)).astype(complex)
+    found = Estimate(each, abs(each), abs(each), np.zeros(4))
+    with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
+        check_wiring(found, Desk(rig, SENSORS))
+
+
+def test_sensors_of_a_single_source_are_no_cables(rig: Rig) -> None:
+    """One ERA with the loop-back beside it: all inputs have that output alone."""
+    alone = Desk(replace(rig, eras=rig.eras[:1]), SENSORS, is_shared=True)
+    each = np.full((len(FREQUENCIES), 4, 1), 0.4 + 0j)
+    check_wiring(Estimate(each, abs(each), abs(each), np.zeros(4)), alone)
+    each[:, 3] = 1e-5
+    with pytest.raises(InputError, match="connect them by a cable"):
+        check_wiring(Estimate(each, abs(each), abs(each), np.zeros(4)), alone)
 
 
 def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:

@@ -141,6 +141,15 @@ def test_table_of_another_program_is_read(
     check(rig, responses_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=1e-7)
 
 
+def test_lines_of_a_file_stay_at_their_frequencies(rig: Rig, tmp_path: Path) -> None:
+    """200 lines 0.05 Hz apart, nearer than clocks tell tones of recordings apart."""
+    written = [250 + 0.05 * number for number in range(200)]
+    rows = [f"{frequency:.2f},1,0" for frequency in written]
+    (tmp_path / "P1-1.csv").write_text("\n".join(["frequency_hz,real,imag", *rows]))
+    found = [each.frequency for each in read_stepped(tmp_path / "P1-1.csv", Desk(rig, FIXED))]
+    assert found == pytest.approx(written, rel=1e-9)
+
+
 def test_columns_that_are_not_there_are_in_the_name(rig: Rig, tmp_path: Path) -> None:
     """P2-SE.csv, frequency and response only."""
     (tmp_path / "P2-SE.csv").write_text("frequency_hz,magnitude,phase_deg\n61,0.2,90\n")
@@ -169,6 +178,40 @@ def test_files_that_say_too_little_are_refused(
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=cause):
         read_stepped(tmp_path / name, Desk(rig, FIXED))
+
+
+@pytest.mark.parametrize("held", [1.5, 10.0])
+def test_a_distorted_reference_has_the_frequency_of_its_tone(
+    rig: Rig, tmp_path: Path, held: float
+) -> None:
+    """A third harmonic of 10 and 20 %, and an offset of 10 %: tones are where they were played.
+
+    Frames of 50 ms are no whole number of their periods.
+    """
+    for number, (third, offset) in enumerate([(0.1, 0.0), (0.2, 0.0), (0.0, 0.1)]):
+        path = tmp_path / f"{number}.wav"
+        recording(path, range(4), references=1, held=held)
+        rate, samples = wavfile.read(path)
+        reference = samples[:, 2] / 16384
+        # sin 3a = 3 sin a - 4 sin³ a
+        distorted = reference + third * (3 * reference - 4 * reference**3) + offset
+        samples[:, 2] = 8000 * distorted
+        wavfile.write(path, rate, samples)
+        tones = {each.frequency for each in read_stepped(path, Desk(rig, FIXED))}
+        assert sorted(tones) == pytest.approx(TONES, rel=2e-5)
+
+
+def test_tones_that_cannot_be_told_are_refused_with_their_time(rig: Rig, tmp_path: Path) -> None:
+    """Noise in the reference amid the second tone of the first ERA, which no tone is made of."""
+    path = tmp_path / "steps.wav"
+    recording(path, range(4), references=1)
+    rate, samples = wavfile.read(path)
+    noisy = slice(round(2.3 * rate), round(3.5 * rate))
+    noise = np.random.default_rng(0).standard_normal(noisy.stop - noisy.start)
+    samples[noisy, 2] += (3000 * noise).astype(np.int16)
+    wavfile.write(path, rate, samples)
+    with pytest.raises(InputError, match=r"at 2\.\d s: the reference must be one steady tone"):
+        read_stepped(path, Desk(rig, FIXED))
 
 
 def sweep() -> FloatArray:

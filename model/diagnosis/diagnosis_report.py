@@ -20,7 +20,7 @@ from model.study.verify import MIN_KEPT_SHARE
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
     "loose": "press it on or glue it anew, and measure again",
-    "weak": "check its voltage or volume and its mounting, or measure its gain with `era calibrate`",
+    "weak": "check its voltage, volume and mounting, or measure its gain with `era calibrate`",
     "strong": "lower its voltage or volume, or correct its stroke or gains in the rig",
     "other ERA": "correct the plug, or the rig's channels",
     "inverted": "swap its two wires",

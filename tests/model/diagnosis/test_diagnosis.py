@@ -140,7 +140,7 @@ def test_verdict_names_the_sensors_first_where_all_channels_are_inverted(
 def test_diagnose_relates_gain_to_that_of_a_calibrated_rig(
     coarse_rig: Rig, built: Responses
 ) -> None:
-    """Of gains of 1.5 in its file, a channel that plays 1.5 is well and one that plays 1 is weak."""
+    """Of gains of 1.5 in its file a channel that plays 1.5 is well, and one that plays 1 weak."""
     eras = tuple(replace(era, gains=((200.0, 1.5, 0.0),)) for era in coarse_rig.eras)
     played = built.values * np.array([1.5, 1.5, 1.0, 1.5])[:, None]
     verdict = diagnose(replace(coarse_rig, eras=eras), replace(built, values=played))

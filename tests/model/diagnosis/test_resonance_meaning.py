@@ -25,7 +25,7 @@ NAMES = ("NE", "NW", "SW", "SE")
 def given_as(which: str, resonance: float = 306.0) -> Rig:
     """The board of the page, whose file has a resonance, by default its sheet's, as one of both."""
     keys = {"resonance": resonance, "resonance_is": which}
-    return load_rig(FOLDER / "rig.yaml").replaced(eras={name: keys for name in NAMES})
+    return load_rig(FOLDER / "rig.yaml").replaced(eras=dict.fromkeys(NAMES, keys))
 
 
 def measured(rig: Rig, seed: int) -> Responses:

@@ -115,7 +115,7 @@ def calibrate(
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
     the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
-    of another size, for gains that no drive has, and for suspensions of exciters at a bound.
+    of another size, for gains that no drive has, and for suspensions or feet at a bound.
     """
     dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
     while True:
@@ -208,13 +208,17 @@ def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
 
 
 def _check_suspensions(problem: CalibrationProblem, fit: Fit) -> None:
-    """Raise InputError for exciters whose stiffness is at a bound, as by a wrong resonance."""
-    plate, factors = problem.plate, {}
+    """Raise InputError for exciters and feet whose stiffness is at a bound, as of another kind."""
+    plate = problem.plate
+    factors: dict[str, float] = {}
+    feet: dict[str, float] = {}
     for row, value, is_at_bound in zip(
         plate.rows, plate.values(fit.z), _at_bounds(problem, fit), strict=True
     ):
         if is_at_bound and row.kind == "stiffness" and row in plate.of_exciters:
             factors[row.era] = value / row.of(plate.rig)
+        elif is_at_bound and row.foot:
+            feet[row.foot] = value / row.of(plate.rig)
     if factors:
         raise InputError(
             f"stiffness of {', '.join(factors)} must be about that of the rig, got "
@@ -222,6 +226,12 @@ def _check_suspensions(problem: CalibrationProblem, fit: Fit) -> None:
             "is searched; check resonance and resonance_is of these: whether free or mounted "
             "(era plate show prints where the glued magnets resonate), and by era rig check that "
             "they are glued"
+        )
+    if feet:
+        raise InputError(
+            f"stiffness of feet {', '.join(feet)} must be about that of the rig, got "
+            f"{', '.join(f'{each:.2g}' for each in feet.values())} times it, the bound of what is "
+            "searched; check their kind, their places and that all of them touch"
         )
 
 

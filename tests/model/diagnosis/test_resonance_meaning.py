@@ -1,4 +1,4 @@
-"""Which resonance the file of exciters gives: boards of a weekend, drawn as their parts deviate."""
+"""Which resonance, feet and exciters the file of a weekend's board has, and the board has not."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,6 +65,15 @@ def test_a_resonance_that_differs_little_is_refused_with_what_is_at_a_bound() ->
     found, rig = measured(given_as("free"), 1), given_as("free", 60.0)
     with pytest.raises(InputError, match=r"^stiffness of .* 10 times it.* resonance_is"):
         calibrate(rig, found, check_consistency(rig, found))
+
+
+def test_feet_of_another_kind_are_refused_at_their_bound() -> None:
+    """Of foam below the board and of rubber in its file, ten times as stiff or more."""
+    rig = load_rig(FOLDER / "rig.yaml")
+    feet = dict.fromkeys(("left", "right", "near", "far"), {"kind": "rubber"})
+    found, rubber = measured(rig, 1), rig.replaced(supports=feet)
+    with pytest.raises(InputError, match=r"^stiffness of feet .* 0\.1 times it"):
+        calibrate(rubber, found, check_consistency(rubber, found))
 
 
 def test_a_dead_exciter_is_no_calibrated_rig(

@@ -196,7 +196,9 @@ def test_feet_are_read_back_whichever_is_stiffer_by_a_hair() -> None:
     rig = rig_of(document)
     one, other = rig.masses
     masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
-    text = rewritten_text(document, rig, replace(rig, masses=masses), comment="")
+    known = replace(rig.uncertainty, supports=0.05)
+    found = replace(rig, masses=masses, uncertainty=known)
+    text = rewritten_text(document, rig, found, comment="")
     back = rig_of(parse_document("rig.yaml", text)).masses
     assert [each.x for each in back] == [0.1, 0.2]
     assert [each.stiffness for each in back] == pytest.approx([345.678, 345.678])

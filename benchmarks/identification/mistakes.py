@@ -56,7 +56,7 @@ class HalfGlued:
         return np.asarray(self.own.force(omega) * self.share(omega))
 
 
-def behind_glue(own: Any, stiffness: float) -> HalfGlued:
+def on_glue(own: Any, stiffness: float) -> HalfGlued:
     """An exciter on a spring of glue [N/m], which loses a fifth."""
     glue = stiffness * (1 + 1j * _GLUE_LOSS)
     return HalfGlued(own, lambda omega: glue / (glue + own.dynamic_stiffness(omega)))
@@ -84,7 +84,7 @@ def _states(state: str) -> Callable[[Verdict, int], bool]:
 
 
 def _on_glue(stiffness: float) -> Callable[[Any, int], HalfGlued]:
-    return lambda own, _: behind_glue(own, stiffness)
+    return lambda own, _: on_glue(own, stiffness)
 
 
 def _acts_less(verdict: Verdict, exciter: int) -> bool:
@@ -132,7 +132,7 @@ def _mistakes() -> Iterator[tuple[str, Mistake]]:
     )
     yield (
         "on glue of 300 to 2400 N/m",
-        Mistake(_states("loose"), mount=lambda own, seed: behind_glue(own, GLUES[seed % 5])),
+        Mistake(_states("loose"), mount=lambda own, seed: on_glue(own, GLUES[seed % 5])),
     )
     for glue in STIFFER:
         yield (

@@ -5,7 +5,7 @@
 The boards and touches of `python -m benchmarks.weekend.chain`. Each board is a process that moves
 in time, with viscous losses and amplifiers that lag, on a JACK server of the dummy driver: `era
 measure` with one sensor that is moved, `era calibrate`, `era table build`, then `era soft-amp` and
-`era daemon`, which is told of the fingers that are put on the board. The sensor is put beside its
+`era daemon`, which gets the fingers that are put on the board. The sensor is put beside its
 places, and reads the same at all of them. What fingers feel is kept by the board, half a second
 after it begins. As bought and exactly known is answered in memory, and felt in
 the steady state. Five minutes a board.

@@ -122,7 +122,7 @@ def identify(
 
     from controller.diagnosis.plate_measurement import observation_of
     from model.config.points import parse_frequencies
-    from model.diagnosis.grain_direction import check_grain
+    from model.diagnosis.other_meaning import check_meaning
     from model.identification import identification_report
     from model.identification.identify import identify as fit
     from model.identification.measurement import DeviceSettings, measure_by_device
@@ -166,7 +166,7 @@ def identify(
             measured = measured_by_amplifiers(rig, url or [], level=level, is_quick=quick)
     started = time.perf_counter()
     try:
-        check_grain(rig, observation_of(measured.measurement, rig))
+        check_meaning(rig, observation_of(measured.measurement, rig))
         with progress_bar("fits") as progress:
             found = fit(rig, measured.measurement, seed=seed, progress=progress)
     except InputError as error:

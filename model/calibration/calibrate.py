@@ -115,7 +115,7 @@ def calibrate(
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
     the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
-    of another size, and for gains that no drive has.
+    of another size, for gains that no drive has, and for suspensions or feet at a bound.
     """
     dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
     while True:
@@ -146,6 +146,7 @@ def calibrate(
     progress(2, 3)
     _check_sides(problem, found)
     _check_gains(problem, found)
+    _check_suspensions(problem, found)
     _check_outliers(problem, found)
     report = _report(
         problem,
@@ -206,6 +207,41 @@ def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
             )
 
 
+def _check_suspensions(problem: CalibrationProblem, fit: Fit) -> None:
+    """Raise InputError for exciters and feet whose stiffness is at a bound, as of another kind."""
+    plate = problem.plate
+    factors: dict[str, float] = {}
+    feet: dict[str, float] = {}
+    for row, value, is_at_bound in zip(
+        plate.rows, plate.values(fit.z), _at_bounds(problem, fit), strict=True
+    ):
+        if is_at_bound and row.kind == "stiffness" and row in plate.of_exciters:
+            factors[row.era] = value / row.of(plate.rig)
+        elif is_at_bound and row.foot:
+            feet[row.foot] = value / row.of(plate.rig)
+    if factors:
+        raise InputError(
+            f"stiffness of {', '.join(factors)} must be about that of the rig, got "
+            f"{', '.join(f'{each:.2g}' for each in factors.values())} times it, the bound of what "
+            "is searched; check resonance and resonance_is of these: whether free or mounted "
+            "(era plate show prints where the glued magnets resonate), and by era rig check that "
+            "they are glued"
+        )
+    if feet:
+        raise InputError(
+            f"stiffness of feet {', '.join(feet)} must be about that of the rig, got "
+            f"{', '.join(f'{each:.2g}' for each in feet.values())} times it, the bound of what is "
+            "searched; check their kind, their places and that all of them touch"
+        )
+
+
+def _at_bounds(problem: CalibrationProblem, fit: Fit) -> NDArray[np.bool_]:
+    """Mask (n,) of the fitted values that are free and at a bound."""
+    space = problem.plate.model.space
+    distance = np.abs(np.array([space.lower, space.upper]) - fit.z).min(axis=0)
+    return np.asarray(problem.free & (distance < 1e-6)[problem.plate.numbers])
+
+
 def _check_sides(problem: CalibrationProblem, fit: Fit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
     if _fit_error(problem, fit) > MAX_FIT_ERROR:
@@ -257,22 +293,20 @@ def _report(
         replace(era, gains=gain_rows(gains[:, number], live.frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
-    bounds = np.array([fitted.model.space.lower, fitted.model.space.upper])
-    at_bound = (np.abs(bounds - fit.z).min(axis=0) < 1e-6)[fitted.numbers]
     parameters = tuple(
         FittedParameter(
             row,
             row.of(before),
             float(value),
             standard_error(before, row, float(value), float(error), fit.dampers) if free else None,
-            bool(free and bound),
+            bool(bound),
         )
         for row, value, error, free, bound in zip(
             fitted.rows,
             fitted.values(fit.z),
             fitted.errors(fit.z, fit.error),
             problem.free,
-            at_bound,
+            _at_bounds(problem, fit),
             strict=True,
         )
     )

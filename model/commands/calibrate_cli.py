@@ -22,6 +22,11 @@ _UNCHECKED = (
     "are explained by a wrong plate as well: measure at {least} places or more, better at eight"
 )
 
+_DEAD = (
+    "every ERA that is played must move the plate, {eras} did not; no rig is written. Find out why "
+    "by era rig check, or remove it from the rig"
+)
+
 
 def calibrate(
     rig_file: RigArgument,
@@ -66,10 +71,15 @@ def calibrate(
         *calibration_report.finding_rows(calibration),
         *calibration_report.check_rows(calibration),
     ]
+    refusal = None
+    if not calibration.is_good:
+        refusal = _NO_FIT if calibration.held_out else _UNCHECKED.format(least=LEAST_SENSORS + 1)
+    elif calibration.dead_eras:
+        refusal = _DEAD.format(eras=", ".join(calibration.dead_eras))
     made = f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"
     files = (
         write_fitted_rig(output, document, (rig, calibration.rig), [made, *rows, *notes], mesh=mesh)
-        if calibration.is_good
+        if refusal is None
         else []
     )
     if picture is not None:
@@ -84,7 +94,6 @@ def calibrate(
         f"from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
         f"{counted(responses.count, 'value')}"
     )
-    refusal = _NO_FIT if calibration.held_out else _UNCHECKED.format(least=LEAST_SENSORS + 1)
     finish(
         [heading, "", *rows, *calibration_report.gain_rows(calibration), "", *notes],
         calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
@@ -92,5 +101,5 @@ def calibrate(
         else None,
         files=files,
         elapsed=timed.elapsed,
-        refusal=None if calibration.is_good else refusal,
+        refusal=refusal,
     )

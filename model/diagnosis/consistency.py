@@ -9,17 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
-from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import wrong_size
 from model.calibration.responses import Responses, Screening
 from model.calibration.sensed_plate import SensedPlate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch
-from model.diagnosis.grain_direction import TurnedGrain
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.verdict import Verdict, best_wiring, diagnose
 from model.errors import InputError
@@ -29,7 +25,6 @@ GRAVITY = 9.80665  # m/s², standard
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
 _MAX_FREQUENCIES = 16  # ample for every check
 _CLEAR = 20.0  # difference of costs
-_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of a sensor that is elsewhere
 
 
 @dataclass(frozen=True)
@@ -64,8 +59,8 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     """Refuse responses that are not what they claim; return what of them a fit can use.
 
     Raises InputError that names the cause: too few sensors or frequencies, another quantity or
-    unit, a grain along the other side, conjugated phases, sensors at swapped places, swapped or
-    inverted channels.
+    unit, a grain along the other side, the other meaning of a resonance, conjugated phases, sensors
+    at swapped places, swapped or inverted channels.
     """
     rows = np.unique(
         np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
@@ -87,14 +82,10 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     )
 
 
-def _check_claims(
-    plate: SensedPlate, shapes: ShapeMatch, grain: TurnedGrain | None, observation: Responses
-) -> None:
-    """Raise InputError where responses are of another board, quantity, phase or other places."""
-    if grain is not None:
-        raise InputError(str(grain))
+def _check_claims(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
+    """Raise InputError where responses are of another quantity or phase."""
     _check_quantity(plate, shapes, observation)
-    _check_phases_and_places(plate, shapes, observation)
+    _check_phases(plate, shapes, observation)
 
 
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
@@ -130,11 +121,9 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Respons
     )
 
 
-def _check_phases_and_places(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
-) -> None:
-    """Raise InputError for conjugated phases, and for sensors at each other's places."""
-    match, drives = best_wiring(plate, observation.values, shapes)
+def _check_phases(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> None:
+    """Raise InputError for conjugated phases."""
+    match, _ = best_wiring(plate, observation.values, shapes)
     other, _ = best_wiring(plate, observation.values.conj(), shapes)
     if other.cost < match.cost - _CLEAR:
         raise InputError(
@@ -143,45 +132,6 @@ def _check_phases_and_places(
             f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
             "change them"
         )
-    exchanged = _exchanged(observation, match.responses[:, list(drives)])
-    if exchanged:
-        pairs = ", ".join(f"{name} at that of {place}" for name, place in exchanged)
-        raise InputError(
-            f"sensors must be at their places, got responses that fit exchanged ones: {pairs}; "
-            "correct their positions or names"
-        )
-
-
-def _exchanged(observation: Responses, model: ComplexArray) -> list[tuple[str, str]]:
-    """Pairs of a sensor and the one at whose place it is, which is elsewhere too.
-
-    model: responses (f, e, s).
-    """
-    values = observation.values
-    weight = np.isfinite(values) / row_rms(values)[:, :, None]
-    gains, _ = project_gains(model, values, weight)
-    measured = np.where(weight > 0, values * weight, 0j)
-    predicted = np.nan_to_num(gains)[:, :, None] * model / row_rms(values)[:, :, None]
-    coherence = _coherence(measured, predicted, weight > 0)
-    sensors, places = linear_sum_assignment(-(coherence**2))
-    names = observation.sensors
-    return [
-        (names[sensor], names[place])
-        for sensor, place in zip(sensors, places, strict=True)
-        if coherence[sensor, sensor] < _OWN_PLACE
-        and coherence[place, place] < _OWN_PLACE  # else two are at one place, which is no exchange
-        and coherence[sensor, place] > _OTHER_PLACE
-    ]
-
-
-def _coherence(
-    measured: ComplexArray, predicted: ComplexArray, used: NDArray[np.bool_]
-) -> FloatArray:
-    """Coherence (s, s) of each sensor's responses with the model's at each place."""
-    inner = np.abs(np.einsum("fes,fep->sp", measured, predicted.conj()))
-    own = (np.abs(measured) ** 2).sum(axis=(0, 1))
-    other = np.einsum("fes,fep->sp", used.astype(float), np.abs(predicted) ** 2)
-    return np.asarray(inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300)))
 
 
 def _check_wiring(verdict: Verdict) -> None:

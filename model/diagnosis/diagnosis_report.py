@@ -7,8 +7,10 @@ from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
+from model.diagnosis.exchanged_sensors import ExchangedSensors
 from model.diagnosis.grain_direction import TurnedGrain
 from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
+from model.diagnosis.resonance_meaning import MisreadResonance
 from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import in_display_unit, percent
@@ -18,8 +20,8 @@ from model.study.verify import MIN_KEPT_SHARE
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",
     "loose": "press it on or glue it anew, and measure again",
-    "weak": "check its voltage and mounting, or measure its gain with `era calibrate`",
-    "strong": "lower its voltage, or correct its stroke in the rig",
+    "weak": "check its voltage, volume and mounting, or measure its gain with `era calibrate`",
+    "strong": "lower its voltage or volume, or correct its stroke or gains in the rig",
     "other ERA": "correct the plug, or the rig's channels",
     "inverted": "swap its two wires",
     "out of phase": "measure its gains with `era calibrate`",
@@ -31,7 +33,7 @@ _MIN_SHARE = 0.05  # likelihood of a reported explanation
 def verdict_rows(verdict: Verdict) -> list[str]:
     """Lines of findings with their remedies, and one that all is well where nothing is amiss."""
     by_era = {channel.era: channel for channel in verdict.channels}
-    rows = [] if verdict.grain is None else [f"GRAIN: {verdict.grain}"]
+    rows = [f"{each.label}: {each}" for each in verdict.corrections]
     for cycle in verdict.swapped:
         confidence = f"(confidence {min(by_era[era].confidence for era in cycle):.3f})"
         if len(cycle) == 2:
@@ -49,17 +51,23 @@ def verdict_rows(verdict: Verdict) -> list[str]:
     common = verdict.common_state
     if common is not None:
         rows.append(_common_row(verdict.channels, common))
+    if verdict.all_inverted:
+        rows.append(
+            "INVERTED: all channels have the sign that is opposite to the sensors': turn the "
+            "sensors over, swap the two wires of every ERA, or check the sign convention of phases"
+        )
     for channel in verdict.channels:
         reported = {*channel.states} - {"well", "not driven", common}
+        if verdict.all_inverted:
+            reported.discard("inverted")
         if channel.era in swapped:
             reported.discard("other ERA")
         rows += [_row(channel, state) for state in channel.states if state in reported]
-    inverted = [c for c in verdict.channels if "inverted" in c.states]
-    if len(inverted) > 1 and len(inverted) == sum(c.drives is not None for c in verdict.channels):
-        rows.append("all of them: check mounting of sensors and sign convention of phases")
     rows += [f"SENSOR {each.name} {each.why}: left out" for each in verdict.bad_sensors]
     is_loose = any("loose" in channel.states for channel in verdict.channels)
-    if verdict.grain is None and not verdict.plate_matches and not is_loose:
+    if verdict.is_of_another_rig:
+        pass  # which is corrected first
+    elif not verdict.plate_matches and not is_loose:
         rows += _plate_rows(verdict)
     elif verdict.match is not None and verdict.match.outliers.any():
         by_sensor = verdict.match.outliers.sum(axis=(0, 1))
@@ -212,7 +220,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "wiring_matches": verdict.wiring_matches,
         "plate": {
             "matches": verdict.plate_matches,
-            "grain": None if verdict.grain is None else _grain_as_json(verdict.grain),
+            **_corrections_as_json(verdict),
             "beyond": None if verdict.beyond is None else _beyond_as_json(verdict.beyond),
             "changes": verdict.changes or {},
             "kept_share": verdict.kept_share,
@@ -267,13 +275,22 @@ def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
     }
 
 
-def _grain_as_json(grain: TurnedGrain) -> dict[str, Any]:
-    return {
-        "expected": grain.as_written,
-        "found": grain.along,
-        "unexplained": grain.error,
-        "unexplained_as_written": grain.error_as_written,
-    }
+def _corrections_as_json(verdict: Verdict) -> dict[str, Any]:
+    found: dict[str, Any] = {"grain": None, "resonance_is": {}, "exchanged_sensors": {}}
+    for each in verdict.corrections:
+        match each:
+            case TurnedGrain():
+                found["grain"] = {
+                    "expected": each.as_written,
+                    "found": each.along,
+                    "unexplained": each.error,
+                    "unexplained_as_written": each.error_as_written,
+                }
+            case MisreadResonance():
+                found["resonance_is"] |= each.meant
+            case ExchangedSensors():
+                found["exchanged_sensors"] |= dict(each.pairs)
+    return found
 
 
 def _row(channel: ChannelVerdict, state: ChannelState) -> str:

@@ -37,6 +37,11 @@ class BadSensor:
         """What is wrong with it."""
         if self.scale < _UPSIDE_DOWN:
             return f"is upside down (reads {self.scale:.2f} of what the others say): turn it over"
+        if self.is_mute and self.scale:
+            return (
+                f"reads {self.scale:.2f} of what the others say: check that it is where its line "
+                "says, and its cable"
+            )
         return f"reads {self.scale:.2f} of what the others say" if self.scale else "reads nothing"
 
 

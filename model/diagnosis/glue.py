@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.variable_projection import project_gains, row_rms
 from model.diagnosis.plate_match import Match
-from model.structure.attachments import Era
+from model.structure.exciter import Exciter
 
 _GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
 _RISES = 0.2  # of the logarithm of a gain over the frequencies
@@ -43,7 +43,7 @@ def behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> ND
     omega = match.plate.model.omega
     for channel in np.flatnonzero(driven).tolist():
         era = match.rig.eras[drives[channel]]
-        if not isinstance(era, Era):
+        if isinstance(era, Exciter):
             others = driven & (np.arange(len(drives)) != channel)
             own = sizes[:, channel] - np.nanmedian(sizes[:, others], axis=1)
             found[channel] = _is_behind_glue(own, era.dynamic_stiffness(omega))

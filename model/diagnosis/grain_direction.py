@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import SensedPlate, sensed_plate
 from model.diagnosis.assignment import ShapeMatch, match_shapes
-from model.errors import InputError
 from model.identification.identify import solved_for
 from model.quantities import percent
 from model.rig.rig import Rig
@@ -34,6 +33,8 @@ class TurnedGrain:
     as_written: str
     error: float
     error_as_written: float
+
+    label = "GRAIN"
 
     def __str__(self) -> str:
         """What is wrong, and what to do."""
@@ -67,13 +68,3 @@ def turned_grain(
     as_written = rig.grain
     along = "length" if as_written == "width" else "width"
     return TurnedGrain(other, along, as_written, error, shapes.error)
-
-
-def check_grain(rig: Rig, observation: Responses) -> None:
-    """Raise InputError for a board whose grain clearly runs along the other side than the rig's."""
-    plate = sensed_plate(
-        rig, observation.points, observation.frequencies, masses=observation.masses
-    )
-    found = turned_grain(plate, match_shapes(plate, observation.values), observation)
-    if found:
-        raise InputError(str(found))

@@ -27,8 +27,9 @@ from model.diagnosis.diagnosis_screening import (
     off_scale,
     usable_sensors,
 )
+from model.diagnosis.exchanged_sensors import ExchangedSensors, exchanged_sensors
 from model.diagnosis.glue import behind_glue
-from model.diagnosis.grain_direction import TurnedGrain, turned_grain
+from model.diagnosis.other_meaning import OtherMeaning, other_meaning
 from model.diagnosis.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
@@ -57,8 +58,8 @@ _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
 
-Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, TurnedGrain | None, Responses], None]
-"""Of responses at usable sensors, by the plate there, what its shapes are most like, its grain."""
+Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, Responses], None]
+"""Of responses at usable sensors, by the plate there and what its shapes are most like."""
 
 ChannelState: TypeAlias = Literal[
     "well",
@@ -78,9 +79,9 @@ class ChannelVerdict:
     """A channel: the ERA to which the rig wires it, the one that it drives, and its states.
 
     states: "well" alone if nothing is wrong; drives: None for a channel that is dead or was not
-    driven; gain: relative to the command; phase [degrees], None if unknown; mac_own,
-    mac_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in drives
-    and states.
+    driven; gain: relative to the command and the rig's gains; phase [degrees], None if unknown;
+    mac_own, mac_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in
+    drives and states.
     """
 
     era: str
@@ -104,8 +105,8 @@ class Verdict:
     plate that fits; sensors: names of those that were not left out; beyond: what of a plate that
     matches is beyond tolerances, None for nothing or where it was not sought; promise_margins: by
     what that plate exceeds the contrasts that the rig's table promises [dB], none where they were
-    not compared; grain: the board that was measured, where its grain runs along the other side than
-    the rig's, and of which all else then is.
+    not compared; corrections: what the files say wrongly of the board or of places of sensors; all
+    else is of the corrected ones.
     """
 
     channels: tuple[ChannelVerdict, ...]
@@ -119,7 +120,7 @@ class Verdict:
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
     promise_margins: tuple[float, ...] = ()
-    grain: TurnedGrain | None = None
+    corrections: tuple[OtherMeaning | ExchangedSensors, ...] = ()
 
     @property
     def wiring_matches(self) -> bool:
@@ -145,7 +146,19 @@ class Verdict:
             and self.wiring_matches
             and self.beyond is None
             and not self.misses_promises
+            and not self.corrections
         )
+
+    @property
+    def is_of_another_rig(self) -> bool:
+        """Whether the board that was found is not that of the file."""
+        return any(isinstance(each, OtherMeaning) for each in self.corrections)
+
+    @property
+    def all_inverted(self) -> bool:
+        """Whether all of several channels have the sign that is opposite to the sensors'."""
+        found = ["inverted" in each.states for each in self.channels if each.drives is not None]
+        return len(found) > 1 and all(found)
 
     @property
     def kept_share(self) -> float | None:
@@ -174,7 +187,8 @@ def diagnose(
     """Compare a measurement with the rig's prediction.
 
     false_alarm: share of plates as written of which a value may be called wrong; check: that
-    responses are what they claim, before channels are judged by their size; has_form: whether the
+    responses are what they claim, before channels are judged by their size; then corrections are
+    errors; has_form: whether the
     plate may have form errors, and what is beyond them is sought, by sensors of known scale.
     Raises InputError for fewer than three usable sensors or four frequencies.
     """
@@ -192,13 +206,16 @@ def diagnose(
     if removed:
         plate = _plate_of(rig, observation)
     shapes = match_shapes(plate, observation.values)
-    live = np.where(dead[:, None], np.nan, observation.values)
-    grain = turned_grain(plate, match_shapes(plate, live), replace(observation, values=live))
+    live = replace(observation, values=np.where(dead[:, None], np.nan, observation.values))
+    other = other_meaning(plate, match_shapes(plate, live.values), live)
+    if other is not None:
+        if check is not None:
+            raise InputError(str(other))
+        found = diagnose(other.rig, observation, false_alarm=false_alarm)
+        corrections = (other, *found.corrections)
+        return replace(found, plate_matches=False, changes=None, corrections=corrections)
     if check is not None:
-        check(plate, shapes, grain, observation)
-    if grain is not None:
-        found = diagnose(grain.rig, observation, false_alarm=false_alarm)
-        return replace(found, plate_matches=False, changes=None, grain=grain)
+        check(plate, shapes, observation)
     dead |= dead_channels(plate, observation, shapes)
     values = np.where(dead[:, None], np.nan, observation.values)
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
@@ -219,6 +236,13 @@ def diagnose(
             observation.frequencies,
         )
     match, drives = best_wiring(plate, values, shapes)
+    live = replace(observation, values=values)
+    if exchanged := exchanged_sensors(live, match.responses[:, list(drives)]):
+        if check is not None:
+            raise InputError(str(exchanged))
+        put_right = exchanged.put_right(observation)
+        found = diagnose(rig, put_right, false_alarm=false_alarm, has_form=has_form)
+        return replace(found, corrections=(exchanged, *found.corrections))
     # With more noise than usual parameters are less certain.
     error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
     if error > MODEL_ERROR:
@@ -320,6 +344,7 @@ def _channel(
     driven = drives[number]
     # Commands are shares of the stroke of the ERA to which the rig wires the channel.
     gain = float(match.gains[number]) * era.full_level / rig.eras[driven].full_level
+    gain /= float(np.median(np.abs(rig.eras[driven].gain(observation.frequencies))))
     states: list[ChannelState] = []
     confidence = min(
         shapes.confidence(number, driven, other)

@@ -123,7 +123,9 @@ def _restated(rig: Rig) -> set[KeyPath]:
 def _numbers(rig: Rig, document: Document) -> Iterator[float]:
     """Yield all numbers of a rig that are written."""
     # A file's own masses come before its supports, and those that were found after both.
-    masses = sorted(rig.masses, key=lambda each: (each.stiffness, round(each.x, 5), each.y))
+    masses = sorted(
+        rig.masses, key=lambda each: (each.stiffness > 0, round(each.x, 5), round(each.y, 5))
+    )
     parts: list[Any] = [_values(rig, document), [(each.x, each.y, each.mass) for each in masses]]
     while parts:
         match parts.pop():

@@ -111,7 +111,7 @@ def soft_amp(
         limit=limit,
         max_gaps=max_gaps,
     )
-    library()  # compiled here, where its errors are told
+    library()  # compiled here, where its errors are reported
     with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
         supervisor = Supervisor(
             settings,

@@ -114,6 +114,41 @@ def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, s
     assert min(c.confidence for c in swapped.channels) > 0.95
 
 
+def test_diagnose_puts_exchanged_sensors_right(coarse_rig: Rig, built: Responses) -> None:
+    """Nothing is wrong but where P2 and P10 are: neither is upside down, none is left out."""
+    values, order = built.values.copy(), [*range(len(built.sensors))]
+    order[1], order[9] = order[9], order[1]
+    verdict = diagnose(coarse_rig, replace(built, values=values[:, :, order]))
+    (row,) = verdict_rows(verdict)
+    assert row.startswith("PLACES: ")
+    assert "P2 at that of P10, P10 at that of P2" in row
+    assert not verdict.is_well
+    assert verdict.wiring_matches
+    assert verdict.plate_matches
+    assert as_json(verdict)["plate"]["exchanged_sensors"] == {"P2": "P10", "P10": "P2"}
+
+
+def test_verdict_names_the_sensors_first_where_all_channels_are_inverted(
+    coarse_rig: Rig, built: Responses
+) -> None:
+    """One line: there are no others that they could be opposite to."""
+    (row,) = verdict_rows(diagnose(coarse_rig, replace(built, values=-built.values)))
+    assert row.startswith("INVERTED: all channels")
+    assert "turn the sensors over" in row
+
+
+def test_diagnose_relates_gain_to_that_of_a_calibrated_rig(
+    coarse_rig: Rig, built: Responses
+) -> None:
+    """Of gains of 1.5 in its file a channel that plays 1.5 is well, and one that plays 1 weak."""
+    eras = tuple(replace(era, gains=((200.0, 1.5, 0.0),)) for era in coarse_rig.eras)
+    played = built.values * np.array([1.5, 1.5, 1.0, 1.5])[:, None]
+    verdict = diagnose(replace(coarse_rig, eras=eras), replace(built, values=played))
+    assert states(verdict) == {coarse_rig.eras[2].name: ("weak",)}
+    assert verdict.channels[0].gain == pytest.approx(1.0, abs=0.1)
+    assert verdict.channels[2].gain == pytest.approx(1 / 1.5, abs=0.1)
+
+
 def test_diagnose_relates_gain_to_the_stroke_that_is_driven(coarse_rig, built):
     """SW and SE exchanged, SE with twice the stroke: a share of it is twice what was asked of SW.
 

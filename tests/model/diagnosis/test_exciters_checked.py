@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.identification.mistakes import behind_glue
+from benchmarks.identification.mistakes import on_glue
 from exciter_rig import exciter_rig
 from model.arrays import FloatArray
 from model.calibration.responses import Responses
@@ -56,7 +56,7 @@ def checked(
     true = as_sold(rig, seed)
     assert isinstance(rig.mesh, SpectralMesh)
     sources = [
-        behind_glue(era, glue) if number == loose and isinstance(era, Exciter) else era
+        on_glue(era, glue) if number == loose and isinstance(era, Exciter) else era
         for number, era in enumerate(true.eras)
     ]
     values = direct_spectral_acceleration(

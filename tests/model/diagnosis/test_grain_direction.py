@@ -14,7 +14,7 @@ from model.calibration.responses_file import write_responses
 from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
-from model.diagnosis.grain_direction import check_grain
+from model.diagnosis.other_meaning import check_meaning
 from model.diagnosis.verdict import diagnose
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate
@@ -56,7 +56,7 @@ def turned(across: Rig) -> Responses:
 def test_boards_cut_as_their_file_says_are_not_accused(rig: Rig) -> None:
     """Twenty whose parts deviate as bought ones do, half of them by four of the twelve places."""
     for seed in range(20):
-        check_grain(rig, measured(rig, seed))
+        check_meaning(rig, measured(rig, seed))
 
 
 def test_boards_cut_the_other_way_are_accused_of_that_alone(rig: Rig, across: Rig) -> None:

@@ -187,3 +187,18 @@ def test_a_mass_that_is_found_comes_beside_supports() -> None:
     back = rig_of(parse_document("rig.yaml", text)).masses
     assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
     assert found in back
+
+
+def test_feet_are_read_back_whichever_is_stiffer_by_a_hair() -> None:
+    """Two that differ by less than is written: the order of their stiffness says nothing."""
+    feet = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}"
+    document = parse_document("rig.yaml", FLOW.replace("mesh: 12x9", f"{feet}\nmesh: 12x9"))
+    rig = rig_of(document)
+    one, other = rig.masses
+    masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
+    known = replace(rig.uncertainty, supports=0.05)
+    found = replace(rig, masses=masses, uncertainty=known)
+    text = rewritten_text(document, rig, found, comment="")
+    back = rig_of(parse_document("rig.yaml", text)).masses
+    assert [each.x for each in back] == [0.1, 0.2]
+    assert [each.stiffness for each in back] == pytest.approx([345.678, 345.678])

@@ -187,3 +187,14 @@ def test_a_mass_that_is_found_comes_beside_supports() -> None:
     back = rig_of(parse_document("rig.yaml", text)).masses
     assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
     assert found in back
+
+
+def test_rewritten_text_keeps_how_uncertain_feet_are_that_it_states() -> None:
+    """A foot of foam, uncertain by its kind, gets a stiffness and stays as uncertain: by 0.3."""
+    document = parse_document("rig.yaml", BOARD)
+    rig = rig_of(document)
+    (foot,) = rig.masses
+    softer = replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
+    back = rig_of(parse_document("b.yaml", rewritten_text(document, rig, softer, comment="")))
+    assert back.uncertainty.supports == 0.3
+    assert back.masses[0].stiffness == pytest.approx(0.8 * foot.stiffness)

@@ -175,10 +175,12 @@ def uncertainty_of(
     known_gains = np.isfinite(fit.readings_error[0]) & np.isfinite(lacking)
     if known_gains.any(axis=0).all():
         field = max(_rms(lacking[known_gains]), held_out.unexplained if held_out else 0.0)
-        # The best gain of a field that is off by so much at n sensors.
-        off = field / np.sqrt(2 * fit.used.sum(axis=2)[known_gains])
+        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
+        # and stiffness that are off change a field in phase with it.
+        off = field / np.sqrt(fit.used.sum(axis=2)[known_gains])
         gain, phase = (
-            max(_rms(np.hypot(off, error[known_gains])), _LEAST) for error in fit.readings_error
+            max(_rms(np.hypot(share * off, error[known_gains])), _LEAST)
+            for share, error in zip((1, math.sqrt(0.5)), fit.readings_error, strict=True)
         )
         gains = {"gain": _rounded(gain), "phase_deg": _rounded(math.degrees(phase))}
         gains |= {"field": _rounded(field), "common_gain": _rounded(fit.common_error)}

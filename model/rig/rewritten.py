@@ -122,7 +122,11 @@ def _restated(before: Rig, after: Rig) -> set[KeyPath]:
     own: set[KeyPath] = {
         ("eras", era.name, key) for era in after.eras for key in KINDS[type(era)].instead
     }
-    feet = {("uncertainty",)} if before.masses != after.masses[: len(before.masses)] else set[KeyPath]()
+    feet = (
+        {("uncertainty",)}
+        if before.masses != after.masses[: len(before.masses)]
+        else set[KeyPath]()
+    )
     return {("plate", "loss_factor"), *own, *feet}
 
 

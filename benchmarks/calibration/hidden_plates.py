@@ -24,6 +24,8 @@ from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses_csv
+from model.calibration.sensed_plate import sensed_plate
+from model.calibration.variable_projection import project_gains, row_rms
 from model.fem.mesh import ELEMENTS, Mesh
 from model.fem.plate import PlateMatrices, assemble
 from model.rig.file import load_rig
@@ -41,6 +43,10 @@ SENSORS = np.array(
         *([0.06, 0.91], [0.31, 0.80], [0.71, 0.86], [0.96, 0.93]),
     ]
 )
+
+FIELD_POINTS = np.stack(np.meshgrid([0.1, 0.3, 0.5, 0.7, 0.9], [0.12, 0.37, 0.63, 0.88]), -1)
+FIELD_POINTS = FIELD_POINTS.reshape(-1, 2)
+"""Where fingers may be, as shares of the sides."""
 
 CHOSEN = {3: [0, 6, 9], 4: [0, 3, 5, 10], 6: [0, 2, 4, 7, 9, 10], 12: list(range(12))}
 """Sensors of those above, by their number."""
@@ -179,14 +185,31 @@ def gains_of(rig: Rig) -> ComplexArray:
     return np.asarray((rows[..., 1] * np.exp(1j * rows[..., 2])).T)
 
 
-def gain_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
-    """Errors of the gains of a rig against true ones (f, e), in its uncertainties.
+def fields_of(hidden: HiddenPlate) -> ComplexArray:
+    """True fields of a plate at FIELD_POINTS and the frequencies of its gains, (f, e, p)."""
+    frequencies = np.array([row[0] for row in hidden.rig.eras[0].gains])
+    plate = hidden.rig.plate
+    return hidden.responses(frequencies, FIELD_POINTS * [plate.length, plate.width])
 
-    Magnitudes, then phases, (2, f, e).
+
+def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
+    """Errors of a rig's fields against those of `fields_of` (f, e, p), in its uncertainties.
+
+    Of the gains that a rig's fields have best, magnitudes and phases, then of the fields with
+    these, root mean square, (3, f, e).
     """
-    off = np.log(gains_of(rig) / true)
-    known = rig.uncertainty
-    return np.abs([off.real / known.gain, off.imag / np.radians(known.phase_deg)])
+    points = FIELD_POINTS * [rig.plate.length, rig.plate.width]
+    frequencies = np.array([row[0] for row in rig.eras[0].gains])
+    fields = gains_of(rig)[:, :, None] * sensed_plate(rig, points, frequencies).responses()
+    gains, left = project_gains(fields, true, np.ones(fields.shape))
+    off, known = np.log(gains), rig.uncertainty
+    return np.abs(
+        [
+            off.real / np.hypot(known.gain, known.common_gain),
+            off.imag / np.radians(known.phase_deg),
+            row_rms(left) / row_rms(true) / known.field,
+        ]
+    )
 
 
 def sensors_of(seed: int) -> int:
@@ -202,10 +225,10 @@ def main() -> None:
         hidden = draw_plate(rig, form, seed=seed)
         responses = measure(hidden, rig, seed=seed, count=sensors_of(seed))
         write_responses_csv(folder / f"{seed}.csv", responses, rig)
-        gains = gains_of(hidden.rig)
+        fields = fields_of(hidden)
         truth = {
             "values": true_values(hidden.rig),
-            "gains": [gains.real.tolist(), gains.imag.tolist()],
+            "fields": [fields.real.tolist(), fields.imag.tolist()],
         }
         (folder / f"{seed}.json").write_text(json.dumps(truth))
 

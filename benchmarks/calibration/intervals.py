@@ -1,7 +1,8 @@
 """How often intervals of 90 % hold the truth, over plates hidden in a process of their own.
 
-Gains and phases: of every ERA at every frequency, by the uncertainty in the calibrated rig; values:
-by their standard errors.
+Gains and phases: of what every ERA does to the plate at every frequency, by the uncertainty in the
+calibrated rig; values: by their standard errors. Fields: by how much they are off with the best
+gains, root mean square over the plate relative to what the rig states.
 """
 
 import json
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.calibration.hidden_plates import CHOSEN, gain_deviations, sensors_of
+from benchmarks.calibration.hidden_plates import CHOSEN, field_deviations, sensors_of
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
@@ -33,11 +34,12 @@ def deviations(
 ) -> dict[str, tuple[FloatArray, float]]:
     """Errors in standard errors by kind of value, and the standard error, relative."""
     found = calibrate(rig, responses, check_consistency(rig, responses))
-    real, imaginary = np.array(truth["gains"])
-    gains, phases = gain_deviations(found.rig, real + 1j * imaginary)
+    real, imaginary = np.array(truth["fields"])
+    gains, phases, fields = field_deviations(found.rig, real + 1j * imaginary)
     known = found.rig.uncertainty
     by_kind = {
         "gain": (gains.ravel(), known.gain),
+        "field": (fields.ravel(), known.field),
         "phase": (phases.ravel(), float(np.radians(known.phase_deg))),
     }
     values = defaultdict(list)

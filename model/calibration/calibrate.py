@@ -19,10 +19,9 @@ from model.calibration.calibration_result import (
     HeldOutSensors,
     SensorScale,
 )
-from model.calibration.fit import CalibrationProblem, Fit, solve, start_at
+from model.calibration.fit import CalibrationProblem, Fit, solve, start_at, without_form
 from model.calibration.fitted_rig import (
     gain_rows,
-    lacking_of,
     moved_eras,
     predicted_by,
     rig_of_fit,
@@ -36,7 +35,7 @@ from model.calibration.responses import (
     check_enough_sensors,
 )
 from model.calibration.sensed_plate import sensed_plate
-from model.calibration.variable_projection import row_rms
+from model.calibration.variable_projection import responses_of, row_rms
 from model.choice import best_of
 from model.errors import InputError
 from model.identification.held_out import SHARE, relative_rms
@@ -62,20 +61,27 @@ def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutS
     unseen[candidates[evenly_spaced]] = True
     part = problem.without(unseen)
     seen = solve(part, fit)
-    rig, scales = rig_of_fit(part, seen), problem.scales(fit.z)
+    rig = rig_of_fit(part, seen, without_form(part, seen)[0])
+    scales = problem.scales(fit.z)
     responses, gains = predicted_by(
         rig, problem, live.points, replace(fit, used=fit.used & ~unseen)
     )
     predicted = gains[:, :, None] * responses * scales
     size = row_rms(problem.values)
     which = fit.used & unseen
+    error = np.abs(predicted - problem.values) / size[:, :, None]
+    own = problem.plate.model.space.of("sensor_scale", "sensor_place")
+    _, read = responses_of(problem.plate.model, fit.z, own)
+    variance = (np.abs(gains[:, :, None] * read) ** 2).sum(axis=0) + 2 * fit.noise[:, :, None] ** 2
+    left = np.median(error[which] ** 2) - np.median((variance / size[:, :, None] ** 2)[which])
     return HeldOutSensors(
         tuple(compress(live.sensors, unseen)),
         relative_error(
             problem.values, initial_responses(problem) * scales, size, unseen[None, None]
         ),
         relative_error(problem.values, predicted, size, which),
-        float(np.median((np.abs(predicted - problem.values) / size[:, :, None])[which])),
+        float(np.median(error[which])),
+        math.sqrt(max(left, 0.0) / math.log(2)),  # the median of |z|² is log 2 of its mean
     )
 
 
@@ -275,6 +281,7 @@ def _with_median_scale_one(problem: CalibrationProblem, fit: Fit) -> Fit:
         error=error,
         gains=fit.gains * middle,
         gains_error=np.hypot(fit.gains_error, common * np.abs(fit.gains)) * abs(middle),
+        common_error=math.hypot(fit.common_error, common),
     )
 
 
@@ -287,7 +294,8 @@ def _report(
     dead_eras: tuple[str, ...],
 ) -> Calibration:
     fitted, scales, before = problem.plate, problem.scales(fit.z), problem.plate.rig
-    rig = rig_of_fit(problem, fit)
+    plain = without_form(problem, fit)
+    rig = rig_of_fit(problem, fit, plain[0])
     responses, gains = predicted_by(rig, problem, live.points, fit)
     eras = tuple(
         replace(era, gains=gain_rows(gains[:, number], live.frequencies) or era.gains)
@@ -311,8 +319,7 @@ def _report(
         )
     )
     held_out = hold_out(problem, fit, live)
-    lacking = lacking_of(fit, gains[:, :, None] * responses * scales)
-    uncertainty = uncertainty_of(before.uncertainty, problem, fit, parameters, held_out, lacking)
+    uncertainty = uncertainty_of(before.uncertainty, problem, fit, plain, parameters, held_out)
     measured_count = int(np.isfinite(problem.values).sum())
     return Calibration(
         rig=replace(rig, eras=eras, uncertainty=uncertainty),

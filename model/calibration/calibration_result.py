@@ -58,13 +58,15 @@ class HeldOutSensors:
     """Prediction at sensors held out of the fit.
 
     before, after: error of the old and the fitted rig, root mean square over responses, each
-    relative to all sensors' at its frequency and ERA; median: of the fitted rig's.
+    relative to all sensors' at its frequency and ERA; median: of the fitted rig's; unexplained: by
+    it, without what noise and the sensors' own tolerances explain.
     """
 
     sensors: tuple[str, ...]
     before: float
     after: float
     median: float
+    unexplained: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,15 +135,17 @@ class Fit(FitStart):
     """Result of a fit.
 
     error (p,): standard errors of the parameters; gains, gains_error (f, e), NaN where unmeasured,
-    the latter of magnitudes, phases_error (f, e) [rad]; predicted (f, e, s): with gains and scales;
-    chi2: sum of squares per degree of freedom; dampers: what those of all ERAs do to the responses,
-    relative to the plate's own losses.
+    the latter of magnitudes; readings_error (2, f, e): of magnitudes, relative, and phases [rad] of
+    fields by what reads them alone, beside common_error, relative, of the magnitudes of all;
+    predicted (f, e, s): with gains and scales; chi2: sum of squares per degree of freedom; dampers:
+    what those of all ERAs do to the responses, relative to the plate's own losses.
     """
 
     error: FloatArray
     gains: ComplexArray
     gains_error: FloatArray
-    phases_error: FloatArray
+    readings_error: FloatArray
+    common_error: float
     predicted: ComplexArray
     chi2: float
     dampers: float
@@ -207,18 +209,20 @@ def clear(fit: Fit) -> NDArray[np.bool_]:
     return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
 
 
-def without_form(problem: CalibrationProblem, fit: Fit) -> FloatArray:
+def without_form(problem: CalibrationProblem, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Parameters z (p,) of the plate without form errors that explains best what was measured.
 
-    ERAs stay where they clearly are. A rig cannot have form errors, which its field would lack;
-    what they are like of modulus and loss factor comes back, as a side is like another modulus.
+    And standard errors (p,) of what was searched, for which form errors are noise. ERAs stay where
+    they clearly are. A rig cannot have form errors, which its field would lack; what they are like
+    of modulus and loss factor comes back, as a side is like another modulus.
     """
     space, z = problem.plate.model.space, fit.z.copy()
     mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
     form = space.of(*FORM, "mode_shifts") & ~mine
     z[form | (space.of("place") & ~clear(fit))] = 0.0
     part = replace(problem, searched=problem.searched & mine)
-    return _search(part, z, fit.used / fit.noise[:, :, None]).x
+    found = _search(part, z, fit.used / fit.noise[:, :, None])
+    return found.x, _errors(part, found, fit.used)[0]
 
 
 def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:
@@ -263,13 +267,7 @@ def _result(
     problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
 ) -> Fit:
     z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
-    rows = int(used.any(axis=2).sum())
-    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
-    chi2 = float((found.residuals**2).sum()) / freedom
-    _, root, blind = _directions(found)
-    root = root * math.sqrt(max(chi2, 1.0))
-    error = np.zeros(len(z))
-    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
+    error, root, chi2 = _errors(problem, found, used)
     model, by_z = responses_of(problem.plate.model, z, searched)
     gains, _ = project_gains(model, problem.values, weight)
     by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
@@ -281,22 +279,39 @@ def _result(
     space, numbers = problem.plate.model.space, np.flatnonzero(searched)
     for era, factor in enumerate(space.indices("force_factor")):
         relative[numbers == factor, :, era] += space.std[factor]
-    magnitude, phase = (
-        np.sqrt(of_noise + (np.tensordot(root.T, part, axes=1) ** 2).sum(axis=0))
-        for part in (relative.real, relative.imag)
-    )
+    # What else is searched changes gain and field the opposite ways: sensors hear their product.
+    reads = space.of("sensor_scale", "sensor_place")[searched]
+    by_reading = np.tensordot(root[reads].T, relative[reads], axes=1)
+    common = np.nanmean(by_reading, axis=(1, 2), keepdims=True)
+    beside = by_reading - common
     return Fit(
         z,
         noise,
         used,
         error,
         gains,
-        np.abs(gains) * magnitude,
-        phase,
+        np.abs(gains)
+        * np.sqrt(of_noise + (np.tensordot(root.T, relative.real, axes=1) ** 2).sum(axis=0)),
+        np.sqrt(of_noise + (np.array([beside.real, beside.imag]) ** 2).sum(axis=1)),
+        float(np.linalg.norm(common.real)),
         gains[:, :, None] * model,
         chi2,
         _dampers(problem, found.x, root),
     )
+
+
+def _errors(
+    problem: CalibrationProblem, found: Minimum, used: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Standard errors (p,), what is searched by one along each direction (n, k), and chi²."""
+    searched, rows = problem.searched, int(used.any(axis=2).sum())
+    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
+    chi2 = float((found.residuals**2).sum()) / freedom
+    _, root, blind = _directions(found)
+    root = root * math.sqrt(max(chi2, 1.0))
+    error = np.zeros(len(found.x))
+    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
+    return error, root, chi2
 
 
 def _dampers(problem: CalibrationProblem, z: FloatArray, root: FloatArray) -> float:

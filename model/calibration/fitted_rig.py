@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import ndtr
+from numpy.typing import ArrayLike
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibration_result import FittedParameter, HeldOutSensors, MovedEra
-from model.calibration.fit import CalibrationProblem, Fit, clear, without_form
+from model.calibration.fit import CalibrationProblem, Fit, clear
 from model.calibration.sensed_plate import Parameter, sensed_plate
 from model.calibration.variable_projection import project_gains, row_rms
 from model.identification.form_errors import MASS_CELLS
@@ -20,7 +19,6 @@ from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import Gain
 
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
-_HELD, _HALF_WIDTH = 0.9, 1.645  # share that an interval holds, in standard errors either side
 
 # Relative error of values by idealisations of the model, of any but the loss factor, and of that:
 # what form errors leave unexplained widens resonances by 0.4 % (root mean square over plates
@@ -29,9 +27,9 @@ _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
 _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
 
 
-def rig_of_fit(problem: CalibrationProblem, fit: Fit) -> Rig:
-    """Rig that explains the responses best, ERAs where they clearly are; gains unchanged."""
-    rig = problem.plate.rig_at(without_form(problem, fit))
+def rig_of_fit(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> Rig:
+    """Rig of a fit without form errors, z (p,); ERAs where they clearly are, gains unchanged."""
+    rig = problem.plate.rig_at(z)
     moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
     eras = tuple(
         replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
@@ -70,7 +68,7 @@ def place_error(problem: CalibrationProblem, fit: Fit, before: float) -> float:
     kept, error = (space.values(x, "place") for x in (np.where(clear(fit), 0.0, fit.z), fit.error))
     by_data = error < math.sqrt(0.5) * KINDS["place"].std
     of_each = np.where(by_data, np.hypot(np.hypot(kept, error), KINDS["place"].theory), before)
-    return float(np.sqrt(np.mean(of_each**2)))
+    return _rms(of_each)
 
 
 def predicted_by(
@@ -84,8 +82,15 @@ def predicted_by(
     return model, gains
 
 
-def lacking_of(fit: Fit, predicted: ComplexArray) -> FloatArray:
-    """What responses predicted by a rig (f, e, s) lack of a fit's, relative, (f, e)."""
+def lacking_of(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> FloatArray:
+    """What responses lack of a fit's without its form errors, z (p,), relative, (f, e).
+
+    But with its ERAs, whose places a rig states the errors of.
+    """
+    at_places = np.where(problem.plate.model.space.of("place"), fit.z, z)
+    model = problem.plate.responses(at_places)
+    gains, _ = project_gains(model, problem.values, fit.used / fit.noise[:, :, None])
+    predicted = gains[:, :, None] * model
     squares = np.where(fit.used, np.abs(predicted - fit.predicted) ** 2, np.nan)
     size = row_rms(fit.predicted, fit.used)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -126,17 +131,19 @@ def uncertainty_of(
     before: Uncertainty,
     problem: CalibrationProblem,
     fit: Fit,
+    plain: tuple[FloatArray, FloatArray],
     parameters: Sequence[FittedParameter],
     held_out: HeldOutSensors | None,
-    lacking: FloatArray,
 ) -> Uncertainty:
     """How well a calibrated rig is known, for its file.
 
     Without the error of the whole mass, by which all scales and which no pattern feels. Thickness
-    stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness does. Gain
-    and phase are those of the fit's gains, with what its fields have that the rig's are lacking (f,
-    e), as it cannot express form errors, and at least the median error at held-out sensors, which
-    is that of the field. What is not identified keeps the value of the rig before.
+    stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness does. Field
+    is what the fit's fields have that the rig's are lacking (f, e), as it cannot express form
+    errors, and at least what held-out sensors leave unexplained. Gain and phase are those of the
+    best gains of fields that are off by so much, as they are read at the sensors: what else is
+    off moves gains and fields the opposite ways. What is not identified keeps the value of the
+    rig before.
     """
     errors = problem.plate.errors(fit.z, fit.error)
     # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
@@ -161,27 +168,28 @@ def uncertainty_of(
     }
 
     def rms(kind: str) -> float:
-        return float(np.sqrt(np.mean(np.square(relative[kind] or [0.0]))))
+        return _rms(relative[kind] or [0.0])
 
-    gain, phase_deg = before.gain, before.phase_deg
-    known_gains = np.isfinite(fit.phases_error) & np.isfinite(lacking)
+    gains = {}
+    lacking = lacking_of(problem, fit, plain[0])
+    known_gains = np.isfinite(fit.readings_error[0]) & np.isfinite(lacking)
     if known_gains.any(axis=0).all():
-        # The median of |z| of complex errors with standard deviation 1 of each part is 1.18.
-        field = 0.0 if held_out is None else held_out.median / math.sqrt(2 * math.log(2))
-        off = lacking[known_gains] / math.sqrt(2)
-        share = (fit.gains_error / np.abs(fit.gains))[known_gains]
-        gain = max(pooled_error(off, share), field, _LEAST)
-        phase_deg = math.degrees(
-            max(pooled_error(off, fit.phases_error[known_gains]), field, _LEAST)
+        field = max(_rms(lacking[known_gains]), held_out.unexplained if held_out else 0.0)
+        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
+        # and stiffness that are off change a field in phase with it.
+        off = field / np.sqrt(fit.used.sum(axis=2)[known_gains])
+        gain, phase = (
+            max(_rms(np.hypot(share * off, error[known_gains])), _LEAST)
+            for share, error in zip((1, math.sqrt(0.5)), fit.readings_error, strict=True)
         )
+        gains = {"gain": _rounded(gain), "phase_deg": _rounded(math.degrees(phase))}
+        gains |= {"field": _rounded(field), "common_gain": _rounded(fit.common_error)}
     losses = (
         max(rms("loss_factor"), rms("damping"))
         if known["loss_factor"] and known["damping"]
         else math.log(before.damping)
     )
     fitted = {
-        "gain": _rounded(gain),
-        "phase_deg": _rounded(phase_deg),
         "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
         "damping": 1 + _rounded(math.exp(losses) - 1),
     }
@@ -192,24 +200,18 @@ def uncertainty_of(
         if one.parameter.foot
     ]
     if feet:
-        fitted["supports"] = _rounded(math.hypot(np.sqrt(np.mean(np.square(feet))), _MODEL_ERROR))
+        fitted["supports"] = _rounded(math.hypot(_rms(feet), _MODEL_ERROR))
     if known["modulus"]:
-        fitted |= Uncertainty.of_frequency(_rounded(rms("modulus") / 2))
-    return Uncertainty.clipped(**asdict(before) | fitted)
+        # The rig's modulus is that of frequencies with form errors, whatever part is theirs.
+        of_plain, value = problem.plate.errors(*plain)[0], problem.plate.values(plain[0])[0]
+        of_modulus = math.hypot(of_plain / value, _MODEL_ERROR)
+        fitted |= Uncertainty.of_frequency(_rounded(of_modulus / 2))
+    return Uncertainty.clipped(**asdict(before) | fitted | gains)
 
 
-def pooled_error(bias: FloatArray, error: FloatArray) -> float:
-    """Standard error (one for all) whose interval of 90 % holds nine in ten of some values.
-
-    bias, error (n,): of the normal distributions of what they are off by.
-    """
-
-    def missing(half_width: float) -> float:
-        inside = ndtr((half_width - bias) / error) - ndtr((-half_width - bias) / error)
-        return float(inside.mean()) - _HELD
-
-    widest = float((np.abs(bias) + 2 * _HALF_WIDTH * error).max())
-    return float(brentq(missing, 0, widest)) / _HALF_WIDTH
+def _rms(values: ArrayLike) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _rounded(value: float) -> float:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.weekend.chain import BuiltBoard
@@ -28,3 +29,8 @@ def test_the_board_is_found_from_the_file_of_its_sensor(tmp_path: Path, capsys) 
     rigidity = rig.plate.flexural_rigidity / rig.plate.mass
     assert rigidity == pytest.approx(true.flexural_rigidity / true.mass, rel=0.02)
     assert rig.uncertainty.gain < 0.1
+    sizes, errors = (
+        np.concatenate([each[key] for each in report["gains"].values()])
+        for key in ("magnitude", "standard_error")
+    )
+    assert np.median(errors / sizes) < 0.1

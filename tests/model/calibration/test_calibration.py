@@ -73,6 +73,18 @@ def test_calibrate_finds_gains(truth, fitted):
     assert 0.01 * np.sqrt(1 / 22 + 1 / 11) < np.median(errors) < 0.01
 
 
+def test_calibrate_states_each_error_once(truth, fitted):
+    """Of eleven sensors, each within 1 %, the mean is that of all gains, and of none of its own.
+
+    That is at least what noise of 1 % leaves, half of its power in each part. Frequencies are as
+    uncertain as the model leaves them, 0.1 %, whatever a side could have of the modulus.
+    """
+    known, true = fitted.rig.uncertainty, truth.plate.material.E
+    assert known.common_gain == pytest.approx(0.01 / np.sqrt(11), rel=0.2)
+    assert 0.01 / np.sqrt(22) < known.gain < 0.01 / np.sqrt(8)
+    assert abs(fitted.rig.plate.material.E / true - 1) / 2 < known.frequency < 0.0012
+
+
 def test_calibrate_finds_dead_and_wrongly_scaled_sensors(fitted):
     """The dead sensor is left out, the wrong scale found, and no other one suspected."""
     assert fitted.dead_sensors == ("P8",)

@@ -202,3 +202,14 @@ def test_feet_are_read_back_whichever_is_stiffer_by_a_hair() -> None:
     back = rig_of(parse_document("rig.yaml", text)).masses
     assert [each.x for each in back] == [0.1, 0.2]
     assert [each.stiffness for each in back] == pytest.approx([345.678, 345.678])
+
+
+def test_rewritten_text_keeps_how_uncertain_feet_are_that_it_states() -> None:
+    """A foot of foam, uncertain by its kind, gets a stiffness and stays as uncertain: by 0.3."""
+    document = parse_document("rig.yaml", BOARD)
+    rig = rig_of(document)
+    (foot,) = rig.masses
+    softer = replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
+    back = rig_of(parse_document("b.yaml", rewritten_text(document, rig, softer, comment="")))
+    assert back.uncertainty.supports == 0.3
+    assert back.masses[0].stiffness == pytest.approx(0.8 * foot.stiffness)

@@ -24,8 +24,7 @@ from model.rig.file import example_rig_path, rig_of
 from model.rig.parts import limits_of
 from model.rig.rig import Rig
 from model.rig.sections import LimitsSection, RigSection
-from model.structure.attachments import Source
-from model.structure.exciter import Exciter
+from model.structure.attachments import Era, Source
 from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
 from model.structure.laminate_section import slide_frequency
 from model.structure.support import support_problem
@@ -156,11 +155,11 @@ _MAX_ANGLE = math.radians(20.5)  # between two rows
 def gain_notes(rig: Rig) -> list[str]:
     """Warnings: ERAs behind an output whose gains are missing, and each with rows too far apart.
 
-    What an exciter does behind an output is known without gains.
+    What others than ERAs do behind an output is known without gains.
     """
     behind = [era for era in rig.eras if rig.wiring[era.name].amplifier in rig.outputs]
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    names = [era.name for era in behind if not (era.gains or isinstance(era, Exciter))]
+    names = [era.name for era in behind if isinstance(era, Era) and not era.gains]
     notes = []
     if names:
         notes.append(

@@ -118,14 +118,14 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
             "the gain of the input, and its full_scale_v, or choose a lower --level"
         )
     silent = [n for n in named if np.sqrt((recorded[:, n - 1] ** 2).mean()) < SILENT]
-    if len(silent) == len(named):
+    if len(silent) == len(named) > 1:
         raise LinkError(
             "all inputs are silent: check that --device is the one that is wired, its outputs and "
             "inputs not swapped, amplifier and sensor supply switched on"
         )
     if silent:
         inputs = ", ".join(f"{named[n]} (input {n})" for n in silent)
-        raise LinkError(f"silent: {inputs}; check cables and the supply of sensors (IEPE)")
+        raise LinkError(f"silent: {inputs}; check cables, amplifier and sensor supply (IEPE)")
 
 
 def check_wiring(found: Estimate, desk: Desk) -> None:

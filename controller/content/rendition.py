@@ -14,11 +14,11 @@ from controller.content.pattern import Pattern, Transient, along
 from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
-from model.answer.over_duration import CLICKS_APART
 from model.arrays import FloatArray
 from model.choice import best_of
 from model.finger.perception import decibels
 from model.transients.base_motion import KNOT_STEP, rise
+from model.transients.swings import CLICKS_APART
 
 Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]."""

@@ -27,7 +27,7 @@ from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import rise
 from model.transients.knots import RISE
 from model.transients.loaded_envelopes import enveloped_accelerations
-from model.transients.swings import DECAYED, Swing
+from model.transients.swings import CLICKS_APART, DECAYED, Swing
 
 ONSET_RAMP = 0.040
 """Duration of a plain ramp [s].
@@ -56,9 +56,6 @@ _TINY = 1e-30
 FADE_RAMP = 0.020
 """Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
 
-CLICKS_APART = 0.060
-"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
-one."""
 
 _LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
 

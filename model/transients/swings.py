@@ -7,14 +7,21 @@ that follows step by step, exactly for straight lines; those far above follow th
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.transients.time_response import PlateInTime
+
+if TYPE_CHECKING:
+    from model.transients.time_response import PlateInTime
 
 DECAYED = 0.25
 """Time [s] after which little is left of a free vibration of magnets."""
+
+CLICKS_APART = 0.060
+"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
+one."""
 
 _STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
 _PACES = 0.060  # s; from the shortest to the longest pause between what begins anew
@@ -34,7 +41,7 @@ class Swing:
 
 
 def motions_along(
-    plate: PlateInTime, rows: ComplexArray, frequency: float, swing: Swing
+    plate: "PlateInTime", rows: ComplexArray, frequency: float, swing: Swing
 ) -> FloatArray:
     """Largest motions (m,) [m] by drives at a frequency [Hz] whose full level swings, from rest.
 

@@ -41,7 +41,7 @@ def rewritten_text(
     def change(data: CommentedMap) -> None:
         own = _values(before, document)
         for path, value in _values(after, document).items():
-            if value != own[path] or path in _restated(before, after):
+            if value != own[path] or path in _restated(after):
                 _put(data, path, value, rows)
         for era in after.eras:
             entry = data["eras"][era.name]
@@ -114,20 +114,12 @@ def _material(material: Material, *, is_across: bool) -> dict[str, Any]:
     return {"name": material.name, **along.moduli, "rho": material.rho, ratio: along.nu}
 
 
-def _restated(before: Rig, after: Rig) -> set[KeyPath]:
-    """Where values are that are written in any case: others of the file would change them.
-
-    A foot with a stiffness is taken as known, one by its kind alone not.
-    """
+def _restated(after: Rig) -> set[KeyPath]:
+    """Where values are that are written in any case: others of the file would change them."""
     own: set[KeyPath] = {
         ("eras", era.name, key) for era in after.eras for key in KINDS[type(era)].instead
     }
-    feet = (
-        {("uncertainty",)}
-        if before.masses != after.masses[: len(before.masses)]
-        else set[KeyPath]()
-    )
-    return {("plate", "loss_factor"), *own, *feet}
+    return {("plate", "loss_factor"), *own}
 
 
 def _numbers(rig: Rig, document: Document) -> Iterator[float]:

@@ -54,8 +54,6 @@ from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
 
 RESULTS = ROOT / "out" / "weekend_through_jack.json"
-BLOCK = 512
-"""Frames: the most that an amplifier may take, for a machine that does other things, too."""
 MESH = "13x11 Legendre"
 """Of the board in time: not that of the rig."""
 _LEVEL = 0.2  # of a measurement: more clips the sensor
@@ -92,7 +90,6 @@ def played(number: int, count: int) -> Played:
             folder,
             seed=number,
             mesh=MESH,
-            block=BLOCK,
             rig=(FOLDER / "rig.yaml").read_text("utf-8"),
             sensors=(FOLDER / "places.csv").read_text("utf-8"),
             options=["--y-cable", "--built", "built.yaml", "--sensors", "put.csv"],

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
+from model.calibration.responses import Responses
 from model.identification.form_errors import reduced_modes
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.parameters import KINDS, MAX_GUESSED, VALUE_UNITS, space_by_sheets
@@ -236,3 +237,14 @@ def sensed_plate(
     form = reduced_modes(rig, free) if has_form else None
     space = space_by_sheets(rig, (), None)
     return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
+
+
+def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> SensedPlate:
+    """The plate of a rig at the sensors and frequencies of a measurement, as `sensed_plate`."""
+    return sensed_plate(
+        rig,
+        observation.points,
+        observation.frequencies,
+        masses=observation.masses,
+        has_form=has_form,
+    )

@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.calibration.variable_projection import (
     project_gains,
     projection_slopes,
@@ -95,13 +95,7 @@ def match_with_form(
 
     def matched(loads: Sequence[PointLoad | FingertipLoad], noise: float) -> Match:
         rig = replace(plate.rig, masses=(*plate.rig.masses, *loads))  # type: ignore[arg-type]
-        sensed = sensed_plate(
-            rig,
-            observation.points,
-            observation.frequencies,
-            masses=observation.masses,
-            has_form=True,
-        )
+        sensed = plate_of(rig, observation, has_form=True)
         return match_plate(sensed, values, drives=drives, model_error=noise)
 
     noise = float(np.clip(matched((), _FIRST_NOISE).error, *_NOISE))

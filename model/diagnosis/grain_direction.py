@@ -10,7 +10,7 @@ three quarters with their grain turned.
 from dataclasses import dataclass, replace
 
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.identification.identify import solved_for
 from model.quantities import percent
@@ -59,9 +59,7 @@ def turned_grain(
     turned = replace(rig.plate, material=rig.plate.material.turned())
     other = replace(rig, plate=turned)
     other = replace(other, mesh=solved_for(other, rig.limits.frequency_max).mesh)
-    sensed = sensed_plate(
-        other, observation.points, observation.frequencies, masses=observation.masses
-    )
+    sensed = plate_of(other, observation)
     error = match_shapes(sensed, observation.values).error
     if error > min(_MAX_ERROR, _CLEARLY * shapes.error):
         return None

@@ -3,7 +3,7 @@
 from typing import TypeAlias
 
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.diagnosis.grain_direction import TurnedGrain, turned_grain
 from model.diagnosis.resonance_meaning import MisreadResonance, misread_resonance
@@ -26,9 +26,7 @@ def other_meaning(
 
 def check_meaning(rig: Rig, observation: Responses) -> None:
     """Raise InputError for a rig that clearly says something the wrong way round."""
-    plate = sensed_plate(
-        rig, observation.points, observation.frequencies, masses=observation.masses
-    )
+    plate = plate_of(rig, observation)
     found = other_meaning(plate, match_shapes(plate, observation.values), observation)
     if found:
         raise InputError(str(found))

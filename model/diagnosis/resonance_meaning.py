@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.calibration.variable_projection import project_gains, row_rms
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.rig.exciter_checks import exciters_of, sections_of
@@ -69,15 +69,15 @@ def misread_resonance(
         for name, section in sections_of(rig).items()
         if not section.stiffness
     }
+    if not as_written:
+        return None
     variation_as_written = _variation(plate, shapes, observation)
-    if not as_written or not variation_as_written > _VARYING:
+    if not variation_as_written > _VARYING:
         return None
     for which in dict.fromkeys(as_written.values()):
         meant = {name: _OTHER[which] for name, own in as_written.items() if own == which}
         other = rig.replaced(eras={name: {"resonance_is": each} for name, each in meant.items()})
-        sensed = sensed_plate(
-            other, observation.points, observation.frequencies, masses=observation.masses
-        )
+        sensed = plate_of(other, observation)
         found = _variation(sensed, match_shapes(sensed, observation.values), observation)
         if found < _CLEARLY * variation_as_written:
             glued = {e.name: e.magnet_frequency for e in exciters_of(other) if e.name in meant}

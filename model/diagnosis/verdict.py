@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.choice import best_by, best_of
 from model.diagnosis.assignment import (
     ChannelPhase,
@@ -200,11 +200,11 @@ def diagnose(
             f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
             f"{len(observation.frequencies)}"
         )
-    plate = _plate_of(rig, observation)
+    plate = plate_of(rig, observation)
     dead = dead_channels(plate, observation)
     observation, removed = usable_sensors(observation, dead)
     if removed:
-        plate = _plate_of(rig, observation)
+        plate = plate_of(rig, observation)
     shapes = match_shapes(plate, observation.values)
     live = replace(observation, values=np.where(dead[:, None], np.nan, observation.values))
     other = other_meaning(plate, match_shapes(plate, live.values), live)
@@ -302,11 +302,6 @@ def diagnose(
         observation.frequencies,
         beyond if matches else None,
     )
-
-
-def _plate_of(rig: Rig, observation: Responses) -> SensedPlate:
-    """The rig's plate at the sensors of a measurement."""
-    return sensed_plate(rig, observation.points, observation.frequencies, masses=observation.masses)
 
 
 def best_wiring(

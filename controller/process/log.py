@@ -15,9 +15,10 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from io import FileIO
 from logging.handlers import QueueHandler, QueueListener
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from pythonjsonlogger.json import JsonFormatter
 
@@ -53,11 +54,11 @@ class LogFormatter(JsonFormatter):
         return log_data | {"level": level, "message": message}
 
 
-def open_log_file(file: Path) -> TextIO:
+def open_log_file(file: Path) -> FileIO:
     """Open a file to append to, a new one with mode 0600; raises OSError, also for a pipe."""
     # Non-blocking, so that a named pipe is refused instead of waited for.
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
-    stream = os.fdopen(os.open(file, flags, 0o600), "a", encoding="utf-8")
+    stream = FileIO(os.open(file, flags, 0o600), "a")
     if stat.S_ISFIFO(os.fstat(stream.fileno()).st_mode):
         stream.close()
         raise OSError(errno.EINVAL, "a named pipe", str(file))
@@ -89,7 +90,7 @@ class RateLimitFilter(logging.Filter):
 
 
 class LineWriter(logging.Handler):
-    """Appends each record's message to a file, or to standard error.
+    """Appends each record's message to a file, or to standard error, as a whole line or not at all.
 
     file: opened for each line, whatever has become of it; None for standard error.
     """
@@ -100,14 +101,16 @@ class LineWriter(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line, or lose it."""
-        with (
-            contextlib.suppress(Exception),  # the disk may have space again
-            contextlib.nullcontext(sys.stderr)
-            if self._file is None
-            else open_log_file(self._file) as stream,
-        ):
-            stream.write(f"{record.getMessage()}\n")
-            stream.flush()
+        line = f"{record.getMessage()}\n"
+        with contextlib.suppress(Exception):  # the disk may have space again
+            if self._file is None:
+                sys.stderr.write(line)
+                sys.stderr.flush()
+                return
+            with open_log_file(self._file) as stream:
+                written = stream.write(data := line.encode())
+                if written < len(data):
+                    stream.truncate(stream.tell() - written)
 
 
 class LogThread(QueueHandler):

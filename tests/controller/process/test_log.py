@@ -26,6 +26,7 @@ from controller.operation.states import DaemonState, Operation
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from controller.process.service_manager import ServiceManager
 from drivers.wires.wire import Reply
+from full_disk import full_disk
 from gateway_bench import wait_for
 from registry import clock
 from set_chain import set_chain
@@ -149,6 +150,21 @@ def test_log_goes_on_after_a_line_that_cannot_be_written(
     logger.warning("after")
     thread.close()
     assert json.loads(file.read_text("utf-8"))["message"] == "after"
+
+
+def test_full_disk_cuts_no_line_of_the_log(logger: logging.Logger, tmp_path: Path) -> None:
+    """Each line is in the file as a whole or not at all, and a later one follows a whole one."""
+    thread = LogThread(tmp_path / "log")
+    logger.addHandler(thread)
+    messages = [f"{number} {'x' * 300}" for number in range(5)]
+    with full_disk(at=1024):  # bytes, amid the third line
+        for each in messages:
+            logger.warning(each)
+        wait_for(lambda: not thread.queue.unfinished_tasks)
+    logger.warning("after")
+    thread.close()
+    lines = (tmp_path / "log").read_text("utf-8").splitlines()
+    assert [json.loads(line)["message"] for line in lines] == [*messages[:2], "after"]
 
 
 def test_log_is_reopened_after_rotation(logger: logging.Logger, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from controller.effects.gains import GainDb, SourceName
+from model.arguments import shown
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from registry.regular_file import regular_file
@@ -18,6 +19,8 @@ MAX_NAMES = 64
 
 UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
 """Clients that no strength is kept for: commands, and browsers that have given no name."""
+
+_MAX_SIZE = 1 << 21  # bytes; of as many names of the greatest length, each character escaped
 
 _Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
 _GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
@@ -83,7 +86,11 @@ def read_strengths(file: Path | None) -> Mapping[str, float]:
         return {}
     try:
         with open(file, "rb", opener=regular_file) as stream:
-            gains = json.loads(stream.read(), object_pairs_hook=_unique)
+            text = stream.read(_MAX_SIZE + 1)
+        if len(text) > _MAX_SIZE:
+            raise InputError(f"{file}: must be up to {_MAX_SIZE >> 20} MiB long; remove it")
+        # A number of many digits becomes infinite, and is refused as such.
+        gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
         return _GAINS.validate_python(gains, strict=True)
     except FileNotFoundError:
         return {}
@@ -101,6 +108,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict[str, Any]()
     for name, value in pairs:
         if name in found:
-            raise InputError(f"strengths must have each name once, got {name!a} twice")
+            raise InputError(f"strengths must have each name once, got {shown(name)} twice")
         found[name] = value
     return found

@@ -231,7 +231,11 @@ def test_config_commands_create_and_check_daemon_files(
         ('{"": -3}', "must have strengths of -40 to 0 dB by name"),
         ('{"a": NaN}', "must have strengths of -40 to 0 dB by name"),
         ('{"a": -3, "a": -6}', "strengths must have each name once, got 'a' twice"),
+        ('{"a": -3, "a": -6}'.replace("a", "a" * 10**5), "each name once, got 'a{39}[.]{3} twice"),
         ("{'a': -3}", "is not JSON"),
+        ('{"a": -3, "b', "is not JSON"),
+        ('{"a": ' + "1" * 10**5 + "}", "must have strengths of -40 to 0 dB by name"),
+        (" " * (1 << 21) + "{}", "must be up to 2 MiB long"),
         ("[" * 100_000, "is not JSON"),
     ],
 )

@@ -1,7 +1,10 @@
-"""WAV files of PCM or float."""
+"""WAV files of PCM or float.
 
-import io
-import warnings
+What writes to a pipe, and what lost power while it recorded, leaves sizes of 0 or of about 2^31 or
+2^32: such samples go on to the end of the file.
+"""
+
+import struct
 from typing import Any
 
 import numpy as np
@@ -9,29 +12,75 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 
+_PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE  # formats; the last has another one in an extension
+_EXTENDED = 24  # where that is
+_LONG = b"ds64"  # a chunk of RF64 with sizes of 64 bits
+_UNKNOWN_SIZE = 0x7FFF0000  # and larger: of what was not known yet
+_KINDS = {
+    (_PCM, 1): "u1",
+    (_PCM, 2): "i2",
+    (_PCM, 3): "i4",
+    (_PCM, 4): "i4",
+    (_PCM, 8): "i8",
+    (_FLOAT, 4): "f4",
+    (_FLOAT, 8): "f8",
+}
+"""Types of samples by format and size [bytes], in arrays where no type has that size a larger."""
+
 
 def samples_of(content: bytes) -> tuple[int, FloatArray]:
     """The rate [Hz] of a file, and samples (n, channels) of which 1 is full scale.
 
     Raises InputError, which does not name the file.
     """
-    from scipy.io import wavfile  # slow to import
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", r"Chunk \(non-data\)", wavfile.WavFileWarning)
-        try:
-            rate, given = wavfile.read(io.BytesIO(content))
-        except Exception as error:  # of a damaged file anything
-            raise InputError(f"is no WAV file of PCM or float: {error}; save it as one") from error
-    if not given.size:
+    order = ">" if content.startswith(b"RIFX") else "<"
+    form, data = _chunks(content, order)
+    code, channels, rate, _, frame, bits = struct.unpack_from(f"{order}HHIIHH", form)
+    if code == _EXTENSIBLE and len(form) >= _EXTENDED + 2:
+        (code,) = struct.unpack_from(f"{order}H", form, _EXTENDED)
+    size = frame // max(channels, 1)
+    kind = _KINDS.get((code, size))
+    if kind is None or frame != channels * size or not rate:
+        raise _refused(f"got format {code}, {channels} channels of {bits} bits, {rate} Hz")
+    raw = np.frombuffer(data[: len(data) // frame * frame], np.uint8).reshape(-1, size)
+    if missing := np.dtype(kind).itemsize - size:
+        raw = np.pad(raw, ((0, 0), (0, missing) if order == ">" else (missing, 0)))
+    if not raw.size:
         raise InputError("has no samples")
-    return rate, _scaled(given).reshape(len(given), -1)
+    return rate, _scaled(raw.ravel().view(f"{order}{kind}")).reshape(-1, channels)
+
+
+def _chunks(content: bytes, order: str) -> tuple[bytes, memoryview]:
+    """The format of a file, at least what all have, and its samples; raises InputError."""
+    if content[:4] not in (b"RIFF", b"RIFX", b"RF64") or content[8:12] != b"WAVE":
+        raise _refused("it must begin with RIFF and WAVE")
+    (stated,) = struct.unpack_from(f"{order}I", content, 4)
+    at, found = 12, dict[bytes, bytes]()
+    while at + 8 <= len(content):
+        name, size = struct.unpack_from(f"{order}4sI", content, at)
+        at += 8
+        if name == b"data" and len(found.get(b"fmt ", b"")) >= 16:
+            left = len(content) - at
+            if len(found.get(_LONG, b"")) >= 16:
+                size = struct.unpack_from("<Q", found[_LONG], 8)[0] or size
+            if size >= _UNKNOWN_SIZE or (size == 0 and stated + 8 < len(content)):
+                size = left
+            if size > left:
+                raise _refused(f"it must have {size} bytes of samples, got {left}: it was cut off")
+            return found[b"fmt "], memoryview(content)[at : at + size]
+        found[name] = content[at : at + size]
+        at += size + size % 2
+    raise _refused("it has no format, or no samples behind it")
+
+
+def _refused(why: str) -> InputError:
+    return InputError(f"is no WAV file of PCM or float: {why}; save it as PCM of 16 bits")
 
 
 def _scaled(given: Any) -> FloatArray:
+    plain = given.astype(np.float32)
     if given.dtype == np.uint8:
-        return np.asarray((given.astype(np.float32) - 128) / 128)
+        return np.asarray((plain - 128) / 128)
     full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
     with np.errstate(all="ignore"):  # of float what is too large or no number is refused later
-        return np.asarray(given.astype(np.float32) / full)
+        return np.asarray(plain / full)

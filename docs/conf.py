@@ -58,13 +58,16 @@ def _named(text: str) -> str:
     return _ARRAY_TYPE.sub("ndarray", text)
 
 
-def _leave_out_of_side_bar(app: Sphinx, doctree: object) -> None:
-    """Decisions and measured figures have an index page each, which alone is in the side bar."""
+def _leave_out(app: Sphinx, doctree: object) -> None:
+    """Keep decisions and measured figures out of the side bar, and decisions out of the search."""
+    metadata = app.env.metadata[app.env.docname]
     if app.env.docname.startswith(("decisions/", "measured/")):
-        app.env.metadata[app.env.docname]["orphan"] = True
+        metadata["orphan"] = True
+    if app.env.docname.startswith("decisions/"):
+        metadata["nosearch"] = True
 
 
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-signature", _shorten)
-    app.connect("doctree-read", _leave_out_of_side_bar)
+    app.connect("doctree-read", _leave_out)

@@ -1,6 +1,9 @@
 """Pages and what leads to them; `make docs` builds them."""
 
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +23,43 @@ def test_every_page_can_be_found() -> None:
     pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
     names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
     assert names - listed == {"index"}
+
+
+def test_the_search_finds_pages_and_no_decision(tmp_path: Path) -> None:
+    """A word of a page is in the index of the built pages, one of a decision is not."""
+    pytest.importorskip("sphinx", reason="`make docs` installs what builds the pages")
+    for name, text in {
+        "index": "# Pages\n\n```{toctree}\nwire\ndecisions/README\n```\n",
+        "wire": "# A wire\n\nserendipity\n",
+        "decisions/README": "# Decisions\n\n[one](0001-one.md)\n",
+        "decisions/0001-one": "# Juxtaposed\n\nbamboozle\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.md").write_text(text, "utf-8")
+    (tmp_path / "_static").mkdir()
+    shutil.copy(ROOT / "docs" / "conf.py", tmp_path)
+    built = tmp_path / "_build"
+    command = [sys.executable, "-m", "sphinx", "-q", "-b", "html", tmp_path, built]
+    subprocess.run(command, check=True, capture_output=True)
+    index = (built / "searchindex.js").read_text("utf-8").lower()
+    assert "serendip" in index
+    assert "juxtapos" not in index
+    assert "bamboozl" not in index
+
+
+def test_the_version_is_the_same_wherever_it_is_stated() -> None:
+    """The newest release of the changelog, the citation and the packages have one version."""
+    stated = {
+        "pyproject.toml": r'^version = "(.+)"',
+        "CITATION.cff": r"^version: (.+)",
+        "CHANGELOG.md": r"^## \[(.+)\] - \d{4}-\d\d-\d\d$",
+        "examples/javascript/package.json": r'^  "version": "(.+)"',
+        "docs/how-to/installation.md": r"era_haptics-([\d.]+)-py3",
+        "docs/how-to/deployment.md": r"era_haptics-([\d.]+)-py3",
+    }
+    texts = {name: (ROOT / name).read_text("utf-8") for name in stated}
+    versions = {name: re.findall(stated[name], texts[name], re.MULTILINE)[0] for name in stated}
+    assert len(set(versions.values())) == 1, versions
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])

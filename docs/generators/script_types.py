@@ -1,14 +1,16 @@
 """The messages of the API for TypeScript, and the version of its package for npm."""
 
 import re
+import tomllib
 from collections.abc import Iterator
-from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from client_stub import registered
 from controller.api.topics import TOPICS
 from message_types import Models, Notation, each_model
 
+_ROOT = Path(__file__).parents[2]
 _HEAD = "// Written by docs/generators/script_types.py."
 _EVENT = """/** An event notification of any topic. */
 export type Event = {
@@ -48,8 +50,9 @@ def messages() -> str:
 
 
 def with_version(package: str) -> str:
-    """The file package.json with the version of the distribution."""
-    return re.sub(r'("version": )"[^"]*"', rf'\1"{version("era-haptics")}"', package)
+    """The file package.json with the version in pyproject.toml, installed or not."""
+    project = tomllib.loads((_ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    return re.sub(r'("version": )"[^"]*"', rf'\1"{project["version"]}"', package)
 
 
 def _interface(name: str, summary: str) -> Iterator[str]:

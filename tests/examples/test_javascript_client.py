@@ -174,7 +174,7 @@ def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
     if npm is not None:
         for command in (
             "pack --silent",
-            f"install --offline --prefix {user} ./era-haptics-0.2.0.tgz",
+            f"install --offline --prefix {user} ./era-haptics-{package['version']}.tgz",
         ):
             subprocess.run([npm, *command.split()], cwd=source, check=True, capture_output=True)
     else:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from textwrap import dedent
 
@@ -170,7 +171,7 @@ def test_run_prints_help_and_version(
 ) -> None:
     """On standard output; the program is called era however it was started."""
     assert run(["--version"], entries) == 0
-    assert capsys.readouterr().out == "era-haptics 0.2.0\n"
+    assert capsys.readouterr().out == f"era-haptics {version('era-haptics')}\n"
     assert run(["--help"], entries) == 0
     text = capsys.readouterr().out
     assert text.startswith("Usage: era ")

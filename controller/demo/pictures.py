@@ -74,6 +74,11 @@ def touches_figure(table: LocalizationTable, rows: Sequence[TouchRow]) -> Figure
     for axes, row in zip(panels, rows, strict=False):
         _draw_touch(axes, table, row)
     draw_level_scale(figure, panels, shrink=0.7)
+    figure.supxlabel(
+        "felt: mean over the fingertip; quiet: its loudest point; "
+        "felt contrast: the first less the loudest of the second",
+        fontsize=10,
+    )
     return figure
 
 

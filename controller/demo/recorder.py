@@ -19,7 +19,6 @@ from controller.demo.touch_row import (
 from controller.play.content import Prediction
 from controller.play.layer_content import LayerContent
 from controller.play.observer import Observers, PlayReport, SilenceReport
-from controller.play.selection import MOVE_TOLERANCE
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import HELD_BACK
 from model.transients.measures import ONSET_WINDOW
@@ -226,14 +225,13 @@ class TouchRecorder:
 
 
 async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
-    """The row with the pattern that played longest for a touch where it rested last.
+    """The row with the last steady pattern of most contents, or the longest of them.
 
-    Latency and onset are of its first one.
+    It is the same pattern for all fingers that it serves, so that their rows are of one moment.
+    Latency and onset are of the touch's first pattern.
     """
-    at, found = _place(touch.contact), [(_felt_by(touch, each), each) for each in touch.patterns]
-    rested = [each for each in found if math.dist(_place(each[0].contact), at) <= MOVE_TOLERANCE]
-    predicted, main_part = max(rested or found, key=lambda each: each[1].duration)
-    first, applied = touch.patterns[0], main_part.applied
+    first, main_part = touch.patterns[0], max(touch.patterns, key=_significance)
+    predicted, applied = _felt_by(touch, main_part), main_part.applied
     played = _content_of(predicted, applied)
     pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}
@@ -255,7 +253,10 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         promised_contrast_db=predicted.promised_contrast_db,
         predicted_level_db_sl=predicted.level_db_sl,
         pattern=pattern,
-        levels_db_sl={id: finger.level_db_sl for id, finger in vibration.items()},
+        levels_db_sl={
+            id: finger.level_db_sl if id == row.target_id else finger.loudest_db_sl
+            for id, finger in vibration.items()
+        },
     )
     if len(applied.contents) > 1:
         own = _finger_row(predicted, vibration)
@@ -278,6 +279,12 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
         ),
         measured_level_db_sl=target.level_db_sl if target else None,
     )
+
+
+def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
+    """Order of patterns: by contents, then by steadiness, then by time."""
+    applied = pattern.applied
+    return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
 
 
 def _felt_by(touch: _Touch, playing: _PlayedPattern) -> Prediction:

@@ -74,12 +74,13 @@ class FingerRow:
 
 @dataclass(frozen=True, kw_only=True)
 class TouchRow:
-    """A touch from down to up, with the pattern that played longest where it rested last.
+    """A touch from down to up, with its last steady pattern of most contents.
 
     Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
-    fingertips by id [m]; pattern; levels_db_sl of every finger by id. Contrasts are None for a
-    finger alone, and measured ones if the pattern was too short: predicted ones are of the table's
-    plate, promised ones what nine of ten plates within the rig's uncertainty give, in levels;
+    fingertips by id [m]; pattern; levels_db_sl by id: of the target the mean over its tip, of any
+    other finger its loudest point, whose least difference is the contrast. Contrasts are None for
+    a finger alone, and measured ones if the pattern was too short: predicted ones are of the
+    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels;
     transient ones are in accelerations, over the first 100 ms of the touch's first pattern.
     drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
     wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then

@@ -15,9 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from era_haptics.packages import check_packages
+from era_haptics.packages import check_packages, drop_foreign_backend
 
 check_packages()
+drop_foreign_backend()
 
 _IMPORT = re.compile(r"^from (\S+) import (\w+) as", re.MULTILINE)
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")

@@ -4,6 +4,7 @@ Their names are common, and Python takes the first one on its path: a file besid
 package of another distribution.
 """
 
+import os
 import sys
 from importlib.metadata import distributions
 from importlib.util import find_spec
@@ -30,6 +31,20 @@ def check_packages() -> None:
                 sys.stderr.write(f"era: error: {error}\n")
                 sys.exit(2)
             raise
+
+
+def drop_foreign_backend() -> None:
+    """Remove the `MPLBACKEND` of a notebook that started this program if it is not installed here.
+
+    matplotlib refuses to be imported with it. In a notebook it stays, and draws inline.
+    """
+    named = os.environ.get("MPLBACKEND", "").partition("module://")[2]
+    try:
+        is_foreign = named != "" and find_spec(named) is None
+    except ImportError:
+        is_foreign = True
+    if is_foreign:
+        del os.environ["MPLBACKEND"]
 
 
 def _check(package: str) -> None:

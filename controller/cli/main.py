@@ -57,6 +57,8 @@ def main() -> int:
     """Run the command line of the process; return the exit status."""
     for variable in _THREAD_COUNTS:
         os.environ.setdefault(variable, "1")
+    # Pictures go to files; a notebook hands its own backend to what it starts, also with `!era`.
+    os.environ["MPLBACKEND"] = "agg"
     for stream in (sys.stdout, sys.stderr):  # of any encoding, and file names are any bytes
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

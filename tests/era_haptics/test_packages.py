@@ -85,3 +85,47 @@ def test_names_that_hide_nothing_do_not_disturb(tmp_path: Path) -> None:
     assert said(PROGRAM, tmp_path) == (0, [])
     written(tmp_path / "model.py")
     assert said(PROGRAM, ROOT, tmp_path) == (0, [])
+
+
+NOTEBOOK = "module://ipykernel_of_elsewhere.backend_inline"
+BACKEND = (
+    "import era_haptics as era; era.draw_map; import matplotlib as m; print(m.rcParams['backend'])"
+)
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_backend_of_a_notebook_is_kept_where_it_is_installed(
+    tmp_path: Path, is_installed: bool
+) -> None:
+    """In the notebook pictures stay inline; what it starts elsewhere loads matplotlib, too."""
+    name = f"backend_{tmp_path.name.lower()}"
+    if is_installed:
+        (tmp_path / f"{name}.py").write_text('"""A backend."""\n', "utf-8")
+    given = {"MPLBACKEND": f"module://{name}", "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", BACKEND],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | given,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.stdout.strip() == given["MPLBACKEND"]) == is_installed
+
+
+@pytest.mark.parametrize("backend", [NOTEBOOK, "module://", "Qt4Agg"])
+def test_command_draws_into_files_whatever_backend_is_named(backend: str) -> None:
+    """That of a notebook, none, or one that matplotlib has no more; children inherit `agg`."""
+    program = (
+        "import os, sys; sys.argv[1:] = ['--version']; from era_haptics.command import main; "
+        "main(); import model.figures; print(os.environ['MPLBACKEND'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"MPLBACKEND": backend},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "agg"

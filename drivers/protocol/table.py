@@ -174,9 +174,15 @@ def reading(
 
     meaning: what it is of, behind its name. `era amp status`, the API and the metrics have it under
     its name and unit, with the decimals of a step; low, high: in steps; views: what else shows it.
-    A range from 0 or below is sent from 1 on where it is added, since 0 is not stated there.
+    A range from 0 or below is sent from 1 on where it is added, since 0 is not stated there; raises
+    ValueError for one that fills a word, which would so become two.
     """
     zero = 1 - low if is_added and low < 1 else 0
+    if high < WORD <= high + zero:
+        raise ValueError(
+            f"{name} must be from {low} to {WORD - 1 - zero}, or from 1 on, to be one word, where "
+            f"0 of an added reading is not stated, got {low} to {high}"
+        )
     return Number(name, _word(name, low, high, per_unit, unit, zero), is_added, meaning, views)
 
 

@@ -11,6 +11,7 @@ from drivers.protocol.table import (
     MAX_WORDS,
     MESSAGES,
     QUANTITIES,
+    reading,
     sensor_reading,
 )
 from drivers.protocol.table import STATUS as STATUS_RECORD
@@ -61,6 +62,15 @@ def test_reading_has_its_unit_in_its_names_and_the_decimals_of_its_step() -> Non
     assert (speed.decimals, Number("count", QUANTITIES["count"]).decimals) == (2, 0)
     with pytest.raises(ValueError, match=r"unit of fan_speed .* rpm, got /min"):
         WireQuantity("fan_speed", "u16", 20, "/min", 1, 65535)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 65535), (-1, 65534), (-32768, 32767)])
+def test_added_reading_that_fills_a_word_is_refused(low: int, high: int) -> None:
+    """With 0 for not stated it needs two words; one value less, or a start at 1, needs one."""
+    with pytest.raises(ValueError, match=f"later must be from {low} to {high - 1}, "):
+        reading("later", "of it", low, high, 10, "V", is_added=True)
+    for first, last in ((low, high - 1), (1, 65535)):
+        assert reading("later", "of it", first, last, 10, "V", is_added=True).words == 1
 
 
 @pytest.mark.parametrize(

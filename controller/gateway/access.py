@@ -9,7 +9,7 @@ import re
 
 from aiohttp import HttpVersion10, HttpVersion11, web
 
-from controller.gateway.settings import Settings
+from controller.gateway.settings import Settings, sent_origin
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
@@ -51,13 +51,13 @@ class Access:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._origins = {origin.lower() for origin in settings.origins}
+        self._origins = settings.allowed_origins
 
     def check(self, request: web.Request) -> None:
         """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
         headers = request.headers
         host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
-        own = f"{'https' if self._settings.is_encrypted else 'http'}://{host}".lower()
+        own = sent_origin(f"{'https' if self._settings.is_encrypted else 'http'}://{host}")
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
         is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
         for is_refused, error, text in (
@@ -76,7 +76,7 @@ class Access:
                 "this Host is not allowed; see --allow-host",
             ),
             (
-                "Origin" in headers and origin.lower() not in {own, *self._origins},
+                "Origin" in headers and origin.lower() not in {own, *self._origins} - {""},
                 web.HTTPForbidden,
                 "this Origin is not allowed; see --allow-origin",
             ),

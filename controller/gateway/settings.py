@@ -12,8 +12,10 @@ from model.errors import InputError
 from registry.regular_file import regular_file
 
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{22,128}")  # valid in a URL and in a WebSocket subprotocol
-_HOST_NAME = re.compile(r"[A-Za-z0-9._-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]")
-_ORIGIN = re.compile(r"https?://[^/\s]+")
+_HOST_NAME = re.compile(r"[a-z0-9._-]{1,253}")
+_DEVIATING = re.compile("[\xdf\u03c2\u200c\u200d]")  # which Python's IDNA maps unlike browsers
+_ORIGIN = re.compile(r"(https?)://([^/?#@:\s\[\]]+|\[[^]]*\])(?::([0-9]{1,5}))?", re.IGNORECASE)
+_DEFAULT_PORTS = {"http": 80, "https": 443}
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _MAX_TOKEN_FILE = 4096  # bytes
 
@@ -76,7 +78,7 @@ class Settings:
             ),
             *(
                 (
-                    not _HOST_NAME.fullmatch(name),
+                    not sent_host(name),
                     "--allow-host must be a host name without port and without *, such as "
                     f"panel.local, 192.0.2.7 or [2001:db8::7], got {name!r}",
                 )
@@ -84,8 +86,10 @@ class Settings:
             ),
             *(
                 (
-                    not _ORIGIN.fullmatch(origin),
-                    f"--allow-origin must look like https://panel.example:8443, got {origin!r}",
+                    not sent_origin(origin),
+                    "--allow-origin must be scheme, host and perhaps port, such as "
+                    "https://panel.example:8443, with neither path nor slash behind them, "
+                    f"got {origin!r}",
                 )
                 for origin in self.origins
             ),
@@ -105,9 +109,14 @@ class Settings:
 
     @property
     def allowed_names(self) -> frozenset[str]:
-        """Allowed Hosts, without port and in lower case."""
+        """Allowed Hosts as browsers send them, without port."""
         own = () if ipaddress.ip_address(self.host).is_unspecified else (self.shown_host,)
-        return frozenset(name.lower() for name in (*_LOOPBACK_NAMES, *own, *self.extra_hosts))
+        return frozenset(map(sent_host, (*_LOOPBACK_NAMES, *own, *self.extra_hosts)))
+
+    @property
+    def allowed_origins(self) -> frozenset[str]:
+        """Allowed Origins as browsers send them."""
+        return frozenset(map(sent_origin, self.origins))
 
     @property
     def shown_host(self) -> str:
@@ -115,6 +124,35 @@ class Settings:
         if ipaddress.ip_address(self.host).is_unspecified:
             return self.extra_hosts[0]
         return f"[{self.host}]" if ":" in self.host else self.host
+
+
+def sent_host(name: str) -> str:
+    """Return a host as browsers send it, or "" for what is none.
+
+    In lower case, an international name in its ASCII form, an IPv6 address in brackets and in its
+    shortest form. Names whose ASCII form depends on the edition of IDNA are none: give that form.
+    """
+    try:
+        if name.startswith("[") and name.endswith("]") and "%" not in name:
+            return f"[{ipaddress.IPv6Address(name[1:-1])}]"
+        host = "" if _DEVIATING.search(name) else name.encode("idna").decode().lower()
+        if host.rpartition(".")[2].isdecimal():
+            return str(ipaddress.IPv4Address(host))
+    except ValueError:
+        return ""
+    return host if _HOST_NAME.fullmatch(host) else ""
+
+
+def sent_origin(text: str) -> str:
+    """Return an origin as browsers send it, without the scheme's own port; "" for what is none."""
+    match = _ORIGIN.fullmatch(text)
+    host = sent_host(match[2]) if match else ""
+    if match is None or not host:
+        return ""
+    scheme = match[1].lower()
+    port = int(match[3] or _DEFAULT_PORTS[scheme])
+    is_default = port == _DEFAULT_PORTS[scheme]
+    return f"{scheme}://{host}{'' if is_default else f':{port}'}" if 0 < port < 65536 else ""
 
 
 def read_token(path: Path) -> str:

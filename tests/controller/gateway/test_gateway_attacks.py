@@ -93,6 +93,7 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     "json as a parameter of the type": ({"media": "text/plain; application/json"}, {415}),
     "foreign origin": (origin("http://evil.example"), {403}),
     "origin null": (origin("null"), {403}),
+    "empty origin at an impossible port": (origin("") | {"host": ["localhost:99999"]}, {403}),
     "origin with another port": (origin("http://127.0.0.1:1"), {403}),
     "origin with another scheme": (origin("https://HOST"), {403}),
     "own and foreign origin": (origin("http://HOST", "http://evil.example"), {403}),

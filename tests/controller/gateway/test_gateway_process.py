@@ -240,6 +240,16 @@ SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "origin with a path": ({"origins": ("https://panel.example/x",)}, "--allow-origin"),
     "origin null": ({"origins": ("null",)}, "--allow-origin"),
     "any origin": ({"origins": ("*",)}, "--allow-origin"),
+    "host of an address with a zone": ({"extra_hosts": ("[fe80::1%eth0]",)}, "--allow-host"),
+    "host by the end of an address": ({"extra_hosts": ("192.168.7",)}, "--allow-host"),
+    **{
+        f"origin {each}": ({"origins": (each,)}, "--allow-origin must be scheme, host")
+        for each in (
+            *("https://panel.example/", "https://panel.example:0", "https://panel.example:65536"),
+            *("https://me@panel.example", "https://panel..example", "https://*.example"),
+            *("https://[panel]", "https://192.168.1", "https://stra\xdfe.example", "https://:443"),
+        )
+    },
 }
 
 
@@ -249,6 +259,29 @@ def test_settings_refuse_what_is_unsafe(name: str) -> None:
     given, words = SETTINGS[name]
     with pytest.raises(InputError, match=words):
         Settings(socket=Path("era.sock"), **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [
+        ("https://plate.local:443", "https://plate.local"),
+        ("http://plate.local:80", "http://plate.local"),
+        ("http://plate.local:443", "http://plate.local:443"),
+        ("HTTPS://Plate.Local:08443", "https://plate.local:8443"),
+        ("https://b\xfccher.example", "https://xn--bcher-kva.example"),
+        ("https://B\xdcCHER.example", "https://xn--bcher-kva.example"),
+        ("https://[2001:DB8:0:0::7]:443", "https://[2001:db8::7]"),
+    ],
+)
+def test_allowed_origin_is_as_browsers_send_it(given: str, sent: str) -> None:
+    """By the serialization of an origin (RFC 6454, 6.2) and the host parser of the URL standard."""
+    settings = Settings(
+        socket=Path("era.sock"),
+        origins=(given,),
+        extra_hosts=("B\xfccher.example", "[2001:DB8::07]"),
+    )
+    assert settings.allowed_origins == {sent}
+    assert settings.allowed_names >= {"xn--bcher-kva.example", "[2001:db8::7]"}
 
 
 def test_settings_show_and_allow_the_address_listened_on() -> None:

@@ -83,3 +83,21 @@ def test_pages_that_are_named_in_code_are_there() -> None:
     }
     assert len(named) > 10
     assert {(page, path) for page, path in named if not (ROOT / page).is_file()} == set()
+
+
+def test_decisions_that_are_named_are_there() -> None:
+    """A record that was folded into a later one is named nowhere, in code, tests or pages."""
+    folders = ["controller", "docs", "drivers", "firmware", "model", "sim", "tests"]
+    suffixes = {".py", ".c", ".h", ".md", ".yaml"}
+    files = [path for name in folders for path in (ROOT / name).rglob("*.*")]
+    named = {
+        (number, path.name)
+        for path in files
+        if path.suffix in suffixes and "_build" not in path.parts
+        for number in re.findall(
+            r"(?:\bdecisions?/|\bdecisions? |\[)(0\d{3})\b", path.read_text("utf-8")
+        )
+    }
+    assert len(named) > 50
+    there = {path.name[:4] for path in (ROOT / "docs" / "decisions").glob("0*.md")}
+    assert {(number, name) for number, name in named if number not in there} == set()

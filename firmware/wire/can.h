@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 //
-// A CANopen node (docs/decisions/0061-protocol-3.md, Wires): frames in, frames out, whatever carries
+// A CANopen node (docs/decisions/0088-protocol-4.md, Wires): frames in, frames out, whatever carries
 // them.
 //
 //     can_node.c      network management, heartbeats, events, emergencies

@@ -1,4 +1,4 @@
-"""The firmware's samples against the formulas of docs/decisions/0061 and 0088."""
+"""The firmware's samples against the formulas of docs/decisions/0088-protocol-4.md."""
 
 from collections.abc import Callable
 from pathlib import Path

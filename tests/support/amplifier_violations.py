@@ -1,6 +1,6 @@
 """What an amplifier must not do, each in a conversation written by hand.
 
-Messages are by docs/decisions/0061-protocol-3.md, rules by docs/reference/witness.md.
+Messages are by docs/decisions/0088-protocol-4.md, rules by docs/reference/witness.md.
 """
 
 from typing import Any

@@ -1,6 +1,6 @@
 """What a host must not do, each in a conversation written by hand.
 
-Messages are by docs/decisions/0061-protocol-3.md, rules by docs/reference/witness.md.
+Messages are by docs/decisions/0088-protocol-4.md, rules by docs/reference/witness.md.
 """
 
 import hand_written as hand

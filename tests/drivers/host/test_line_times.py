@@ -16,7 +16,7 @@ from drivers.wires.wire import Wire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of, grouped, layer, tone
 
-REACTION = 0.0099  # s; a reply may begin 10 ms after its request (docs/decisions/0061)
+REACTION = 0.0099  # s; a reply may begin 10 ms after its request (decision 0088)
 
 
 class Paced:

@@ -1,4 +1,4 @@
-"""The simulated amplifier of protocol 4 against docs/decisions/0061 and arithmetic by hand."""
+"""The simulated amplifier of protocol 4 against decision 0088 and arithmetic by hand."""
 
 import math
 

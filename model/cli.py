@@ -4,8 +4,6 @@ import typer
 
 from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
-from model.commands.design_cli import design_app
-from model.commands.figure_cli import figure_app
 from model.commands.plate_cli import materials, plate_app, show
 from model.commands.table_cli import query, table_app
 from model.commands.table_files_cli import build, contrast_map, export, plot
@@ -30,8 +28,6 @@ app = typer.Typer()
 app.command()(calibrate)
 app.add_typer(config_app, name="config")
 app.add_typer(plate_app, name="plate")
-app.add_typer(design_app)
-app.add_typer(figure_app)
 app.add_typer(table_app, name="table")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}

@@ -10,11 +10,7 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
-from sim.desk.impedance_cli import MeasureCommand
-from sim.desk.measure_cli import measure
-from sim.desk.outputs_cli import outputs
 from sim.desk.soft_amp_cli import port_option, soft_amp
-from sim.witness_cli import witness
 
 if TYPE_CHECKING:
     from sim.control.context import SimulationContext
@@ -24,10 +20,7 @@ if TYPE_CHECKING:
     from sim.process.view import PlateView
 
 app = typer.Typer(pretty_exceptions_enable=False)
-app.command()(witness)
 app.command("soft-amp")(soft_amp)
-app.command(cls=MeasureCommand)(measure)
-app.command()(outputs)
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2, LinkError: 3}
 """Exit status by class of error."""

@@ -1,4 +1,4 @@
-"""The commands of this package, of its share of the `era` command; here `report` and `gateway`."""
+"""The commands of this package, of its share of the `era` command; here `gateway`."""
 
 import os
 from pathlib import Path
@@ -7,12 +7,12 @@ from typing import Annotated
 import typer
 
 from controller.api.summaries import SUMMARIES
-from controller.cli.content import content_app
 from controller.cli.daemon import (
     DASHBOARD,
     DashboardCommand,
     arm,
     daemon,
+    layout_app,
     of_method,
     reload,
     status,
@@ -21,8 +21,6 @@ from controller.cli.daemon import (
     watch,
 )
 from controller.cli.demo import demo
-from controller.cli.layout import layout_app
-from controller.cli.play import play
 from controller.cli.rig import rig_app
 from drivers.by_hand import cli as by_hand
 from model.errors import InputError
@@ -93,46 +91,14 @@ def _host_and_port(text: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
-def report(
-    configs: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
-    ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
-        "era-report.zip"
-    ),
-    socket: Annotated[
-        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
-    ] = None,
-) -> None:
-    """Collect versions, files and daemon state for a bug report.
-
-    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
-    """
-    from controller.report.collect import collect, write_zip
-
-    for path in configs or ():
-        if not path.exists():
-            raise InputError(f"{path}: no such file; check its name and folder")
-    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
-    collected = collect(configs or [], socket=socket, home=home)
-    write_zip(output, collected)
-    for name, text in collected.files.items():
-        print(f"  {name}: {len(text)} characters")
-    for what in collected.missing:
-        print(f"  skipped: {what}")
-    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
-
-
 EXIT_STATUS = {**by_hand.EXIT_STATUS, InputError: 2}
 
 app = typer.Typer()
-app.add_typer(content_app, name="content")
 app.add_typer(layout_app, name="layout")
 app.add_typer(rig_app, name="rig")
 app.command(cls=DashboardCommand)(daemon)
 app.command(cls=DashboardCommand)(demo)
-for _command in (gateway, play, report, touch, watch):
+for _command in (gateway, touch, watch):
     app.command()(_command)
 for _name in ("disarm", "stop", "clear", "forget"):
     app.command(_name, help=SUMMARIES[_name])(of_method(_name))

@@ -313,3 +313,19 @@ def _print_state(era: "Client", *, as_json: bool) -> None:
     status = era.status()
     answer = {"state": status.state, "cause": status.cause, "remedy": status.remedy}
     print_report([headline(status.state, status.cause)], answer, as_json=as_json)
+
+
+layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts, or choose one.")
+
+
+@layout_app.command()
+def use(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="One of the daemon's layouts.")],
+    socket: Socket = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Use one of the daemon's layouts; what lasts at resting fingers follows it at once."""
+    with connected(socket) as era:
+        used = era.layout(name)
+    names = ", ".join(used.layouts)
+    print_report([f"layout {used.layout} of {names}"], used.model_dump(), as_json=as_json)

@@ -1,11 +1,10 @@
-"""`era layout`: how a surface layout will feel, and which one a daemon uses."""
+"""`era layout check`: how a surface layout will feel."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from controller.cli.daemon import Socket, connected
 from model.commands.options import JsonOption, print_report
 from model.counting import counted
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from controller.check.layout_check import CheckedEffect
     from model.arrays import FloatArray
 
-layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts, or choose one.")
+layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts.")
 
 FAILED = 1
 
@@ -83,19 +82,6 @@ def check(
     print_report(rows, answer, as_json=as_json)
     if problems:
         raise typer.Exit(FAILED)
-
-
-@layout_app.command()
-def use(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="One of the daemon's layouts.")],
-    socket: Socket = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Use one of the daemon's layouts; what lasts at resting fingers follows it at once."""
-    with connected(socket) as era:
-        used = era.layout(name)
-    names = ", ".join(used.layouts)
-    print_report([f"layout {used.layout} of {names}"], used.model_dump(), as_json=as_json)
 
 
 _SHOWN_FROM = 0.05  # dB

@@ -1,7 +1,8 @@
 """The `era` command: assembles the commands of all packages and maps errors to exit statuses.
 
 A package provides commands by a module with `app`, a typer application whose commands appear under
-`era`, and `EXIT_STATUS`, the exit status by error class.
+`era`, those of a group beside others of the same group, and `EXIT_STATUS`, the exit status by error
+class.
 """
 
 import errno
@@ -25,7 +26,10 @@ from registry.plugins import failed_plugin, failure_text
 from registry.posix import posix_needed
 from registry.wording import reworded
 
-COMMANDS = ("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli")
+COMMANDS = (
+    *("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli"),
+    "era_haptics.lab.cli",
+)
 """Modules with commands, by name: packages beside this one do not import each other."""
 
 SECTIONS = {
@@ -155,7 +159,10 @@ def load_commands(modules: Iterable[str] = COMMANDS) -> tuple[TyperGroup, ExitSt
     for name in modules:
         module = import_module(name)
         statuses.update(module.EXIT_STATUS)
-        group.commands.update(_group(module.app).commands)
+        for word, command in _group(module.app).commands.items():
+            known = group.commands.setdefault(word, command)
+            if isinstance(known, TyperGroup) and isinstance(command, TyperGroup):
+                known.commands.update(command.commands)
     return group, statuses
 
 

@@ -13,7 +13,7 @@ import typer
 from drivers.errors import CommandError, CommandRefused, DriverError, FrameError, LinkError
 
 if TYPE_CHECKING:
-    from drivers.judge.asking import CheckResult
+    pass
 
 _T = TypeVar("_T")
 
@@ -95,7 +95,7 @@ def discover(
     """List serial ports, CAN interfaces and the amplifiers on them."""
     from drivers.by_hand.places import discover as discovered
 
-    result, problems = _run(discovered(url or [], probes=probe, slcan=slcan), trace)
+    result, problems = run(discovered(url or [], probes=probe, slcan=slcan), trace)
     if json_:
         print(json.dumps(result))
     else:
@@ -198,68 +198,8 @@ def address(
 _add_plain("clear", "Acknowledge a stop or fault. Leaves the amplifier disarmed.")
 
 
-@amp.command()
-def conformance(
-    url: Url,
-    write: Annotated[
-        bool, typer.Option("--write", help="Drive the outputs too, without confirmation.")
-    ] = False,
-    level: Annotated[
-        float | None,
-        typer.Option(
-            metavar="LEVEL",
-            min=0.1,  # below it fractions are too close together for measured levels
-            max=1.0,
-            show_default=False,
-            help="Level at which channels are driven, of full level; 0.2 if not given.",
-        ),
-    ] = None,
-    trace: Trace = None,
-    json_: Json = False,
-) -> None:
-    """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
-    from drivers.by_hand.actions import leave
-    from drivers.judge.asking import LEVEL, judge
-
-    level = LEVEL if level is None else level
-    show = (lambda result: None) if json_ else _show_result
-    report = _run(judge(url, drives=False, level=level, on_result=show), trace)
-    if not write and not json_ and sys.stdin.isatty():
-        write = typer.confirm(
-            f"{report.left} more checks arm the amplifier and drive its channels at {level:.0%} of "
-            "full level. Other addresses of the line are only asked whether they reply; if one "
-            "does, what is for all is left out. Continue?"
-        )
-    if write:
-        more = judge(url, drives=True, level=level, on_result=show, before=report)
-        try:
-            report = _run(more, trace)
-        except (KeyboardInterrupt, LinkError):
-            print(f"era: ended: {_run(leave(url), None)}", file=sys.stderr)
-            raise
-    if json_:
-        print(json.dumps(report.to_json()))
-    else:
-        print(report.summary)
-        if report.left and report.overall != "failed":
-            print(f"Next: era amp conformance {shlex.quote(url)} --write")
-    if report.overall == "failed":
-        raise typer.Exit(1)
-    if write and report.overall == "incomplete":
-        raise typer.Exit(EXIT_STATUS[LinkError])
-
-
-def _show_result(result: "CheckResult") -> None:
-    mark = result.result.value.replace("_", " ")
-    print(f"{mark.upper() if mark == 'failed' else mark:<7}  It {result.check.requirement}.")
-    if result.reason:
-        print(f"         {result.reason} ({result.check.place})")
-    for name in ("sent", "came"):
-        if text := getattr(result.finding, name):
-            print(f"         {name}: {text}")
-
-
-def _run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:
+def run(work: Coroutine[Any, Any, _T], trace: Path | None, *, needs_trace: bool = True) -> _T:
+    """Run what talks to an amplifier, traced to a file if one is named; return its result."""
     import asyncio
 
     from drivers.trace import tracing
@@ -283,7 +223,7 @@ def _act(
     from drivers.by_hand import actions
 
     work = getattr(actions, action)(*arguments)
-    result: dict[str, Any] = _run(work, trace, needs_trace=needs_trace)
+    result: dict[str, Any] = run(work, trace, needs_trace=needs_trace)
     if json_:
         print(json.dumps(result))
         return result

@@ -22,12 +22,12 @@ from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import STATES
+from era_haptics.lab.cli import app
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
-from sim.cli import app
 from sim.far_ends.opening import Wire
 from sim.witness_relay import parse_endpoint, relays
 from virtual_loop import in_virtual_time

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from controller.check.content_check import check_content, kept_shares
 from controller.check.simulated_touch import loaded_plate
-from controller.cli.commands import app
 from controller.content.pattern import Pattern, Transient
+from era_haptics.lab.cli import app
 from model.errors import InputError
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, detection_threshold, over_threshold

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 from controller.check import layout_check, layout_together
 from controller.check.layout_check import CheckedEffect, check_layout
 from controller.check.representative import strongest_target
-from controller.cli.commands import app
 from controller.cli.main import run as run_era
 from controller.content.pattern import Pattern
 from controller.effects.buzz import Buzz
@@ -30,6 +29,7 @@ from controller.effects.layout_file import load_layout
 from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.texture import Texture
+from era_haptics.lab.cli import app
 from long_form import in_turn
 from model.config.kinds import KINDS
 from model.config.shapes import Circle, Rectangle

@@ -12,11 +12,12 @@ from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner, Result
 
 from drivers.by_hand.blocking import BlockingAmplifier
-from drivers.by_hand.cli import app
+from drivers.by_hand.cli import app as amp_app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import READINGS, STATUS_FLAGS
+from era_haptics.lab.cli import app as lab_app
 from model.rig.file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
@@ -97,7 +98,7 @@ COMMON = {
 
 def invoke(*args: str) -> Result:
     """Run `era amp` with these arguments."""
-    return CliRunner().invoke(app, ["amp", *args])
+    return CliRunner().invoke(lab_app if args[0] == "conformance" else amp_app, ["amp", *args])
 
 
 def result_of(*args: str) -> dict[str, Any]:

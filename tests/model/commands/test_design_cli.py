@@ -9,6 +9,7 @@ import yaml
 from typer.testing import CliRunner
 
 import era_haptics as era
+from era_haptics.lab.cli import app as lab_app
 from model.cli import app
 from model.config.document import read_document
 from model.design import problem, search
@@ -32,7 +33,7 @@ def small(monkeypatch):
 
 def design(*arguments: str):
     """Run `era design` in this process."""
-    return CliRunner().invoke(app, ["design", RIG, "--workers", "1", *arguments])
+    return CliRunner().invoke(lab_app, ["design", RIG, "--workers", "1", *arguments])
 
 
 def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
+from era_haptics.lab.cli import app
 from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.sensor_file import WiredSensor
@@ -21,7 +22,6 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from sim.cli import app
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, matched, tone
 

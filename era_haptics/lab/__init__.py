@@ -1,0 +1,1 @@
+"""What people measure, judge and design with: it imports all other packages, none imports it."""

@@ -1,0 +1,29 @@
+"""The lab's share of the `era` command: to measure, judge, design, check and report."""
+
+import typer
+
+from controller.cli.content import content_app
+from controller.cli.layout import layout_app
+from controller.cli.play import play
+from drivers.by_hand.cli import EXIT_STATUS as EXIT_STATUS
+from era_haptics.lab.conformance_cli import conformance
+from era_haptics.lab.report_cli import report
+from model.commands.design_cli import design_app
+from model.commands.figure_cli import figure_app
+from sim.desk.impedance_cli import MeasureCommand
+from sim.desk.measure_cli import measure
+from sim.desk.outputs_cli import outputs
+from sim.witness_cli import witness
+
+amp = typer.Typer()
+amp.command()(conformance)
+
+app = typer.Typer()
+app.add_typer(amp, name="amp")
+app.add_typer(content_app, name="content")
+app.add_typer(layout_app, name="layout")
+app.add_typer(design_app)
+app.add_typer(figure_app)
+for _command in (play, report, witness, outputs):
+    app.command()(_command)
+app.command(cls=MeasureCommand)(measure)

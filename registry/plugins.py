@@ -27,9 +27,10 @@ class PluginRegistry(Generic[_T]):
     """Objects of one kind by name.
 
     what: the kind, for error messages; group: of its entry points; base: what these must be derived
-    from, or, if is_instance, be an instance of; error: the class of errors raised; own: objects of
-    this project without an entry point; called: returns the name of an object, if it has one; hint:
-    the end of the message for an unknown name. If the name is the scheme of a URL, ending: what
+    from, or, if is_instance, be an instance of; error: the class of errors raised; own: the objects
+    of this project, each itself or, of a module that imports the registry or is above it, as
+    "module:object"; called: returns the name of an object, if it has one; hint: the end of the
+    message for an unknown name. If the name is the scheme of a URL, ending: what
     follows the scheme; example: such a URL.
     """
 
@@ -39,7 +40,7 @@ class PluginRegistry(Generic[_T]):
     _: KW_ONLY
     error: type[Exception]
     is_instance: bool = False
-    own: Mapping[str, _T] = field(default_factory=dict)
+    own: Mapping[str, _T | str] = field(default_factory=dict)
     called: Callable[[_T], str] | None = None
     hint: str = ""
     ending: str = ""
@@ -66,14 +67,17 @@ class PluginRegistry(Generic[_T]):
                 f"{_quoted(within)}{self.what} {name}{self.ending} is claimed by several packages "
                 f"({', '.join(packages)}); uninstall all but one, or rename theirs"
             )
-        return self.own[name] if name in self.own else self._loaded(points[0], within)
+        own = self.own.get(name)
+        if own is None:
+            return self._loaded(points[0], within)
+        return EntryPoint(name, own, self.group).load() if isinstance(own, str) else own
 
     def make(self: "PluginRegistry[Callable[[str], _Made]]", url: str) -> _Made:
         """Call the class that the scheme of a URL names with the URL; raises as `find` does.
 
         The class may raise `error` for a URL that it refuses. Schemes are case-insensitive.
         """
-        scheme, ending, _ = url.partition(self.ending)
+        scheme, ending, rest = url.partition(self.ending)
         if not ending:
             raise self.error(
                 f"{url!r} must begin with the scheme of a {self.what} and {self.ending}, "
@@ -82,14 +86,17 @@ class PluginRegistry(Generic[_T]):
         name = scheme.lower()
         maker = self.find(name, within=url)
         if name in self.own:
-            return maker(url)
+            return maker(name + ending + rest)
         (point,) = plugins_of(self.group)[name]
         with self._attributed(point, url, but=(self.error,)):
-            return maker(url)
+            return maker(name + ending + rest)
 
     def _known(self) -> str:
         spelled = ", ".join(name + self.ending for name in self.names())
-        return f"known are {spelled}{self.hint}"
+        return (
+            f"known are {spelled}{self.hint}; one of a package needs an entry point in "
+            f"{self.group}, which is read when that package is installed"
+        )
 
     def _loaded(self, point: EntryPoint, within: str) -> _T:
         with self._attributed(point, within):
@@ -188,8 +195,7 @@ def _of_others(path: tuple[str, ...]) -> dict[str, EntryPoint]:
         if group.startswith(_GROUP_PREFIX)
         for point in entry_points(group=group)
     ]
-    ours = {point.module.partition(".")[0] for point in points if _package(point) == _OURS}
-    return {top: point for point in points if (top := point.module.partition(".")[0]) not in ours}
+    return {point.module.partition(".")[0]: point for point in points if _package(point) != _OURS}
 
 
 def _package(point: EntryPoint) -> str:

@@ -7,6 +7,8 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
+from inspect import isabstract
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.layout_file import load_layout
 from controller.effects.player import EffectPlayer
 from controller.sources.contacts import Contact, ContactKey
-from controller.sources.touch import open_source
+from controller.sources.touch import _SOURCES, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
@@ -353,6 +355,33 @@ def test_installation_of_an_older_version_of_ours_is_no_other_package(install: I
     assert effects.look_up(effects.own[0]) is effects.own[1]
 
 
+OWN_URLS = ("tuio:", "TUIO:4000", "evdev:/dev/input/event5"), ("sim://rig.yaml", "SIM://rig.yaml")
+
+
+def test_parts_of_the_project_need_no_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new one is known at once, without installing the project anew; by a scheme in any case."""
+    monkeypatch.setattr("registry.plugins.plugins_of", lambda group: {})
+    for kind in KINDS:
+        assert is_made_by(kind.look_up(kind.own[0]), kind.own[1])
+    for urls, open_url in zip(OWN_URLS, (open_source, address_of), strict=True):
+        made = {type(open_url(url)).__name__ for url in urls}
+        assert made <= {"TuioSource", "EvdevSource", "SimulatedAddress"}
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+    assert "entry-points" not in project["project"]
+
+
+def test_every_touch_source_of_the_project_is_registered() -> None:
+    """Each class of controller/sources that can run, under a scheme."""
+    for path in (Path(__file__).parents[1] / "controller" / "sources").glob("*.py"):
+        import_module(f"controller.sources.{path.stem}")
+    sources, bases = [], [*TouchSource.__subclasses__()]
+    for base in bases:
+        bases += base.__subclasses__()
+        if base.__module__.startswith("controller.sources") and not isabstract(base):
+            sources.append(f"{base.__module__}:{base.__name__}")
+    assert sorted(sources) == sorted(_SOURCES.own.values()), "add it to controller/sources/touch.py"
+
+
 @of_every_kind
 def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None:
     """A package's name as well as one of ours; all known names are listed."""
@@ -364,6 +393,8 @@ def test_unknown_name_suggests_a_known_one(kind: Kind, install: Install) -> None
     assert f"'pigeonri{ending}'" in unknown
     assert unknown.endswith(f"did you mean pigeonry{ending}")
     assert {f"pigeonry{ending}", f"{kind.own[0]}{ending}"} <= set(re.split("[,;] ", known))
+    group = f"era_haptics.{kind.group}"
+    assert known.endswith(f"entry point in {group}, which is read when that package is installed")
     with pytest.raises(kind.error, match=f"'x{{40}}{ending}'; known are "):
         kind.look_up("x" * 500)
 

@@ -27,8 +27,6 @@ _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     error=InputError,
     own={each.ending: each for each in BUILT_IN},
     called=attrgetter("ending"),
-    hint="; one of a package needs it installed, with an entry point in "
-    "era_haptics.content_formats",
 )
 
 _REFUSED = {

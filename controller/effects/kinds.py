@@ -23,7 +23,6 @@ _KINDS: PluginRegistry[type[Effect]] = PluginRegistry(
     error=InputError,
     own={each.kind: each for each in BUILT_IN},
     called=attrgetter("kind"),
-    hint="; one of a package needs it installed, with an entry point in era_haptics.effects",
 )
 
 

@@ -1,1 +1,1 @@
-"""Touch sources: a file each, found through the entry-point group era_haptics.touch_sources."""
+"""Touch sources: a file each, found by the scheme of their URL."""

@@ -90,6 +90,10 @@ _SOURCES: PluginRegistry[Callable[[str], TouchSource]] = PluginRegistry(
     "era_haptics.touch_sources",
     TouchSource,
     error=InputError,
+    own={
+        "evdev": "controller.sources.evdev:EvdevSource",
+        "tuio": "controller.sources.tuio:TuioSource",
+    },
     ending=":",
     example="tuio:127.0.0.1:3333",
 )

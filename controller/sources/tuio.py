@@ -6,24 +6,21 @@ Specification". Numbers count by their value, whatever their type; what follows 
 are needed is ignored. A malformed message is counted, and the others of its bundle are read.
 """
 
-import asyncio
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
-from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
-from controller.sources.datagrams import MAX_DATAGRAM, Datagram, Peer, listen
+from controller.sources.datagrams import Datagram, Peer
 from controller.sources.osc import Argument, OscError, osc_messages, read_message
 from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame, TouchSource, number_option
-from model.errors import InputError
+from controller.sources.touch import Touch, TouchFrame
+from controller.sources.udp_source import UdpSource
 from registry import clock
 
 ADDRESS = "/tuio/2Dcur"
-DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 3333  # registered for TUIO
 
 # What is not served, of TUIO 1.1 and 2.0; a custom profile is another address.
 _PROFILE = re.compile(r"/(?:tuio/)?(tuio2|(?:2|25|3)D(?:cur|obj|blb))(?=/|$)")
@@ -36,11 +33,11 @@ _SOURCE = b"source\0\0"  # OSC string, NUL-padded
 # Like the reference client, a sequence number that falls by more than 100 is a restarted sender. A
 # restart within the first 100 frames shows by the pause: reordered frames are never this late.
 _LATE_FRAMES = 100
-RESTART_PAUSE = 0.5
-"""Time [s] without a datagram after which a sender at another port is the one of before."""
 # Senders such as the reference implementation are silent while fingers rest; some repeat the alive
 # message once a second.
 DEFAULT_TIMEOUT = 3.0  # s
+RESTART_PAUSE = 0.5
+"""Time [s] without a datagram after which a sender at another port is the one of before."""
 
 MUTE_AFTER = 10.0
 """Time [s] without cursors after which a sender that should be heard is mute."""
@@ -304,25 +301,21 @@ def _is_complete_bundle(datagram: bytes) -> bool:
     return bundle.alive is not None and set(bundle.alive) <= bundle.positions.keys()
 
 
-class TuioSource(TouchSource):
-    """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333).
+class TuioSource(UdpSource):
+    """Listens for TUIO at `tuio:HOST:PORT`, `tuio:PORT` or `tuio:` (127.0.0.1:3333)."""
 
-    A touch table on another machine needs an explicit HOST, because TUIO has no authentication.
-    `?timeout=SECONDS`: how long a resting finger stays without a bundle. Raises InputError for any
-    other URL, and in `run` if the port is taken.
-    """
+    default_port = "3333"  # registered for TUIO
+    default_timeout = DEFAULT_TIMEOUT
 
-    def __init__(self, url: str) -> None:
-        address, _, options = url.partition("?")
-        self.host, self.port = _host_and_port(address)
-        self._url = url
-        self._reader = TuioReader(self.rejects, timeout=_timeout(url, options))
-        self._opened = math.inf  # s; when the port was bound
+    @cached_property
+    def _reader(self) -> TuioReader:
+        """Made once a daemon has set its own counter of rejects."""
+        return TuioReader(self.rejects, timeout=self.timeout)
 
     @property
     def problem(self) -> str | None:
         """Why no cursors come although the port is bound, and what to do."""
-        if not self._reader.is_mute(since=self._opened, now=clock.now()):
+        if not self._reader.is_mute(since=self.opened, now=clock.now()):
             return None
         others = ", ".join(sorted(self._reader.others))
         return (
@@ -331,57 +324,10 @@ class TuioSource(TouchSource):
             "send TUIO 1.1 cursors to this address"
         )
 
-    async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
-        """Deliver a frame per bundle until cancelled."""
-        self._reader.rejects = self.rejects
+    def read(self, datagram: bytes, peer: Peer, arrived: float) -> TouchFrame | None:
+        """Return the frame of a bundle."""
+        return self._reader.read(datagram, peer, now=arrived)
 
-        def received(datagram: bytes, peer: Peer, arrived: float) -> None:
-            frame = self._reader.read(datagram, peer, now=arrived)
-            if frame is not None:
-                deliver(frame)
-
-        try:
-            endpoint = await listen(
-                self.host,
-                self.port,
-                received,
-                max_size=MAX_DATAGRAM,
-                drop_superseded=without_superseded,
-            )
-        except OSError as error:
-            raise InputError(
-                f"touch source {self._url}: cannot bind UDP {self.host}:{self.port} "
-                f"({error.strerror}); stop the program that uses it, or choose another port or "
-                "address of this machine"
-            ) from error
-        self._opened = clock.now()
-        try:
-            await asyncio.get_running_loop().create_future()
-        finally:
-            endpoint.close()
-
-
-def _timeout(url: str, options: str) -> float:
-    """Return the timeout option [s] of a URL; raises InputError."""
-    timeout = number_option(options, "timeout", default=DEFAULT_TIMEOUT)
-    if not CONTACT_TIMEOUT <= timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
-        raise InputError(
-            f"touch source {url}: options must be ?timeout=SECONDS from {CONTACT_TIMEOUT:g} to "
-            f"{MAX_CONTACT_TIMEOUT:g}, got ?{options}"
-        )
-    return timeout
-
-
-def _host_and_port(url: str) -> tuple[str, int]:
-    """Return host and port of `tuio:HOST:PORT`; raises InputError."""
-    rest = url.removeprefix("tuio:").removeprefix("//")
-    host, _, port = rest.rpartition(":")
-    number = int(port) if port.isascii() and port.isdecimal() and len(port) < 6 else -1
-    if not port:
-        number = DEFAULT_PORT
-    if not url.startswith("tuio:") or not 0 <= number < 65536:
-        raise InputError(
-            "touch source must be tuio:HOST:PORT with a port from 0 to 65535, such as "
-            f"tuio:127.0.0.1:3333, got {url}"
-        )
-    return host.strip("[]") or DEFAULT_HOST, number
+    def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
+        """Return those that the newest bundle of their sender does not supersede."""
+        return without_superseded(waiting)

@@ -27,6 +27,7 @@ _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
         "modbus+tcp": ModbusAddress,
         "serial": SerialAddress,
         "serial+tcp": SerialAddress,
+        "sim": "sim.memory_line:SimulatedAddress",
     },
     ending="://",
     example="serial:///dev/ttyUSB0?baud=921600",

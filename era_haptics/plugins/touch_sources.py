@@ -7,6 +7,7 @@ from controller.sources.contacts import Change, Contact, ContactKey, ContactTrac
 from controller.sources.datagrams import Datagram, Datagrams, listen
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
+from controller.sources.udp_source import UdpSource
 from model.errors import InputError
 from registry.clock import now
 
@@ -22,6 +23,7 @@ __all__ = [
     "Touch",
     "TouchFrame",
     "TouchSource",
+    "UdpSource",
     "listen",
     "now",
     "open_source",

@@ -19,7 +19,8 @@ class Dimension:
     """A kind of value: its name with article, its SI unit, and an example to write.
 
     factors: of common units, as pint has them: loading pint doubles a command's start. Any other
-    unit of the dimension is found by pint.
+    unit of the dimension is found by pint. A bare number of a unit with a zero of its own, such as
+    degC, counts from there, as other units with one do; elsewhere these are refused.
     """
 
     name: str
@@ -59,6 +60,7 @@ ANGLE = Dimension(
 )
 RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
 SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
+TEMPERATURE = Dimension("a temperature", "degC", "23 °C or 296 K", {"degC": "1", "°C": "1"})
 LEVEL = Dimension("a level", "dB", "14 dB", {"dB": "1"})
 RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
 
@@ -66,7 +68,7 @@ RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
 # by itself would compute `9**9**9 m`.
 _MAX_LENGTH = 40
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,2})?"
-_FACTOR = r"[A-Za-zµμΩ%]+(?:(?:\^|\*\*)-?\d|[²³])?"
+_FACTOR = r"[A-Za-zµμΩ%°]+(?:(?:\^|\*\*)-?\d|[²³])?"
 _UNIT = rf"{_FACTOR}(?:(?:\s*[*/·]\s*|\s+){_FACTOR}){{0,4}}"
 _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
 
@@ -98,29 +100,39 @@ def _parse(text: str, dimension: Dimension) -> float:
     if unit is None:
         return _to_float(number, dimension)
     known = dimension.factors.get(unit)
-    factor = unit_factor(text, unit, dimension) if known is None else Decimal(known)
-    return _to_float(Decimal(number) * factor, dimension)
+    factor, zero = (Decimal(known), 0) if known else unit_scale(text, unit, dimension)
+    return _to_float(Decimal(number) * factor + zero, dimension)
 
 
-def unit_factor(text: str, unit: str, dimension: Dimension) -> Decimal:
-    """The factor from a unit to the SI unit of a dimension, by pint.
+def unit_scale(text: str, unit: str, dimension: Dimension) -> tuple[Decimal, Decimal]:
+    """The factor from a unit to the SI unit of a dimension, and what its 0 is there, by pint.
 
     The base units must be the same, not just the dimension: revolutions per minute and rad/s have
-    the dimension of Hz.
+    the dimension of Hz. A unit whose 0 is not 0 of the SI unit, as of degC and K, is refused where
+    that has no zero of its own, and a logarithmic one, which has no factor, everywhere.
     """
     import pint
 
     registry = _registry()
     try:
-        factor, base = registry.get_base_units(registry.parse_units(unit.replace("·", "*")))
-        _, expected = registry.get_base_units(registry.parse_units(dimension.unit))
+        given, own = (
+            registry.parse_units(each.replace("·", "*")) for each in (unit, dimension.unit)
+        )
+        factor, base = registry.get_base_units(given)
+        _, expected = registry.get_base_units(own)
+        zero, start = (
+            Decimal(str(registry.Quantity(Decimal(0), each).to_base_units().magnitude))
+            for each in (given, own)
+        )
     except pint.UndefinedUnitError as error:
         raise _refusal(text, dimension, f"has the unknown unit {unit}") from error
-    except (pint.PintError, ArithmeticError, AttributeError, TypeError, ValueError) as error:
+    except TypeError as error:  # of Decimal, for a logarithm
+        raise _refusal(text, dimension, f"is not {dimension.name}") from error
+    except (pint.PintError, ArithmeticError, AttributeError, ValueError) as error:
         raise _refusal(text, dimension, f"has the invalid unit {unit}") from error
-    if base != expected:
+    if base != expected or (zero and not start):
         raise _refusal(text, dimension, f"is not {dimension.name}")
-    return Decimal(str(factor))
+    return Decimal(str(factor)), zero - start
 
 
 @cache

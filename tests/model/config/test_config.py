@@ -25,9 +25,10 @@ from model.config.units import (
     MODULUS,
     RATIO,
     STIFFNESS,
+    TEMPERATURE,
     Dimension,
     quantity,
-    unit_factor,
+    unit_scale,
 )
 from model.errors import InputError
 
@@ -301,8 +302,49 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
         for each in vars(units).values()
         if isinstance(each, Dimension)
         for unit in each.factors
+        if unit != each.unit
     ],
 )
 def test_common_factors_are_those_of_pint(dimension: Dimension, unit: str) -> None:
     """They agree to the last digit, so that it does not matter which of the two is used."""
-    assert unit_factor(f"1 {unit}", unit, dimension) == Decimal(dimension.factors[unit])
+    assert unit_scale(f"1 {unit}", unit, dimension) == (Decimal(dimension.factors[unit]), 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "celsius"),
+    [
+        *(("300 K", 26.85), ("0 K", -273.15), ("23 °C", 23.0), ("-5.5 degC", -5.5), ("20", 20.0)),
+        *(("86 degF", 30.0), ("-40 °F", -40.0), ("491.67 degR", 0.0), ("300000 mK", 26.85)),
+    ],
+)
+def test_temperature_counts_from_the_zero_of_its_unit(text: str, celsius: float) -> None:
+    """By the definitions of the scales: 0 degC is 273.15 K, 32 degF and 491.67 degR."""
+    assert quantity(text, TEMPERATURE) == celsius
+
+
+@pytest.mark.parametrize(
+    ("text", "dimension"),
+    [
+        ("5 degC", Dimension("a temperature difference", "K", "5 K")),
+        ("9 degF", Dimension("a temperature difference", "K", "5 K")),
+        ("3 degC", LENGTH),
+        ("30 dBm", units.POWER),
+        ("3 dB", units.RATIO),
+        ("3 Np", units.LEVEL),
+        ("2 %", units.LEVEL),
+        ("20 dB", TEMPERATURE),
+    ],
+)
+def test_unit_with_a_zero_of_its_own_is_refused_elsewhere(text: str, dimension: Dimension) -> None:
+    """By a factor 30 dBm, 1 W, would be 0.03 W, and 3 Np, 26 dB, would be 3 dB."""
+    with pytest.raises(
+        InputError, match=rf"^'{text}' .*; write .* for example {dimension.example}"
+    ):
+        quantity(text, dimension)
+
+
+def test_unit_per_degree_counts_degrees_of_difference() -> None:
+    """0.05 % per degC is as many per K, and 0.09 % of it per 1.8 degF."""
+    slope = Dimension("a temperature coefficient", "1/K", "0.05 %/K")
+    assert quantity("0.05 %/degC", slope) == quantity("0.05 %/K", slope) == 0.0005
+    assert quantity("0.05 %/degF", slope) == pytest.approx(0.0009)

@@ -63,13 +63,13 @@ control_socket.connect(str(folder / "control"))
 lines = panel.enter_context(control_socket.makefile("rw", encoding="utf-8"))
 
 
-def ask_plate(**question):
+def query_plate(**question):
     """Send a request to the simulated plate and return its reply."""
     print(json.dumps(question), file=lines, flush=True)
     return json.loads(lines.readline())
 
 
-ask_plate(op="fingers", fingers={"target": target, "quiet": quiet})
+query_plate(op="fingers", fingers={"target": target, "quiet": quiet})
 
 # %% [markdown]
 """
@@ -135,7 +135,7 @@ with client.armed("example"):
     hold(client, [quiet, target], 1.0)
     status = client.status()
     now = time.monotonic()  # one clock for all processes of a machine
-    felt = ask_plate(op="felt", since_s=now - 0.3, until_s=now - 0.05)["fingers"]
+    felt = query_plate(op="felt", since_s=now - 0.3, until_s=now - 0.05)["fingers"]
     client.touch([])
 if not status.drive:
     sys.exit(f"nothing was played: {status.silence_reason or status.cause}")

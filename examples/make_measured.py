@@ -102,12 +102,12 @@ def record_responses(
     values = np.empty((len(frequencies), len(rig.eras), len(sensors)), dtype=complex)
     for number, era in enumerate(rig.eras):
         for row, frequency in enumerate(frequencies.tolist()):
-            begin, omega, base = plant.time, 2 * math.pi * frequency, 0.1 * era.stroke
+            start, omega, base = plant.time, 2 * math.pi * frequency, 0.1 * era.stroke
             # The phase is that of the plate's clock.
-            tone = Term(begin, math.inf, omega, base * np.exp(1j * omega * begin))
+            tone = Term(start, math.inf, omega, base * np.exp(1j * omega * start))
             plant.set_input(number, [tone])
-            plant.skip(begin + SETTLE)
-            times, truth = plant.advance(begin + SETTLE + RECORD, sample_rate=RATE, shapes=shapes)
+            plant.skip(start + SETTLE)
+            times, truth = plant.advance(start + SETTLE + RECORD, sample_rate=RATE, shapes=shapes)
             read = readings(sensors, truth, sample_rate=RATE, rng=rng)
             values[row, number] = fit_tones(times, read, [frequency], with_offset=True)[0] / base
         plant.set_input(number, [])

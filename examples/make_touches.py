@@ -44,7 +44,7 @@ THREE_PEOPLE = [
 ]
 
 
-def draw_places(count: int, rng: np.random.Generator) -> np.ndarray:
+def draw_positions(count: int, rng: np.random.Generator) -> np.ndarray:
     """Places [m] (count, 2), each at least APART from the others."""
     while True:
         places = rng.uniform(MARGIN, PLATE - MARGIN, (count, 2))
@@ -61,7 +61,7 @@ def one_person(rng: np.random.Generator) -> list[tuple]:
         start = up + (REST if group in AT_ONCE else PAUSE)
         apart = 0.0 if group in AT_ONCE else HOLD
         up = start + (count - 1) * apart + HOLD
-        for number, place in enumerate(draw_places(count, rng) / PLATE):
+        for number, place in enumerate(draw_positions(count, rng) / PLATE):
             paths.append(((start + number * apart, up), [place, place]))
     return paths
 

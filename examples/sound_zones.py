@@ -42,10 +42,10 @@ def pressure_matching(bright, dark, loading=1e-3):
     Its weights are regularised least squares (Poletti, 125th AES Convention, 2008).
     """
     zones = np.concatenate([bright, dark], axis=2)
-    wanted = np.repeat([1.0, 0.0], [bright.shape[2], dark.shape[2]])
+    pressures = np.repeat([1.0, 0.0], [bright.shape[2], dark.shape[2]])
     power = zones.conj() @ zones.swapaxes(1, 2)
     floor = loading * np.trace(power, axis1=1, axis2=2)[:, None, None] * np.eye(power.shape[1])
-    return np.linalg.solve(power + floor, zones.conj() @ wanted[:, None])[:, :, 0]
+    return np.linalg.solve(power + floor, zones.conj() @ pressures[:, None])[:, :, 0]
 
 
 METHODS = {"contrast control": contrast_control, "pressure matching": pressure_matching}

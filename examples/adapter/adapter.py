@@ -151,18 +151,18 @@ class Adapter:
             amplifier.is_lost = False
         now = self._loop.time()
         amplifier.tick(now)
-        wanted = [tone_of(voices, now) for voices in amplifier.playback.all_voices]
-        for channel, tone in enumerate(wanted):
+        requested = [tone_of(voices, now) for voices in amplifier.playback.all_voices]
+        for channel, tone in enumerate(requested):
             if tone != self._sent[channel]:
                 self._device.play(channel, tone)
                 amplitude = 0.0 if tone is None else tone.amplitude
                 levels = amplifier.device_levels
                 levels[channel] = max(levels[channel], amplitude)  # until it is confirmed
-        if wanted != self._sent:
+        if requested != self._sent:
             async with asyncio.timeout(REPLY):
                 await self._device.send()
-            self._sent = wanted
-            amplifier.device_levels = [0.0 if one is None else one.amplitude for one in wanted]
+            self._sent = requested
+            amplifier.device_levels = [0.0 if one is None else one.amplitude for one in requested]
         self._changed.clear()
         is_moving = any(
             voice.transition.end > now

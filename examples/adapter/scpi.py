@@ -32,13 +32,13 @@ class Generator:
             raise ValueError(f"full voltage must be up to {MAX_PEAK:g} V, got {full:g} V")
         self._address, self._full = (host, port), full
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
-        self._wanted: dict[int, Tone | None] = {}
+        self._requested: dict[int, Tone | None] = {}
         self._playing: dict[int, Tone | None] = {}
         self._number = 0
 
     def play(self, channel: int, tone: Tone | None) -> None:
         """Note the tone of a channel, None for silence."""
-        self._wanted[channel] = tone
+        self._requested[channel] = tone
 
     async def send(self) -> None:
         """Set frequencies, voltages and phases; tones start together unless one goes on.
@@ -46,7 +46,7 @@ class Generator:
         PHAS:SYNC restarts both channels: beside a tone that goes on there is none.
         """
         words, starts = [], False
-        for channel, tone in self._wanted.items():
+        for channel, tone in self._requested.items():
             source, before = f"SOUR{channel + 1}", self._playing.get(channel)
             if tone is None:
                 words.append(f"OUTP{channel + 1} OFF")
@@ -59,7 +59,7 @@ class Generator:
             angle = (tone.phase + 90) / 2
             words += [f"{source}:VOLT {vpp:.6g}", f"{source}:PHAS {angle:.6g}"]
             words.append(f"OUTP{channel + 1} ON")
-        now = {**self._playing, **self._wanted}
+        now = {**self._playing, **self._requested}
         goes_on = any(
             tone is not None
             and (old := self._playing.get(channel)) is not None
@@ -69,14 +69,14 @@ class Generator:
         if starts and not goes_on:
             words += ["*WAI", "SOUR1:PHAS:SYNC"]
         await self._checked(*words)
-        self._wanted, self._playing = {}, now
+        self._requested, self._playing = {}, now
 
     async def silence(self) -> None:
         """Connect, switch both outputs off, and set up sines in volts and degrees."""
         self.disconnect()
         self._streams = await asyncio.open_connection(*self._address)
-        self._wanted, self._playing = {}, {}
-        if await self._ask(*OFF) != ["0", "0"]:
+        self._requested, self._playing = {}, {}
+        if await self._request(*OFF) != ["0", "0"]:
             raise ValueError("the outputs must be off")
         words = ["*CLS", "UNIT:ANGL DEG"]
         for n in CHANNELS:
@@ -99,12 +99,12 @@ class Generator:
 
     async def _checked(self, *words: str) -> None:
         """Send words; raises ValueError for what the instrument says of them, outputs off."""
-        error = (await self._ask(*words, "*OPC?", "SYST:ERR?"))[-1]
+        error = (await self._request(*words, "*OPC?", "SYST:ERR?"))[-1]
         if int(error.split(",")[0]):
-            await self._ask("*CLS", *OFF)
+            await self._request("*CLS", *OFF)
             raise ValueError(f"the generator reports {error}")
 
-    async def _ask(self, *words: str) -> list[str]:
+    async def _request(self, *words: str) -> list[str]:
         """Send words in one line; returns the answers to its questions.
 
         Replies have no number in IEEE 488.2: that of the register *ESE, which nothing else uses,

@@ -11,7 +11,9 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("controller", "drivers", "era_haptics", "model", "registry", "sim")
+PACKAGES = ("controller", "drivers", "era_haptics", "examples", "model", "registry", "sim")
+PAGES = ("README.md", "docs/how-to/*.md", "docs/reference/*.md", "docs/tutorials/*.md")
+"""Whose programs users copy, as they copy the examples."""
 
 RETIRED = {
     "squared": "eigenvalues",
@@ -79,7 +81,15 @@ RETIRED_IN_DRIVERS = {
 }
 """Words within identifiers of the packages that follow a touch to the wire."""
 
-DRIVER_PACKAGES = ("controller/", "drivers/", "era_haptics/", "registry/")
+DRIVER_PACKAGES = (
+    "controller/",
+    "drivers/",
+    "era_haptics/",
+    "registry/",
+    "examples/",
+    "README.md",
+    "docs/",
+)
 
 CONTACT_PACKAGES = ("controller/sources/", "controller/play/", "sim/")
 """Where `lease`, the word of arming, would mean the timeout of a contact."""
@@ -95,21 +105,32 @@ ALLOWED = {
 
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*")  # also in comments: for which files need be parsed
+_PROGRAM = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def retired_identifiers() -> Iterator[str]:
     """Yield `path:line: identifier, use ...` for each definition that has a retired word."""
+    for file, text in _programs():
+        names = {(Path(file).stem, 1)}
+        if any(_replacement(name, file) for name in {*_IDENTIFIER.findall(text)}):
+            names |= {*_definitions(ast.parse(text))}
+        for name, line in sorted(names, key=lambda each: each[1]):
+            instead = _replacement(name, file)
+            if instead is not None:
+                yield f"{file}:{line}: {name}, use {instead}"
+
+
+def _programs() -> Iterator[tuple[str, str]]:
+    """Path and text of each module, and of each program on a page, at the lines of the page."""
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            file = path.relative_to(ROOT).as_posix()
-            text = path.read_text("utf-8")
-            names = {(path.stem, 1)}
-            if any(_replacement(name, file) for name in {*_IDENTIFIER.findall(text)}):
-                names |= {*_definitions(ast.parse(text))}
-            for name, line in sorted(names, key=lambda each: each[1]):
-                instead = _replacement(name, file)
-                if instead is not None:
-                    yield f"{file}:{line}: {name}, use {instead}"
+            yield path.relative_to(ROOT).as_posix(), path.read_text("utf-8")
+    for pattern in PAGES:
+        for path in sorted(ROOT.glob(pattern)):
+            page = path.read_text("utf-8")
+            for found in _PROGRAM.finditer(page):
+                above = page[: found.start(1)].count("\n")
+                yield path.relative_to(ROOT).as_posix(), "\n" * above + found[1]
 
 
 def _definitions(tree: ast.Module) -> Iterator[tuple[str, int]]:

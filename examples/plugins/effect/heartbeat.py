@@ -29,13 +29,13 @@ class Beating(EffectRun):
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus:
         """Return the current pulse or pause, and when it ends."""
         beats, into = divmod(now - self.start + _ROUNDING, self.period)
-        begin = self.start + beats * self.period
+        beat = self.start + beats * self.period
         is_second = into >= SECOND
-        latest = begin + SECOND if is_second else begin
+        latest = beat + SECOND if is_second else beat
         if self.pulse.requested_at != latest:
             self.pulse = Pulse(PULSE, latest)
         if now + _ROUNDING >= self.pulse.end:
-            return NoStimulus(until=begin + (self.period if is_second else SECOND))
+            return NoStimulus(until=beat + (self.period if is_second else SECOND))
         if not is_second:
             return EffectStimulus(self.level_db_sl, until=self.pulse.end, pulse=self.pulse)
         weaker = None if self.level_db_sl is None else self.level_db_sl - WEAKER

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from controller.sources import tuio
+from controller.sources import udp_source
 from controller.sources.touch import Touch, TouchFrame
 from daemon_bench import daemon_table, ready_daemon
 from era_haptics import query
@@ -54,7 +54,7 @@ async def _touched(folder: Path) -> Way:
         return types.SimpleNamespace(close=lambda: None)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuio, "listen", listen)
+        patch.setattr(udp_source, "listen", listen)
         async with ready_daemon(folder, "touch: [{name: panel, url: 'tuio:'}]\n") as (bench, era):
             await era.arm("a test", lease_s=60)
             recorder, played = Recorder(), asyncio.Event()

@@ -27,6 +27,7 @@ from model.choice import best_of
 from model.drive_modes import DRIVE_MODES
 from model.finger.fingertip import fingertip_points, fingertip_weights
 from model.finger.perception import decibels, over_threshold
+from model.quantities import percent
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.from_rest import from_rest
@@ -36,6 +37,7 @@ TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
 """What is within so many dB of what is expected is kept; that counts within so many dB of
 its highest; a plate may be late by so long [s], the same for all of a file."""
 
+_MENTIONED = 0.05  # share of the time off its level that is lost without a word
 _AFTER = 0.1  # s; followed after the end
 _MIN_RATE, _RATE = 1250.0, 3.5  # Hz; and by the highest frequency that plays
 # Odd numbers of samples whose Fourier transforms are fast.
@@ -126,9 +128,14 @@ class CheckedContent:
 
 def kept_shares(expected: FloatArray, given: FloatArray, count: int) -> FloatArray:
     """Shares of the time in which levels [dB] (n,) agree, for delays of what is given (count,)."""
-    counts = expected > expected.max() - RANGE_DB
-    late = [np.roll(given, -each)[counts] - expected[counts] for each in range(count)]
+    late = [_deviations(expected, given, each) for each in range(count)]
     return np.asarray(np.mean(np.abs(late) <= TOLERANCE_DB, axis=1))
+
+
+def _deviations(expected: FloatArray, given: FloatArray, late: int) -> FloatArray:
+    """What is felt so many samples late above what is expected [dB], where that counts."""
+    counts = expected > expected.max() - RANGE_DB
+    return np.asarray(np.roll(given, -late)[counts] - expected[counts])
 
 
 def least_promise(parts: Sequence[Part]) -> float | None:
@@ -159,7 +166,8 @@ def check_content(
     power = 10 ** (requested_level(pattern, level_db_sl, times) / 10)
     expected = decibels(np.sqrt(np.maximum(averaged(power, 1 / rate, SMOOTHING), 0)))
     kept = kept_shares(expected, given, int(MAX_DELAY * rate) + 1)
-    lost = (*played.rendition.remarks, *_weaker(played.parts))
+    deviations = _deviations(expected, given, best_of(kept))
+    lost = (*played.rendition.remarks, *_weaker(played.parts), *_off_level(deviations))
     return CheckedContent(duration, played.parts, lost, 1 / rate, expected, given, kept)
 
 
@@ -217,6 +225,16 @@ def _signals(parts: Sequence[Part], table: LocalizationTable, times: FloatArray)
             tone = shares * np.exp(2j * np.pi * frequency * tau)
             signals[:, during] += ((bases / strokes)[:, None] * tone).imag
     return signals
+
+
+def _off_level(deviations: FloatArray) -> Iterator[str]:
+    """Where what is felt is off what is wanted by more than the tolerance, in words."""
+    for by, how in (
+        (deviations, "stronger than wanted: the plate builds up and rings at this place"),
+        (-deviations, "weaker than wanted: the plate follows too slowly at this place"),
+    ):
+        if (share := np.mean(by > TOLERANCE_DB)) > _MENTIONED:
+            yield f"{percent(share)} of the time, {how}, by up to {by.max():.1f} dB"
 
 
 def _weaker(parts: Sequence[Part]) -> Iterator[str]:

@@ -9,11 +9,13 @@ from controller.cli.daemon import Socket, connected
 from model.commands.options import JsonOption, print_report
 from model.config.points import parse_point
 from model.errors import InputError
+from model.quantities import percent
 
 if TYPE_CHECKING:
     from controller.content.pattern import Pattern
 
-_RATE = 8000  # Hz; the least that all players of sound take
+_RATE = 48000  # Hz; with 16 bits what all players of sound take
+_FULL = 1 << 15  # of samples of 16 bits
 _PEAK = 0.9  # of full scale
 
 
@@ -47,7 +49,7 @@ def play(
     """Play content once at a finger that is on the plate, within 20 mm of a position.
 
     With --simulate write the acceleration at a finger that is alone there as sound, to listen to
-    and to look at.
+    and to look at: 16 bits at 48 kHz, scaled so that its loudest moment is 90 % of full scale.
     """
     place = parse_point(at, what="--at")
     if (simulate is None) != (output is None):
@@ -110,9 +112,13 @@ def _simulate(
     felt = played.accelerations @ fingertip_weights(*place, table.plate)
     sound = resample(felt, round(len(felt) * _RATE / played.rate))
     full_scale = float(np.abs(sound).max()) / _PEAK or 1.0
-    wavfile.write(output, _RATE, (sound / full_scale).astype(np.float32))
+    wavfile.write(output, _RATE, np.rint(_FULL / full_scale * sound).astype(np.int16))
     print_report(
-        [f"full scale is {full_scale:.3g} m/s²", f"wrote {output}"],
+        [
+            f"scaled: the loudest moment is {percent(_PEAK)} of full scale, which is "
+            f"{full_scale:.3g} m/s²",
+            f"wrote {output}: 16 bits, {_RATE / 1000:g} kHz",
+        ],
         {
             "file": str(file),
             "at_m": [*place],

@@ -241,7 +241,7 @@ def _lost(
         of_file = hertz[shares > 0]
         yield (
             f"sharpness of {100 * lost:.0f} % of what lasts: {of_file.min():.0f} to "
-            f"{of_file.max():.0f} Hz in the file, here one frequency near {sum(band) / 2:.0f} Hz"
+            f"{of_file.max():.0f} Hz in the file, one frequency here"
         )
     if clicks:
         yield f"what lasts, {1000 * DUCKING:.0f} ms before and after each tap"

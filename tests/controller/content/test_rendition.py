@@ -63,8 +63,7 @@ def test_what_lasts_has_one_band_where_most_of_its_energy_is() -> None:
     found = rendered(pattern, 20.0, EVERY_10_HZ)
     assert found.band == pytest.approx((0.9 * 206, 1.1 * 206))
     assert found.remarks == (
-        "sharpness of 30 % of what lasts: 206 to 253 Hz in the file, here one frequency near "
-        "206 Hz",
+        "sharpness of 30 % of what lasts: 206 to 253 Hz in the file, one frequency here",
     )
 
 

@@ -10,9 +10,13 @@ from collections.abc import Callable, Mapping
 from model.ensemble.delays import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
+from registry import clock
 
 MARGIN = 1.25
 """By how much more is counted than is known."""
+
+SETTLED = 10.0
+"""Time [s] for which a clock is held until that is said, with how often it was not."""
 
 _FAR_BETTER = 2.0  # times what is counted
 
@@ -26,6 +30,8 @@ class CountedClocks:
         self._rig, self._now = rig, now
         self._names = sorted(rig.channel_counts)
         self._counted = EXACT_CLOCKS
+        self._losses = dict.fromkeys(self._names, 0)  # since it was last said to be held
+        self._held_since: dict[str, float] = {}  # not said yet
         self.errors: dict[str, float] = {}
         """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
 
@@ -49,7 +55,10 @@ class CountedClocks:
             eras = [era.name for era in table.eras]
             self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
             self.errors = errors
-            self._say(before)
+            self._note(before)
+        for name in [*self._held_since]:  # mostly none
+            if clock.now() - self._held_since[name] >= SETTLED:
+                self._say_held(name)
         return table.with_clocks(self._counted)
 
     def is_one_lost(self, known: Mapping[str, float]) -> bool:
@@ -69,24 +78,38 @@ class CountedClocks:
                 return True
         return not self.errors
 
-    def _say(self, before: Mapping[str, float]) -> None:
-        """Log which amplifiers play contents of their own from now on, and which no longer.
+    def _note(self, before: Mapping[str, float]) -> None:
+        """Count losses; log which amplifiers play contents of their own from now on, once.
 
         No clock is known when its line has just been opened, so that it is no warning then.
         """
         level = logging.WARNING if before else logging.INFO
         for name, error in self.errors.items():
-            is_alone = error > MAX_HELD
-            if is_alone and before.get(name, 0.0) <= MAX_HELD:
-                _logger.log(
-                    level,
-                    "amplifier %s: its clock is not held to the others', so its ERAs play contents "
-                    "of their own; if that lasts, see its clock_error in era amp status",
-                    name,
-                )
-            elif not is_alone and before.get(name, 0.0) > MAX_HELD:
-                _logger.info(
-                    "amplifier %s: clock held to %.0f us, its ERAs play with the others'",
-                    name,
-                    1e6 * error,
-                )
+            was_alone = before.get(name, 0.0) > MAX_HELD
+            if error <= MAX_HELD:
+                if was_alone:
+                    self._held_since[name] = clock.now()
+            elif not was_alone:
+                self._held_since.pop(name, None)
+                if not self._losses[name]:
+                    _logger.log(
+                        level,
+                        "amplifier %s: its clock is not held to the others', so its ERAs play "
+                        "contents of their own; if that lasts, see its clock_error in era amp "
+                        "status",
+                        name,
+                    )
+                self._losses[name] += 1
+
+    def _say_held(self, name: str) -> None:
+        """Log that an amplifier's clock has been held for long, and how often it was not."""
+        _logger.info(
+            "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the others'; "
+            "losses before: %d",
+            name,
+            1e6 * self.errors[name],
+            SETTLED,
+            self._losses[name],
+        )
+        self._losses[name] = 0
+        del self._held_since[name]

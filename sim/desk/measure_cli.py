@@ -37,6 +37,13 @@ def measure(
             help="In place of --device: a stepped sine that was recorded, .wav, or measured, .csv.",
         ),
     ] = None,
+    is_simulated: Annotated[
+        bool,
+        typer.Option(
+            "--simulated",
+            help="In place of --device: a plate that deviates from the rig's as --seed draws it.",
+        ),
+    ] = False,
     frequencies: Annotated[
         str | None,
         typer.Option(
@@ -76,7 +83,9 @@ def measure(
     stepped: Annotated[
         bool, typer.Option("--stepped", help="Check with single tones, one ERA at a time.")
     ] = False,
-    seed: Annotated[int, typer.Option(metavar="N", help="Draw other phases.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Draw other phases, or another plate.", min=0)
+    ] = 0,
     impedance: Annotated[
         bool,
         typer.Option(
@@ -108,16 +117,18 @@ def measure(
     lines = parse_frequencies(frequencies) if frequencies else None
     desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True), y_cable)
     is_moved = are_places(desk.sensors)
-    if (device is None) == (source is None):
-        raise InputError("give --device, a sound card, or --from, what another has measured")
+    if (device is not None) + (source is not None) + is_simulated != 1:
+        raise InputError(
+            "give --device, a sound card, or --from, what another has measured, or --simulated"
+        )
     for option, is_wrong, needs in (
         ("--frequencies", source is not None and lines is not None, "--device"),
-        ("--stepped", source is not None and stepped, "--device"),
-        ("--resume", source is not None and resume, "--device"),
+        ("--stepped", device is None and stepped, "--device"),
+        ("--resume", device is None and resume, "--device"),
         ("--resume", resume and not is_moved, "one sensor that is moved, one input in all lines"),
         ("--stepped", stepped and is_moved, "sensors that stay where they are"),
         ("--stepped", stepped and y_cable, "an output of the cable's own"),
-        ("--y-cable", source is not None and y_cable, "--device"),
+        ("--y-cable", device is None and y_cable, "--device"),
     ):
         if is_wrong:
             raise InputError(f"{option} needs {needs}; leave it out")
@@ -127,6 +138,10 @@ def measure(
         from sim.desk.measuring.stepped_file import measured_from
 
         rows, answer = measured_from(source, desk, output)
+    elif is_simulated:
+        from sim.desk.measuring.simulated_plate import measured_by_simulation
+
+        rows, answer = measured_by_simulation(desk, output, frequencies=lines, seed=seed)
     else:
         from sim.desk.measuring.moved_sensor import measure_by_moving
 
@@ -140,6 +155,6 @@ def measure(
                 desk, opened, output, periods=periods, is_stepped=stepped
             )
     if is_whole:
-        next_words = ("calibrate", rig_file, output, "-o", rig_file.with_stem("calibrated"))
+        next_words = ("calibrate", rig_file, output, "-o", output.with_name("calibrated.yaml"))
         rows = [*rows, next_line("era", *next_words)]
     print_report(rows, answer, as_json=as_json)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from model.calibration.responses import MeasuredValue, responses_of
+from model.calibration.responses import MeasuredValue, Responses, responses_of
 from model.calibration.responses_file import write_responses
 from model.calibration.sensor_file import WiredSensor, are_places
 from model.counting import counted
@@ -36,6 +36,13 @@ def measured_from(
 ) -> tuple[list[str | None], dict[str, Any]]:
     """Read files of a stepped sine, write responses, and return the report; raises InputError."""
     found = responses_of(read_stepped(source, desk), desk.rig)
+    return written(found, desk, output, source=str(source))
+
+
+def written(
+    found: Responses, desk: Desk, output: Path, *, source: str
+) -> tuple[list[str | None], dict[str, Any]]:
+    """Write responses that have a source; return the report. Raises InputError."""
     write_responses(output, found, desk.rig)
     absent = [each.name for each in desk.sensors if each.name not in found.sensors]
     lines = found.frequencies

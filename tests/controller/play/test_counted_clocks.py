@@ -10,6 +10,7 @@ from controller.play.counted_clocks import CountedClocks
 from model.ensemble.delays import EXACT_CLOCKS
 from model.rig.rig import Channel
 from paper_table import smooth_rig, smooth_table
+from registry import clock
 
 RIG = smooth_rig()
 HALVES = replace(
@@ -44,22 +45,45 @@ def test_a_table_that_is_learned_has_the_same_clocks() -> None:
     assert other.omega is learned.omega
 
 
-def test_clocks_that_are_not_held_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    """As a warning where it was, by the name of the amplifier, and that it is held again."""
-    now = {"a": 4e-6, "b": math.inf}
+def test_clocks_that_come_and_go_are_told_once_with_how_often(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lost five times within a second: one warning; held for 10 s: once, after five times.
+
+    Answers follow each change at once.
+    """
+    seconds, now = [0.0], {"a": 4e-6, "b": 4e-6}
+    monkeypatch.setattr(clock, "now", lambda: seconds[0])
     clocks, table = CountedClocks(HALVES, lambda: now), smooth_table()
     with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
         table = clocks.counted_by(table)
-        assert table.clocks.groups == (0, 1, 0, 1)
+        for _ in range(5):
+            for now["b"], groups in ((math.inf, (0, 1, 0, 1)), (4e-6, ())):
+                table = clocks.counted_by(table)
+                assert table.clocks.groups == groups
+                seconds[0] += 0.1
+        assert [each.levelno for each in caplog.records] == [logging.WARNING]
+        seconds[0] += 9.8  # 9.9 s since it was held
         table = clocks.counted_by(table)
-        now["b"] = 4e-6
+        assert len(caplog.records) == 1
+        seconds[0] += 0.2
         table = clocks.counted_by(table)
-        assert table.clocks.groups == ()
+        table = clocks.counted_by(table)
+        assert [each.levelno for each in caplog.records] == [logging.WARNING, logging.INFO]
+        assert "losses before: 5" in caplog.records[1].getMessage()
         now["b"] = math.inf
         clocks.counted_by(table)
     levels = [each.levelno for each in caplog.records]
-    assert levels == [logging.INFO, logging.INFO, logging.WARNING]
+    assert levels == [logging.WARNING, logging.INFO, logging.WARNING]
     assert all("amplifier b" in each.getMessage() for each in caplog.records)
+
+
+def test_clock_that_is_not_known_yet_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """When its line has just been opened."""
+    clocks = CountedClocks(HALVES, lambda: {"a": 4e-6, "b": math.inf})
+    with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
+        assert clocks.counted_by(smooth_table()).clocks.groups == (0, 1, 0, 1)
+    assert [each.levelno for each in caplog.records] == [logging.INFO]
 
 
 def test_one_amplifier_has_no_clock_that_counts() -> None:

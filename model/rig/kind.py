@@ -5,19 +5,24 @@ leaves out.
 """
 
 import cmath
+import contextlib
 import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
 from model.config.document import ConfigError, ConfigProblem, Document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.errors import InputError
+from model.quantities import percent
 from model.rig.era_section import STIFF_MOUNT
 from model.rig.exciter_checks import exciter_notes
 from model.rig.file import example_rig_path, rig_of
@@ -57,7 +62,10 @@ def _check(document: Document) -> CheckedFile:
     note = rig.uncertainty_note
     line, lost, more = clock_costs(rig, urls)
     warnings = [*exciter_notes(rig), *warnings]
-    costs = [*lost, *gain_notes(rig), *_plate_notes(rig), *_mount_notes(rig)]
+    costs = [
+        *(*lost, *gain_notes(rig), *_plate_notes(rig)),
+        *(*_mount_notes(rig), *_span_notes(rig)),
+    ]
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
@@ -93,6 +101,34 @@ def _plate_notes(rig: Rig) -> Iterator[str]:
             f"plate.layers: at {slide:.3g} Hz they slide to and fro by themselves, and change "
             "their thickness little above, which is left out: take no answer from it above "
             f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
+        )
+
+
+_SMALL_SPAN = 1 / 3  # of the plate
+
+
+def _span_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where ERAs span a small part of the plate, with what its corners promise.
+
+    None for ERAs in one line along a side.
+    """
+    places = np.array([[era.x, era.y] for era in rig.eras])
+    sides = np.array([rig.plate.length, rig.plate.width])
+    span = np.ptp(places, axis=0)
+    share = float((span / sides).prod())
+    if not 0 < share < _SMALL_SPAN:
+        return
+    apart = (sides * (places - places.min(axis=0)) / span).tolist()
+    eras = tuple(replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, apart, strict=True))
+    exact = dict.fromkeys(rig.channel_counts, 0.0)
+    with contextlib.suppress(InputError):  # no place for two fingers
+        here, there = (
+            resolve_name(_COST)(each, exact).exact_db for each in (rig, replace(rig, eras=eras))
+        )
+        yield (
+            f"eras: they span {percent(share)} of the plate; two contents are promised {here:.1f} "
+            f"dB, with ERAs spread to its corners {there:.1f} dB: check `at` of each after a "
+            "change of plate.length or plate.width"
         )
 
 

@@ -107,6 +107,24 @@ def test_page_example_feels_what_was_predicted(
     assert (tmp_path / "contents.png").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("cache")
+def test_readme_program_prints_what_is_said_of_each_finger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the README shows it, a line a finger; the quiet one has no contrast of its own."""
+    readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
+    (tmp_path / "examples").mkdir()
+    shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    (lines,) = re.findall(r"^```python\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
+    (shown,) = re.findall(r"^```text\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
+    (tmp_path / "readme.py").write_text(lines, "utf-8")
+    runpy.run_path("readme.py")
+    printed = capsys.readouterr().out
+    assert printed == shown
+    assert ["contrast" in line for line in printed.splitlines()] == [True, True, True, False]
+
+
 def test_page_rig_needs_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

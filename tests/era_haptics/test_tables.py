@@ -93,6 +93,8 @@ def test_results_become_frames(table: era.LocalizationTable) -> None:
     frame = answer.to_frame()
     assert list(frame["verdict"]) == [each.verdict for each in answer.fingers]
     assert frame.loc[1, "x_m"] == QUIET[0][0]
+    worst = frame["worst_foreign_level_db_sl"]
+    assert worst[1] == answer.fingers[1].foreign_level_db_sl
     plate = era.SolvedPlate(era.load_rig(str(era.example_rig_path()), mesh="12x9"))
     modes = plate.modes.to_frame()
     assert modes["frequency_hz"].tolist() == plate.modes.natural_frequencies.tolist()

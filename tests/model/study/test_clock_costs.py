@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 
 from drivers.line_kinds import CLOCK_ERRORS
 from model.cli import app
+from model.rig.file import example_rig_path
 from model.rig.rig import Channel
 from model.rig.uncertainty import Uncertainty
 from model.study.clock_costs import ClockCost, clock_cost
@@ -46,6 +48,27 @@ def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
     assert kept[0] - kept[1] < 2 < kept[0] - kept[3]
     one = replace(rig, wiring={era.name: Channel("a", n) for n, era in enumerate(rig.eras)})
     assert clock_cost(one, {"a": math.inf}) == ClockCost(costs[0].exact_db, costs[0].exact_db)
+
+
+@pytest.mark.parametrize(("length", "width", "said"), [("60 cm", "40 cm", 1), ("12 in", "9 in", 0)])
+def test_config_check_remarks_eras_on_a_small_part_of_the_plate(
+    tmp_path: Path, length: str, width: str, said: int
+) -> None:
+    """12 x 9 in of 60 x 40 cm are 29 %; spread to the corners ERAs promise more. Still good."""
+    text = example_rig_path().read_text("utf-8")
+    text = text.replace("length: 12 in", f"length: {length}").replace(
+        "width: 9 in", f"width: {width}"
+    )
+    file = tmp_path / "rig.yaml"
+    file.write_text(text)
+    result = CliRunner().invoke(app, ["config", "check", str(file), "--json"])
+    assert result.exit_code == 0
+    remarks = [each for each in json.loads(result.output)["warnings"] if "span" in each]
+    assert len(remarks) == said
+    for each in remarks:
+        assert "29 %" in each
+        here, there = (float(number) for number in re.findall(r"([0-9.]+) dB", each))
+        assert here + 1 < there
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,7 @@ def _off_level(deviations: FloatArray) -> Iterator[str]:
         (deviations, "stronger than wanted: the plate builds up and rings at this place"),
         (-deviations, "weaker than wanted: the plate follows too slowly at this place"),
     ):
-        if (share := np.mean(by > TOLERANCE_DB)) > _MENTIONED:
+        if (share := float(np.mean(by > TOLERANCE_DB))) > _MENTIONED:
             yield f"{percent(share)} of the time, {how}, by up to {by.max():.1f} dB"
 
 

@@ -117,9 +117,24 @@ function showState(next, word, cause, newEpoch = null) {
   at("state").textContent = word ?? "not connected";
   at("state").dataset.state = state ?? "disconnected";
   at("state").title = state ?? "";
-  at("cause").textContent = at("cause").title = cause ?? "";
+  at("cause").textContent = at("cause").title = withThisPage(cause) ?? "";
   at("plate").classList.toggle("unknown", state === null || state === "COMM_LOST");
   showButtons();
+  showHint();
+}
+
+// What to do first, on a plate without fingers.
+function showHint() {
+  const hints = { OPERATION_ENABLED: "Touch the plate", QUICK_STOP_ACTIVE: "Clear and arm, then touch", FAULT: "Clear and arm, then touch" };
+  const hint = DISARMED.includes(state) ? "Arm, then touch" : hints[state];
+  at("hint").hidden = !hint || overlay.contacts.length > 0;
+  at("hint").textContent = hint ?? "";
+}
+
+// A text of the daemon in which this page is called so.
+function withThisPage(text) {
+  for (const name of [`dashboard (${ownName})`, ownName]) text = text?.replaceAll(`by '${name}'`, "from this page");
+  return text;
 }
 
 function showStatus(status) {
@@ -146,6 +161,7 @@ function showOutage(message) {
 function showUnknown(cause) {
   showState(null, null, cause);
   overlay.show({ contacts: [], layers: {} });
+  showHint();
   showLayers();
   fieldView.clear();
   at("inputs").textContent = "";
@@ -215,21 +231,24 @@ const HANDLERS = {
     if (linkLoss && next !== "NOT_READY") {
       annotate(linkLoss.item, `${timeOfDay(new Date())} all amplifiers reconnected, disarmed`, remedy);
     } else if (isChange) {
-      addEvent(log, next === "FAULT" ? "error" : "info", cause.startsWith(word) ? cause : `${word}: ${cause}`, remedy);
+      addEvent(log, next === "FAULT" ? "error" : "info", withThisPage(cause.startsWith(word) ? cause : `${word}: ${cause}`), remedy);
     }
     linkLoss = null;
   },
   contacts({ contacts }) {
     overlay.show({ contacts });
+    showHint();
     summariseSilence();
   },
   pattern(pattern) {
     overlay.show(pattern);
+    showHint();
     showLayers();
     summarisePattern(pattern);
   },
   silence({ contacts, reason }) {
     overlay.show({ contacts, layers: {} });
+    showHint();
     showLayers();
     summarise(`silent: ${reason}`);
     summariseSilence();
@@ -268,7 +287,7 @@ const HANDLERS = {
     showStrengths(at("strengths-section"), at("strengths"), Object.entries(strengths), set);
   },
   log({ level, message, cause, remedy }) {
-    addEvent(log, level, cause ? `${message}: ${cause}` : message, remedy);
+    addEvent(log, level, withThisPage(cause ? `${message}: ${cause}` : message), remedy);
   },
   link({ event, message }) {
     if (event !== "retry" || !linkLoss) return;  // the state shows the others

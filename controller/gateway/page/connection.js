@@ -92,6 +92,7 @@ export class Connection {
     });
     if (this.source) this.call("hello", { client: this.source }).catch(() => {});
     this.renew();
+    this.name = id;
     this.handlers.opened?.(result, id);
   }
 
@@ -285,6 +286,6 @@ export class Connection {
     const given = new AbortController();  // AbortSignal.timeout is missing in browsers before 2022
     setTimeout(() => given.abort(), RESPONSE_TIMEOUT_MS);
     const url = new URL(`api/v1/${method}`, this.gateway);
-    return fetch(url, { method: "POST", headers, body: "{}", keepalive: true, signal: given.signal });
+    return fetch(url, { method: "POST", headers, body: JSON.stringify(this.name ? { client: this.name } : {}), keepalive: true, signal: given.signal });
   }
 }

@@ -7,7 +7,7 @@ const GREY = 0.62;  // where contents mix
 const OWN_DB = 12;  // above all others a content is felt as a finger's own
 const BRIGHTEST_DB = 30;  // above the threshold of feeling
 const SLOW_DOWN = 100;  // factor
-const SCALE_DECAY = 0.85;  // per frame, towards a lower scale
+const SCALE_HELD_MS = 10000;  // for so long a scale stays that less would do for
 
 const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
 
@@ -52,7 +52,7 @@ export class FieldView {
     this.onScale = onScale;
     this.inMotion = false;
     this.layer = null;  // the only one that is drawn; null for all
-    this.scale = 0;
+    this.scale = this.neededAt = 0;  // neededAt: when the plate last vibrated by as much as the scale
     this.frames = 0;
     this.clear();
     requestAnimationFrame((now) => this.draw(now));
@@ -111,9 +111,11 @@ export class FieldView {
     requestAnimationFrame((next) => this.draw(next));
     this.frames++;
     const target = roundUp(this.peak);
-    const scale = target >= this.scale ? target : Math.max(target, this.scale * SCALE_DECAY);
-    if (scale !== this.scale) {
-      this.scale = scale;
+    // At rest it stays; otherwise it falls at once, not in steps.
+    if (target >= this.scale || this.peak === 0) this.neededAt = now;
+    if (target > this.scale || now - this.neededAt > SCALE_HELD_MS) {
+      this.scale = target;
+      this.neededAt = now;
       this.drawScale();
       this.isStale = true;
     }
@@ -196,8 +198,7 @@ export class FieldView {
     context.putImageData(image, 0, 0);
     if (name === "felt") this.onScale(0, `${BRIGHTEST_DB} dB above threshold`);
     else {
-      const shown = Number(this.scale.toPrecision(2));  // it decays in small steps
-      this.onScale(this.inMotion ? -shown : 0, `${shown} m/s²`);
+      this.onScale(this.inMotion ? -this.scale : 0, `${this.scale} m/s²`);
     }
   }
 }

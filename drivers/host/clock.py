@@ -24,7 +24,7 @@ from statistics import median_low
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, SPAN
+from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, SPAN, ahead
 from drivers.protocol.records import Values
 from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
@@ -42,6 +42,7 @@ _MAX_CRYSTAL = 0.01  # no oscillator is so far off: the clock stands still, or r
 _EXPECTED_BEND = 2e-7  # 1/s; half of that by which its rate changes, while it warms up
 _LEAST = 5e-7  # s; of a reading, and of the time of this process
 _FAR, _FAR_ERRORS = 100e-6, 10.0  # s, and errors; what is beyond is a clock that was moved
+_TOO_FAST = 1e-3  # s; of readings that are a little wrong
 _GENTLE = 0.5, 1e-4  # s to lead an error to zero, and by which rate at most: not felt
 _FAST = 0.2, 2.8e-3  # four Pings, or lost ones overshoot; all together a Ping can say
 _TOGETHER = 0.5, 5e-4  # all of a line, one after another: faster they would part
@@ -72,15 +73,16 @@ class HeldClock:
     """The clock of an amplifier, by its messages; times [s] are of the host's clock."""
 
     def __init__(self) -> None:
+        self._has_bits = True  # no network, and no USB: they take their time
         self.identified(CLOCK_UNKNOWN, bits=0.0)
-        self.shortest = math.inf
-        """Of its exchanges, the time beside the bits [s]: within it lies what no exchange shows."""
+        self._promptest = math.inf  # exchange, less its bits [s]
         self.is_alone = True
         """Whether it is held together with no other one: then nothing is read of it."""
         self._other: HeldClock | None = None  # to which it is held, see `compare`
         self._is_first = False  # whether others are held to it
         self._pace = 0.0  # seconds a second, by the rate of a Ping
         self._requested = 0.0, 0.0  # when what a Status shows was sent, and arrives at the soonest
+        self._shown = 0, -math.inf, 0.0  # a clock of one alone, and between which times
         self._marks = 0  # since a Status, which may show any of them
         self._pinged: tuple[float, float] | None = None  # when Pings without reply arrive
         self._arming = 0  # the shift of an Arm without a reply
@@ -101,7 +103,13 @@ class HeldClock:
 
     def identified(self, stated: int, *, bits: float) -> None:
         """Note its `clock_error` as of the wire, and how long the bits of its Status take [s]."""
-        self.stated, self.can_be_steered, self._bits = stated, stated != CLOCK_UNKNOWN, bits
+        self.stated, self.can_be_steered = stated, stated != CLOCK_UNKNOWN
+        self._bits = bits if self._has_bits else 0.0
+
+    @property
+    def shortest(self) -> float:
+        """Its promptest exchange beside the bits [s]: within it lies what no exchange shows."""
+        return max(self._promptest, 0.0)
 
     @property
     def is_compared(self) -> bool:
@@ -157,9 +165,12 @@ class HeldClock:
 
     def problem(self, time: float) -> ClockProblem | None:
         """Return what ails it at a time [s]; None if nothing."""
+        has_jumped = time - self._jumped_at < CLOCK_SETTLING
+        if self.is_alone:
+            return "clock_jumped" if has_jumped else None
         if not self.can_be_steered:
-            return None if self.is_alone else "clock_not_steered"
-        if time - self._jumped_at < CLOCK_SETTLING:
+            return "clock_not_steered"
+        if has_jumped:
             return "clock_jumped"
         if self._is_armed and time - self._near_at > CLOCK_SETTLING:
             return "clock_unsettled"
@@ -196,12 +207,13 @@ class HeldClock:
 
     def sent(self, name: str, values: Values, now: float, arrives: float) -> None:
         """Note a request that is sent now and arrives at a time [s] at the soonest."""
-        if self.is_alone:
-            return
+        arrives = arrives if self._has_bits else now
         if name == "Mark":
             self._marks += 1
         if name == "Mark" or not self._marks:
             self._requested = now, arrives
+        if self.is_alone:
+            return
         if name == "Arm":
             self._arming = values["shift"]
         elif name == "Ping":
@@ -209,13 +221,18 @@ class HeldClock:
 
     def replied(self, name: str, values: Values, status: Values, received: float) -> None:
         """Note a Status that replies to a request at a time [s]."""
-        if self.is_alone:
-            return
         (sent, arrives), marks, self._marks = self._requested, self._marks, 0
+        was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
+        if self.is_alone:
+            is_reported = was_armed and self._is_armed and name != "Arm" and not marks
+            self._check_pace(status["clock"], sent, received, is_reported=is_reported)
+            return
+        if self._has_bits and received - sent < (arrives - sent + self._bits) / 2:
+            self._has_bits, self._bits, self._promptest, arrives = False, 0.0, math.inf, sent
+            self._forget(sent)
         time = min(arrives, received)
         if time - self._beside.time > _MARKED:  # what it differs by is no longer seen
             self._beside = _Line(-math.inf)
-        was_armed, self._is_armed = self._is_armed, status["state"] == ENABLED
         has_left = was_armed and not self._is_armed and name not in ("Stop", "Disarm")
         if name == "Arm" and self._is_armed:
             self._added += values["shift"] * HIGH_TIME
@@ -223,7 +240,7 @@ class HeldClock:
         elif self._arming or has_left:  # whether it was shifted, or since when its rate is 0
             self._forget(time)
         self._arming = 0
-        self.shortest = min(self.shortest, max(received - time - self._bits, 0.0))
+        self._promptest = min(self._promptest, received - time - self._bits)
         # Whether a Ping without reply was heard is not known before that to the next one.
         is_kept = self._pinged is None or name == "Ping"
         if marks <= 1 and (is_kept or not self._lowest):
@@ -240,6 +257,17 @@ class HeldClock:
             since = sum(self._pinged or (time, time)) / 2  # any attempt may be the first heard
             self._added += (self._pace - pace) * since
             self._pace, self._pinged = pace, None
+
+    def _check_pace(self, clock: int, sent: float, received: float, *, is_reported: bool) -> None:
+        """Compare what has passed on a clock that is alone with the host's, of some seconds."""
+        shown, earliest, latest = self._shown
+        if is_reported and received - earliest < CLOCK_SETTLING:
+            passed = ahead(clock, shown)
+            off = _FAR + _MAX_CRYSTAL * (received - earliest)
+            if sent - latest - off <= passed <= received - earliest + off:
+                return
+            self._jumped_at = received
+        self._shown = clock, sent, received
 
     def _read(
         self, clock: int, time: float, earlier: float, later: float, *, is_reported: bool
@@ -260,11 +288,15 @@ class HeldClock:
             [low - late - line.rate * (at - time) for at, low, late in self._lowest],
             default=-math.inf,
         )
+        # And early nowhere: what is above by more than any crystal gains runs too fast.
+        most = min(
+            [low + _MAX_CRYSTAL * (time - at) for at, low, _ in self._lowest], default=math.inf
+        )
         is_early = off < sure - lead - far - earlier
         self._is_doubted = is_early and not self._is_doubted
         if self._is_doubted:  # one alone may show a Mark that came twice
             return lead + off
-        if is_early or off > later + far:
+        if is_early or off > later + far or off > later + most - lead + _TOO_FAST:
             if is_reported:
                 self._jumped_at = time
             self._forget(time)
@@ -274,7 +306,7 @@ class HeldClock:
                 above = max(line.lead + line.rate * (at - line.time) - low, 0.0)
                 self._lowest[number] = at, low + min(off + above, 0.0), late
         # Less what its exchange took longer than the promptest one: by so much it may be late.
-        self._all.append((time, lead + off - max(later - self.shortest - self._bits, 0.0)))
+        self._all.append((time, lead + off - max(later - self._promptest - self._bits, 0.0)))
         part = _MIN_PART
         self._lowest = [each for each in self._lowest if time - each[0] <= WINDOW]
         while self._lowest and time - self._lowest[0][0] > _PARTS * part:
@@ -360,7 +392,7 @@ class HeldClock:
         rate_error = errors * math.sqrt(scatter * (1 / breadth + (2 * middle) ** 2 / wide))
         error = errors * math.sqrt(scatter * (1 / count + middle**2 / breadth + square**2 / wide))
         recent = [
-            (high + (rate - bend * age) * age - lead, late - self.shortest - self._bits)
+            (high + (rate - bend * age) * age - lead, late - self._promptest - self._bits)
             for age, high, late in aged[-_RECENT:]
         ]
         # None is later than its exchange took longer than the promptest one.

@@ -36,8 +36,8 @@ REPORTS: dict[ReportKind, tuple[str, str]] = {
         "update its firmware, or exchange it",
     ),
     "clock_jumped": (
-        "its clock jumps, stands still, or is read wrong by more than it states",
-        "check its clock and clock_error: era amp conformance; less is promised meanwhile",
+        "its clock jumps, stands still, has a wrong rate, or is read wrong by more than it states",
+        "check its clock and clock_error: era amp conformance; beside others less is promised",
     ),
     "clock_rate": (
         f"its clock is more than {MAX_CLOCK_RATE * 1e6:g} ppm too fast or too slow",

@@ -323,6 +323,13 @@ class Backwards(Still):
         return -AmplifierClock.reading(self, time) % SPAN
 
 
+class Fast(Still):
+    """Runs 1.5 times as fast."""
+
+    def reading(self, time: float) -> int:
+        return 3 * AmplifierClock.reading(self, time) // 2 % SPAN
+
+
 class Random(Still):
     """Shows any number."""
 
@@ -339,6 +346,7 @@ CLOCKS: dict[str, tuple[type[AmplifierClock], float, float]] = {
     "stands still": (Still, 0.0, 0.0),
     "runs backwards": (Backwards, 0.0, 0.0),
     "random": (Random, 0.0, 0.0),
+    "runs half as fast again": (Fast, 0.0, 0.0),
 }
 """A clock, by how much it is ahead at first, and jumps after 0.5 s [s]."""
 
@@ -374,6 +382,24 @@ async def test_clock_that_lies_costs_promise_and_stops_nothing(
     assert said == ("clock_not_steered" if "not steered" in lie else "clock_jumped")
     assert group.clock_errors["a"] > 0.1
     await stops_truthfully(group, ends[0])
+
+
+@pytest.mark.parametrize("lie", [each for each in CLOCKS if "not steered" not in each])
+@in_virtual_time
+async def test_clock_that_lies_alone_is_said(lie: str) -> None:
+    """Of an amplifier without others, on whose clock all its frequencies count, within 3 s."""
+    kind, ahead, jump = CLOCKS[lie]
+    end = MemoryLine("serial", "a")
+    far = end.far["a"]
+    far.clock = kind(Crystal(3e-5, 0.0, ahead))
+    group = await group_of(end)
+    for beat in range(60):
+        if beat == 10:
+            far.clock.shift(round(jump / HIGH_TIME))
+        await asyncio.sleep(0.05)
+        await group.beat()
+    assert set(group.amplifiers["a"].reported_at) == {"clock_jumped"}
+    await stops_truthfully(group, end)
 
 
 @in_virtual_time

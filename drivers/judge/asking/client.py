@@ -118,6 +118,8 @@ _LOOK = 0.005  # s; between looks whether this machine is late
 # s; by which it is late where an amplifier on it is not judged by its silence, a few times, or ever
 _BUSY, _STALLED = 0.02, 0.1
 REPLY_TIMEOUT = 0.5  # s; far above the reaction, so that a busy machine is no mute amplifier
+# s; beyond that, for a reply which the machine or line delivers late; in a check, so many at most
+_DELIVERED, _MAX_DELIVERED = 1.5, 8
 GATEWAY_TIMEOUT = 1.5  # s; in which a gateway says that a unit does not reply
 _MAX_SHOWN = 300  # bytes
 _AT_ONCE = 16  # addresses
@@ -181,6 +183,7 @@ class Client(ABC):
     times until a reply began. attempts: of this check that came too late; mute: its requests
     without a reply; wasted: the time [s] of all of the run. lag: by how much this machine was late
     since the check began, at most; lateness: by how much this machine or a reply was, of all.
+    delivered: replies that came in a row after their timeout.
     """
 
     kind: ClassVar[str]
@@ -210,7 +213,7 @@ class Client(ABC):
         self.timeout = REPLY_TIMEOUT
         self.came = b""
         self.neighbours: frozenset[int] = frozenset()
-        self.free = self.attempts = self.mute = 0
+        self.free = self.attempts = self.mute = self.delivered = 0
         self.fastest: dict[str, float] = {}
         self.reactions: dict[str, list[float]] = defaultdict(list)
         self.wasted = self.lag = self.lateness = 0.0
@@ -388,8 +391,11 @@ class Client(ABC):
             timer.cancel()
 
     async def replied(self, is_meant: Callable[[Heard], bool], what: str) -> Heard:
-        """Return the reply to what was sent; Violation where none comes."""
-        before, self.lag = self.lag, 0.0
+        """Return the reply to what was sent; Violation where none comes, Late where one is late.
+
+        An amplifier whose replies are late in a row, or time and again, is slow by itself.
+        """
+        before, self.lag, began = self.lag, 0.0, clock.now()
         found = await self.next(is_meant, self.timeout)
         is_in_time = self.lag <= (_BUSY if self.mute < _FEW else _STALLED)
         self.lag = max(self.lag, before)
@@ -397,7 +403,14 @@ class Client(ABC):
             self.mute += 1
             require_in_time(is_in_time, f"no reply came to {what}")
             others = f", but {len(self.came)} other bytes{self.remark()}" if self.came else ""
+            is_sound = not others or any(each.at > began for each in self.order[-1:])
+            if is_sound and await self.next(is_meant, _DELIVERED):
+                self.delivered += 1
+                is_slow = self.delivered >= _FEW or self.mute > _MAX_DELIVERED
+                require_in_time(is_slow, f"the reply to {what} came later than {self.timeout:g} s")
+                others = ", but later"
             raise NoReply(what, f"no reply within {self.timeout:g} s{others}")
+        self.delivered = 0
         return found
 
     def remark(self) -> str:

@@ -15,7 +15,7 @@ from registry import clock
 _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _READINGS, _APART = 8, 0.03  # of one state; s between two at most
-_MAX_DURATION = 3.0  # s; in which a rate must show
+_MAX_DURATION = 8.0  # s; in which a rate must show
 _LASTING, _QUICK = 1.5, 0.01  # s; of a layer, whose end shows a wrong rate; for an exchange
 _SHIFTS = 1, 0x4000, 0xC001
 
@@ -75,8 +75,8 @@ def clock_shifts(subject: Subject) -> Rows:
 async def clock_rate(subject: Subject) -> None:
     """It runs faster by the rate of a Ping until the next, and by none unless it is armed."""
     _require_known(subject)
-    width = max(subject.exchange_time, subject.client.transit)
-    duration = max(0.35, 1.5 * width / (_HIGHEST * RATE - DRIFT))
+    await subject.request("GetStatus")  # whose exchanges all rests on
+    duration = max(0.35, 1.5 * subject.read_time / (_HIGHEST * RATE - DRIFT))
     require(duration <= _MAX_DURATION, "its exchanges are too long to see a rate")
 
     lasting = _LASTING if subject.exchange_time <= _QUICK else duration / 2  # s; not of the clock

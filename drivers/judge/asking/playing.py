@@ -7,7 +7,7 @@ from functools import partial
 
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal, require, require_in_time
-from drivers.judge.asking.material import Row, Rows, layer, play, send
+from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
 from drivers.protocol.sets import Command, Envelope
@@ -66,8 +66,10 @@ def renew(subject: Subject) -> Rows:
     )
     sooner = layer(0, renew=True, valid_for=subject.lasting(100))
     third = layer(3, subject.beside(3, 0.25), valid_for=subject.lasting(120))
+    turned = subject.one(subject.tone(0, 0.5, 90.0), valid_for=subject.lasting(400))
     return [
         (first, second, 0.05, layer(0, renew=True, valid_for=subject.lasting(200))),
+        (turned, layer(0, renew=True), send("GetAchieved", layer=0)),
         (layer(2, renew=True, valid_for=subject.lasting(100)), second),
         (third, layer(3, renew=True), send("GetAchieved", layer=3), 0.15 * subject.slowness),
         *((subject.one(valid_for=subject.lasting(before)), sooner) for before in (0, 400)),
@@ -80,6 +82,7 @@ def after(subject: Subject) -> Rows:
     first = subject.one(subject.tone(onset=subject.long_onset))
     waiting = layer(0, subject.tone(0, 0.25, frequency=subject.other), after=True)
     newer, over = layer(0, subject.tone(0, 0.75), after=True), _passed(subject, 3)
+    both = waiting, layer(1, subject.beside(1, 0.25))  # of which one alone waits
 
     async def achieved() -> None:
         answer = await subject.request("GetAchieved", layer=0)
@@ -91,6 +94,7 @@ def after(subject: Subject) -> Rows:
         (first, waiting, layer(0), over),
         (first, waiting, subject.one(level=0.75), over),
         (first, waiting, send("Silence", ramp=0), over),
+        *((first, stage(*each), send("Commit", token=2)) for each in (both, both[::-1])),
     ]
 
 
@@ -311,14 +315,15 @@ async def _expect_cancelled(subject: Subject) -> None:
 
 
 async def _expect_alike(subject: Subject, phase: float, time: float) -> None:
-    """Play two slow tones a time [s] apart, then the first of them again, that time later."""
+    """Play two slow tones a time [s] apart, the first renewed, then again, that time later."""
     await subject.arm()
     subject.shown.outputs.interferes = True
     first, second = (
         layer(number, subject.tone(0, 0.5, each, frequency=max(subject.lowest, _SLOW)))
         for number, each in enumerate((0.0, phase))
     )
-    await subject.run([first, time, second, time, first, time, subject.status])
+    renewed = layer(0, renew=True)
+    await subject.run([first, time, renewed, second, time, first, time, subject.status])
 
 
 @driving(_PLACE)

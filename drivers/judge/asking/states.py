@@ -18,6 +18,7 @@ _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdo
 _WRONG = "WRONG_STATE"
 _DENSE, _NEAR = 0.003, 0.0003  # s; between statuses at most; from samples to the clock
 _ROUGH = 20  # steps of level
+_READINGS = {"mark": "Mark", "electrical": "GetMeasured"}  # by their features
 
 
 @driving(_STATES)
@@ -28,9 +29,10 @@ def plays_nothing_disarmed(subject: Subject) -> Rows:
 
 def _unarmed(subject: Subject, ramp: int = 0) -> list[Row]:
     """Make what is refused, or changes no state, unless it is armed; ramp: of a Disarm [ms]."""
-    one = subject.one(level=0.75)
-    others: list[Row] = [each(one, token=9, code=_WRONG) for each in (play, stage)]
-    refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=0, code=_WRONG)
+    one, beyond = subject.one(level=0.75), QUANTITIES["ramp"].maximum
+    # The state comes before what is beyond the capabilities, and a layer that comes twice.
+    others: list[Row] = [play(one, token=9, code=_WRONG), stage(one, one, token=9, code=_WRONG)]
+    refused = send("Commit", token=1, code=_WRONG), send("Silence", ramp=beyond, code=_WRONG)
     return [*others, *refused, send("Ping", session=77), send("Disarm", ramp=ramp)]
 
 
@@ -38,7 +40,7 @@ def _latched(subject: Subject) -> list[Row]:
     """Make the same for an amplifier that is stopped or in a fault, which does not arm either."""
     serial = subject.identity["serial_number"]
     moves = [send("SetAddress", address=9, serial_number=serial, code=_WRONG)]
-    arm = send("Arm", watchdog=subject.can["watchdog_max"], session=77, code=_WRONG)
+    arm = send("Arm", watchdog=QUANTITIES["watchdog"].maximum, session=77, code=_WRONG)
     return [arm, *moves * subject.has("address"), *_unarmed(subject)]
 
 
@@ -127,10 +129,11 @@ async def _arm_as(subject: Subject, session: int) -> None:
 
 @driving(_STATES)
 def arming_ends_fades(subject: Subject) -> Rows:
-    """It is silent 5 ms after an Arm amid the fade of a Disarm."""
+    """It is silent 5 ms after an Arm amid a Disarm's fade, refused with the session of before."""
     disarm = send("Disarm", ramp=subject.can["ramp_max"])
+    ended = send("Arm", watchdog=subject.can["watchdog_max"], code="WRONG_SESSION")
     fades = partial(subject.follow, 0.02)
-    return [subject.arm, subject.one(), disarm, subject.arm, fades, subject.one()]
+    return [subject.arm, subject.one(), disarm, ended, subject.arm, fades, subject.one()]
 
 
 @driving(_STATES)
@@ -297,7 +300,8 @@ async def what_does_not_feed(subject: Subject) -> None:
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
     idle: Rows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
-        *(send("GetAchieved", layer=0), send("Clear", latch=0)),
+        *(send("GetAchieved", layer=0), send("Clear", latch=0), subject.client.hello),
+        *(send(name) for feature, name in _READINGS.items() if subject.has(feature)),
         send("Ping", session=77, code="WRONG_SESSION"),
         play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
         play(subject.one(), token=0x8001, code="BAD_TOKEN"),

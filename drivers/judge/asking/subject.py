@@ -444,12 +444,12 @@ class Subject(Material):
         Lest an amplifier that is late has longer times. A line may delay more than is known of it,
         which a reading shows.
         """
-        count, fastest, read = self.client.transactions, self.client.fastest, self._read_time
+        count, fastest, read = self.client.transactions, self.client.fastest, self.read_time
         slowest = max((fastest[each] for each in fastest if each not in _READ_ALONE), default=read)
         return min(slowest, count * REACTION + max(self.client.transit, count * read))
 
     @property
-    def _read_time(self) -> float:
+    def read_time(self) -> float:
         """The shortest exchange [s] so far of a message that only reads."""
         fastest = self.client.fastest
         return min((fastest[each] for each in _READ_ALONE if each in fastest), default=math.inf)
@@ -527,7 +527,7 @@ class Subject(Material):
         end = self.shown.outputs.settled_at(began[1]) + _SETTLING
         end = end if duration is None else began[0] + duration
         few = min(2 * self.exchange_time, 2.0)  # of a slow line
-        end = max(end, clock.now() + min(few, 2 * self._read_time))
+        end = max(end, clock.now() + min(few, 2 * self.read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
         while clock.now() < end + max(few, _SETTLING) * (seen < 2):

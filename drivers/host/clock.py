@@ -289,14 +289,14 @@ class HeldClock:
             default=-math.inf,
         )
         # And early nowhere: what is above by more than any crystal gains runs too fast.
-        most = min(
+        highest = min(
             [low + _MAX_CRYSTAL * (time - at) for at, low, _ in self._lowest], default=math.inf
         )
         is_early = off < sure - lead - far - earlier
         self._is_doubted = is_early and not self._is_doubted
         if self._is_doubted:  # one alone may show a Mark that came twice
             return lead + off
-        if is_early or off > later + far or off > later + most - lead + _TOO_FAST:
+        if is_early or off > later + far or off > later + highest - lead + _TOO_FAST:
             if is_reported:
                 self._jumped_at = time
             self._forget(time)

@@ -3,14 +3,16 @@
 The gateway is an ordinary API client. One that exits is restarted after a growing pause; it ends
 with the daemon, even if that is killed.
 
-A configuration is read by `python -m controller.daemon.children FILE`, which writes it, or the text
-of its problems, in Python's pickle format: a thread that parses for a second holds the
+A configuration is read by `python -m controller.daemon.children FILE`, which renders its content
+for the frequencies that it is given, and writes it, or the text of its problems, in Python's pickle
+format: a thread that parses for a second holds the
 interpreter's lock up to 5 ms at a time, and for as long as another program has its processor, so
 that the loop and its heartbeats would wait for it.
 """
 
 import asyncio
 import contextlib
+import io
 import logging
 import os
 import pickle
@@ -21,6 +23,7 @@ from pathlib import Path
 
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.process.child import child_command, ended
+from model.arrays import FloatArray
 from model.errors import InputError
 from registry import clock
 from registry.pauses import Backoff
@@ -81,8 +84,17 @@ _TIMEOUT = 60.0  # s; a plug-in or a file on a lost network folder may hang
 _NICE = 10  # above that of the daemon, whose loop comes first
 
 
-def read_in_child(file: Path) -> DaemonConfig:
-    """Read a configuration in a child process; blocks, InputError with all problems.
+class _Pieces(io.BytesIO):
+    """Bytes that take a call for each 64 KiB: in it other threads get the interpreter's lock."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(size)
+
+
+def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
+    """Read a configuration in a child process, for the frequencies of a table [Hz]; blocks.
+
+    Raises InputError with all problems.
 
     A plug-in that this process cannot load since it started is a problem, too. Raises OSError if
     the child cannot be started or fails.
@@ -90,7 +102,7 @@ def read_in_child(file: Path) -> DaemonConfig:
     try:
         done = subprocess.run(  # noqa: S603  our own module
             child_command("controller.daemon.children", str(file)),
-            stdin=subprocess.DEVNULL,
+            input=pickle.dumps(frequencies),
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is handled by the daemon
             timeout=_TIMEOUT,
@@ -101,7 +113,7 @@ def read_in_child(file: Path) -> DaemonConfig:
     if done.returncode != 0:
         raise OSError(f"reading {file} failed with status {done.returncode}")
     try:
-        read = pickle.loads(done.stdout)  # noqa: S301  of our own process
+        read = pickle.load(_Pieces(done.stdout))  # noqa: S301  of our own process
     except (ImportError, AttributeError, TypeError) as error:
         raise InputError(
             f"{file} uses a plug-in that was installed or changed after the daemon started "
@@ -119,7 +131,8 @@ def _main() -> None:
     sys.stdout = sys.stderr  # for what a plugin prints
     read: DaemonConfig | str
     try:
-        read = load_daemon_config(Path(sys.argv[1]))
+        frequencies = pickle.load(sys.stdin.buffer)  # noqa: S301  of the daemon
+        read = load_daemon_config(Path(sys.argv[1])).for_table(frequencies)
     except InputError as error:
         read = str(error)
     pickle.dump(read, output)

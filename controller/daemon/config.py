@@ -1,9 +1,10 @@
 """Loads and validates a daemon's configuration and the files that it names."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Self
 
 from controller.daemon.config_sections import (
     MAX_LAYOUTS,
@@ -23,6 +24,7 @@ from controller.sources.touch import (
     turned,
 )
 from drivers.by_hand.rig_check import check_links
+from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, read_document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Validation
@@ -74,6 +76,11 @@ class DaemonConfig:
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
+
+    def for_table(self, frequencies: FloatArray) -> Self:
+        """Return it with all that its layouts play made for the frequencies of a table [Hz]."""
+        layouts = {name: each.for_table(frequencies) for name, each in self.layouts.items()}
+        return replace(self, layouts=layouts)
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

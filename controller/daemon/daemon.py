@@ -61,7 +61,8 @@ class Daemon:
         lines: Callable[[Lines | None], Lines] = Lines,
         watchdog: float = WATCHDOG,
     ) -> None:
-        self._config = config
+        self._config = config = config.for_table(table.frequencies)
+        self._frequencies = table.frequencies
         self._log = log
         self._manager = manager
         self._dashboard = dashboard
@@ -224,13 +225,16 @@ class Daemon:
     async def _reload_now(self) -> ReloadResult:
         is_done = False
         try:
-            change = await in_thread(partial(read_again, self._config), name="reload")
+            change = await in_thread(
+                partial(read_again, self._config, self._frequencies), name="reload"
+            )
             is_armed = self._supervisor.operation.state in ENERGISED
             if reasons := change.refusals(is_armed=is_armed):
                 reasons += [f"{each}, but not applied" for each in change.changes]
             else:
                 reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
-                self._config, is_done = change.config, True
+                replaced, self._config, is_done = [self._config], change.config, True
+                await in_thread(partial(self._layouts.applied, change, replaced), name="reload")
         except (InputError, OSError) as error:
             reasons = [line.strip() for line in str(error).splitlines()]
         except Exception as error:  # systemd and clients wait for the end of the reload

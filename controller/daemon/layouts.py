@@ -1,13 +1,12 @@
 """The surface layouts of a running daemon, of which one is in use."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.topics import LayoutEvent
 from controller.daemon.config import DaemonConfig
 from controller.daemon.reload import ConfigChange
-from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
 from model.arrays import FloatArray
@@ -19,15 +18,15 @@ _logger = logging.getLogger(__name__)
 class LayoutChoice:
     """The layouts of a daemon's configuration; in use is the first until another one is chosen.
 
-    frequencies [Hz]: of the table, of which bands that it lacks are logged; changed: called when
-    another layout, or the same with other content, is in use.
+    config: made for a table; frequencies [Hz]: of that, to log bands that it lacks; changed: called
+    when another layout, or the same with other content, is in use.
     """
 
     def __init__(
         self, config: DaemonConfig, frequencies: FloatArray, *, changed: Callable[[], None]
     ) -> None:
         self._frequencies = frequencies
-        self._layouts = self._for_table(config.layouts)
+        self._layouts = config.layouts
         self._changed = changed
         self.name = next(iter(self._layouts))
         """Of the layout in use; None if none is configured."""
@@ -60,18 +59,11 @@ class LayoutChoice:
 
         If it was removed it is the first, of which it returns a note.
         """
-        before, self._layouts = self.name, self._for_table(change.config.layouts)
+        before, self._layouts = self.name, change.config.layouts
         name = before if before in self._layouts else next(iter(self._layouts))
-        if change.layouts:
-            self._warn_of_bands()
         if name != before or name in change.layouts:
             self._play(name)
         return [] if name == before else [f"layout in use: {name or 'none'}"]
-
-    def _for_table(
-        self, layouts: Mapping[str | None, SurfaceLayout]
-    ) -> Mapping[str | None, SurfaceLayout]:
-        return {name: each.for_table(self._frequencies) for name, each in layouts.items()}
 
     def event(self) -> LayoutEvent:
         """The layout in use, as an event."""
@@ -83,6 +75,15 @@ class LayoutChoice:
         self.player.replace(self._layouts[name])
         _logger.info("layout: %s in use", name or "none")
         self._changed()
+
+    def applied(self, change: ConfigChange, replaced: list[DaemonConfig]) -> None:
+        """Do what is left once a change is applied; outside of the event loop.
+
+        replaced: is emptied: to free many objects takes as long as to make them.
+        """
+        replaced.clear()
+        if change.layouts:
+            self._warn_of_bands()
 
     def _warn_of_bands(self) -> None:
         for name, layout in self._layouts.items():

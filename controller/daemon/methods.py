@@ -8,6 +8,7 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from functools import partial
 
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
@@ -67,11 +68,15 @@ from model.finger.perception import STRONG_DB_SL
 from model.table.table import LocalizationTable
 from registry import clock
 from registry.suggestions import did_you_mean
+from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
 
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
+
+MAX_WAITING_PLAYS = 16
+"""Plays of all clients together whose content is being rendered."""
 
 _SAVE_TIMEOUT = 0.2  # s; of what is being written when the daemon ends
 
@@ -108,6 +113,7 @@ class ApiService:
         self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving: asyncio.Task[None] | None = None
         self._save_problem = ""  # of the last attempt
+        self._preparing, self._waiting_plays = asyncio.Lock(), 0
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
@@ -315,12 +321,9 @@ class ApiService:
         return effects_result(self._layouts.player.layout)
 
     @api_method(is_repeated=False)
-    def play(self, client: Connection, params: PlayParams) -> Empty:
+    def play(self, client: Connection, params: PlayParams) -> Empty | Awaitable[Empty]:
         """Play an effect, or points, at a finger; only while armed."""
         # At the contact nearest to the position, at the effect's own level or below.
-        operation = self._supervisor.operation
-        if operation.state is not _ENABLED or self._controller.group.members.degraded:
-            raise _wrong_state(operation)
         name, effect, level_max = self._played(params)
         level = params.level_db_sl
         if level is not None and not MIN_DB_SL <= level <= level_max:
@@ -331,6 +334,52 @@ class ApiService:
                 where="level_db_sl",
                 remedy="choose one of these, or another level in the surface layout",
             )
+        self._nearest(params)
+        if effect.is_prepared(effect.level_db_sl if level is None else level):
+            return self._play(client, params, name, effect)
+        if self._waiting_plays >= MAX_WAITING_PLAYS:
+            raise RpcError(
+                ErrorCode.BUSY, "too much is being prepared to be played", remedy="try again"
+            )
+        return self._play_prepared(client, params, name, effect)
+
+    async def _play_prepared(
+        self, client: Connection, params: PlayParams, name: str, effect: Effect
+    ) -> Empty:
+        """Prepare an effect in a thread, one at a time, then play it."""
+        epoch, level = self._supervisor.operation.epoch, params.level_db_sl
+        made = effect.for_table(self._table.frequencies)  # its renditions are its own
+        work = partial(made.prepare, made.level_db_sl if level is None else level)
+        self._waiting_plays += 1
+        try:
+            async with self._preparing:
+                await in_thread(work, name="content")
+        finally:
+            self._waiting_plays -= 1
+        if self._supervisor.operation.epoch != epoch:
+            raise RpcError(
+                ErrorCode.WRONG_STATE, "stopped or disarmed meanwhile", remedy="play it again"
+            )
+        return self._play(client, params, name, made)
+
+    def _play(self, client: Connection, params: PlayParams, name: str, effect: Effect) -> Empty:
+        """Play an effect that is prepared at the finger that is there now."""
+        self._layouts.player.play(
+            name,
+            self._nearest(params),
+            clock.now(),
+            level_db_sl=params.level_db_sl,
+            player=client.name,
+            effect=effect,
+        )
+        self._controller.cycle.request_update()
+        return Empty()
+
+    def _nearest(self, params: PlayParams) -> Contact:
+        """Return the contact at which is played; raises RpcError without one, or if disarmed."""
+        operation = self._supervisor.operation
+        if operation.state is not _ENABLED or self._controller.group.members.degraded:
+            raise _wrong_state(operation)
 
         def distance(contact: Contact) -> float:
             return math.dist((contact.x, contact.y), (params.x_m, params.y_m))
@@ -343,16 +392,7 @@ class ApiService:
                 where="x_m",
                 remedy="touch the plate there, or send a touch over the API",
             )
-        self._layouts.player.play(
-            name,
-            nearest,
-            clock.now(),
-            level_db_sl=level,
-            player=client.name,
-            effect=effect,
-        )
-        self._controller.cycle.request_update()
-        return Empty()
+        return nearest
 
     def _played(self, params: PlayParams) -> tuple[str, Effect, float]:
         """Return what is to be played: its name, effect and highest level; raises RpcError."""
@@ -372,7 +412,7 @@ class ApiService:
             highest = min(layout.max_db_sl, MAX_DB_SL)
             level = min(STRONG_DB_SL, highest)
             made = File.of(pattern, name="points", level_db_sl=level, loop=params.loop)
-            return "points", made.for_table(self._table.frequencies), highest
+            return "points", made, highest
         name = params.effect or ""
         if (effect := layout.effects.get(name)) is None:
             raise RpcError(
@@ -394,7 +434,7 @@ class ApiService:
 
     @api_method()
     def strength(self, client: Connection, params: StrengthParams) -> StrengthResult:
-        """Set the strength of a touch source or client, or show it; the status shows all.
+        """Set the strength of a touch source, client or region, or show it; the status shows all.
 
         What plays is led there within 100 ms.
         """
@@ -402,7 +442,7 @@ class ApiService:
         if name not in known:
             raise RpcError(
                 ErrorCode.REFUSED,
-                f"name must be a touch source or client, got {name!a}",
+                f"name must be a touch source, client or region, got {name!a}",
                 where="name",
                 remedy=f"{did_you_mean(name, known)}choose one of {', '.join(known) or 'none'}",
             )

@@ -3,10 +3,11 @@
 Nothing here runs in the event loop, as large layouts take a while to compare.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig
+from model.arrays import FloatArray
 from registry.garbage_collection import without_collections
 
 _APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
@@ -39,10 +40,13 @@ class ConfigChange:
         return reasons
 
 
-def read_again(old: DaemonConfig) -> ConfigChange:
-    """Read a daemon's configuration again; blocks, raises as `read_in_child`."""
+def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
+    """Read a daemon's configuration again for a table's frequencies [Hz]; blocks.
+
+    Raises as `read_in_child`.
+    """
     with without_collections():  # of large layouts
-        return config_change(old, read_in_child(old.source))
+        return config_change(old, read_in_child(old.source, frequencies))
 
 
 def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
@@ -60,5 +64,7 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
     ]
     if before["level_db_sl"] != after["level_db_sl"]:
         changes.append(f"level_db_sl: from {before['level_db_sl']:g} to {after['level_db_sl']:g}")
+    kept = {name: now[name] if name in differ else was[name] for name in now}
     highest = [max(each.max_db_sl for each in layouts.values()) for layouts in (was, now)]
+    new = replace(new, layouts=kept)
     return ConfigChange(new, restart, changes, frozenset(differ), *highest)

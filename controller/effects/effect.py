@@ -200,6 +200,13 @@ class Effect(TunedSection, ABC):
         """Return it as it is played at the frequencies of a table [Hz]."""
         return self
 
+    def is_prepared(self, level_db_sl: float | None) -> bool:
+        """Whether a start at a level takes no time; else it is prepared first."""
+        return True
+
+    def prepare(self, level_db_sl: float | None) -> None:
+        """Make what a start at a level would take time for; called outside of the control loop."""
+
     def gives_level_in(self, region: Region | None) -> bool:
         """Whether its layout gives it a level of its own, in a region or outside of all."""
         is_given = region is not None and region.has_level

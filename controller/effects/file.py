@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -63,19 +63,33 @@ class File(Effect):
         self._pattern = read_content(path, self.channel) if path.suffix else _named(self.file)
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it for the frequencies of a table [Hz], with what takes long to make done."""
+        """Return it for the frequencies of a table [Hz]; nothing is prepared of it."""
         effect = self.model_copy()
-        effect._frequencies = tuple(frequencies.tolist())
-        effect._renditions(self.level_db_sl)
+        effect._frequencies, effect._rendered = tuple(frequencies.tolist()), {}
         return effect
 
-    def _renditions(self, level_db_sl: float | None) -> tuple[Rendition, Rendition]:
-        level = MAX_DB_SL if level_db_sl is None else level_db_sl
-        return _renditions(self._pattern, level, self._frequencies)
+    @cached_property
+    def _rendered(self) -> dict[float, tuple[Rendition, Rendition]]:
+        """Renditions by level: no part of what is compared."""
+        return {}
+
+    def is_prepared(self, level_db_sl: float | None) -> bool:
+        """Whether it is rendered at a level."""
+        return _level(level_db_sl) in self._rendered
+
+    def prepare(self, level_db_sl: float | None) -> None:
+        """Render it at a level.
+
+        Not by scaling another one: levels between the faintest and the strongest move by less.
+        """
+        level = _level(level_db_sl)
+        self._rendered[level] = _renditions(self._pattern, level, self._frequencies)
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start at its beginning."""
-        alone, among = self._renditions(level_db_sl)
+        if not self.is_prepared(level_db_sl):
+            self.prepare(level_db_sl)
+        alone, among = self._rendered[_level(level_db_sl)]
         return _FileRun(alone, among, now, loop=self.loop, is_limit=level_db_sl is None)
 
     @property
@@ -89,6 +103,11 @@ def named_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, File]:
     return {
         each: File.of(_named(each), name=each, level_db_sl=level_db_sl) for each in named_contents()
     }
+
+
+def _level(level_db_sl: float | None) -> float:
+    """The level [dB SL] of a rendition; None: for as strong as the neighbours allow."""
+    return MAX_DB_SL if level_db_sl is None else level_db_sl
 
 
 @lru_cache

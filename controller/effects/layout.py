@@ -55,8 +55,13 @@ class SurfaceLayout:
             yield None, ELSEWHERE, self.elsewhere
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it as it is played at the frequencies of a table [Hz]."""
+        """Return it as it is played at the frequencies of a table [Hz], prepared at its levels."""
         effects = {name: each.for_table(frequencies) for name, each in self.effects.items()}
+        for each in effects.values():
+            each.prepare(each.level_db_sl)
+        for region, _, name in self.uses():
+            if not effects[name].is_prepared(level := self.level_of(name, region)):
+                effects[name].prepare(level)
         return replace(self, effects=effects)
 
     @property

@@ -21,7 +21,7 @@ START = 1000.0  # s; not zero, which code could take for "never"
 _FIRST_PORT = 20_000
 _TURNS_MAX = 20_000  # at one moment; more are an endless loop
 _REAL_WAIT = 0.001  # s; for a thread that works
-_AWAITED = ("reload", "dump")  # names of threads for which time stands still
+_AWAITED = ("reload", "dump", "content")  # names of threads for which time stands still
 _LATENCY = (50e-6, 400e-6)  # s; of a loopback connection
 
 Seen = Callable[[str, str, bytes], None]

@@ -197,7 +197,7 @@ async def test_reload_ends_after_unexpected_error(
         manager = bench.daemon._manager
         monkeypatch.setattr(manager, "notify", lambda first, *_: notices.append(first))
 
-        def fail(path: Path) -> None:
+        def fail(*_: object) -> None:
             raise RuntimeError("injected")
 
         with monkeypatch.context() as patched:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from controller.daemon.children import read_in_child
@@ -18,6 +19,8 @@ from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.file import example_rig_path
 from virtual_loop import in_virtual_time
+
+FREQUENCIES = np.arange(60.0, 301.0, 20.0)  # Hz; of a table
 
 MOST_EVENTS = 4000
 """Of a callback that handles input of clients or files: 2000 calls and returns, about 1 ms."""
@@ -161,7 +164,7 @@ async def test_reload_costs_the_loop_nothing(
         assert max(events) <= MOST_EVENTS
         assert (await era.status()).state == ENABLED
     with pytest.raises(InputError, match=r"missing\.yaml"):
-        read_in_child(tmp_path / "missing.yaml")
+        read_in_child(tmp_path / "missing.yaml", FREQUENCIES)
 
 
 def test_reading_a_configuration_in_a_child_is_bounded_in_time(
@@ -170,7 +173,7 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
     """An error of the system, as if the child had failed; a child cannot start in no time."""
     monkeypatch.setattr("controller.daemon.children._TIMEOUT", 0.0)
     with pytest.raises(OSError, match="took longer"):
-        read_in_child(tmp_path / "daemon.yaml")
+        read_in_child(tmp_path / "daemon.yaml", FREQUENCIES)
 
 
 def test_plugin_installed_meanwhile_needs_a_restart(
@@ -189,7 +192,7 @@ def test_plugin_installed_meanwhile_needs_a_restart(
     (folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")
     (folder / "daemon.yaml").write_text("rig: rig.yaml\nlayouts: {panel: layout.yaml}\n")
     with pytest.raises(InputError, match="restart the daemon"):
-        read_in_child(folder / "daemon.yaml")
+        read_in_child(folder / "daemon.yaml", FREQUENCIES)
 
 
 def test_child_ends_by_none_of_the_daemons_own_signals() -> None:

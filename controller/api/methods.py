@@ -63,12 +63,13 @@ class HelloResult(Message):
 
 
 class StrengthResult(Message):
-    """The strengths of touch sources and clients that are known."""
+    """The strengths of touch sources, clients and regions that are known."""
 
     strengths: dict[str, float] = Field(
         default={},
         description="gain in dB by name, 0 where none is set: of the inputs of the configuration, "
-        "sources that had fingers, clients that are connected, and what else is set",
+        "sources that had fingers, clients that are connected, regions of the layout in use, and "
+        "what else is set",
     )
 
 
@@ -236,11 +237,13 @@ class PlayParams(Message):
 
 
 class StrengthParams(Message):
-    """A touch source or client and its gain; without a gain nothing is set."""
+    """A touch source, client or region and its gain; without a gain nothing is set."""
 
-    name: SourceName = Field(description="of an input, a sender there, a source or a client")
+    name: SourceName = Field(
+        description="of an input, a sender there, a source, a client or a region"
+    )
     gain_db: Annotated[GainDb | None, BY_PLACE] = Field(
-        None, description="of all that it brings, 0 for what layout and limits allow"
+        None, description="of all that it brings or has, 0 for what layout and limits allow"
     )
 
 

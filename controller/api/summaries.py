@@ -19,7 +19,7 @@ SUMMARIES = {
     "reload": "Read the daemon's files again, and apply their layouts if nothing else has changed.",
     "effects": "List the effects.",
     "play": "Play an effect, or points, at a finger; only while armed.",
-    "strength": "Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms.",
+    "strength": "Set the strength of a touch source, client or region, or show it; the status shows all. What plays is led there within 100 ms.",
     "subscribe": "Receive notifications of topics.",
     "unsubscribe": "Receive no more notifications of topics.",
 }

@@ -143,7 +143,7 @@ TOPICS: dict[Topic, TopicData] = {
         InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
     ),
     "strength": TopicData(
-        StrengthResult, "strengths of touch sources and clients, at rate_hz", "periodically"
+        StrengthResult, "strengths of sources, clients and regions, at rate_hz", "periodically"
     ),
 }
 """Every topic, by name."""

@@ -140,7 +140,7 @@ def of_method(method: str) -> Callable[..., None]:
 
 def strength(
     name: Annotated[
-        str | None, typer.Argument(metavar="[SOURCE|CLIENT]", help="Default: show all.")
+        str | None, typer.Argument(metavar="[SOURCE|CLIENT|REGION]", help="Default: show all.")
     ] = None,
     gain_db: Annotated[
         float | None, typer.Argument(metavar="[DB]", help="-40 to 0; default: show what is set.")

@@ -157,10 +157,11 @@ class EventPublisher:
             self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
 
     def strengths(self) -> StrengthResult:
-        """The strengths of all touch sources and clients that are known."""
+        """The strengths of all touch sources, clients and regions that are known."""
         known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
         clients = [name for _, name in known.clients() if not UNNAMED.fullmatch(name)]
-        names = sorted({*inputs, *known.sources, *clients})
+        regions = [each.name for each in self._player.layout.regions]
+        names = sorted({*inputs, *known.sources, *clients, *regions})
         return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
 
     def learning_summary(self) -> LearningSummary | None:

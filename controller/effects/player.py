@@ -76,8 +76,8 @@ class EffectPlayer:
     beside it the newest short pulse, 6 dB above it where no level is given. Of the fingers that
     feel the effect outside of all regions only the newest does. Short pulses of two fingers are 60
     ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
-    stimulus at the moment (no detent passed, no movement) does not count. strengths: of sources and
-    clients.
+    stimulus at the moment (no detent passed, no movement) does not count. strengths: of sources,
+    clients and regions.
     """
 
     def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
@@ -124,7 +124,9 @@ class EffectPlayer:
             )
             targets.append(target)
             self._targets.add(key)
-            gains_db[key, target.is_short] = self.strengths.gain_db(key.source, play.player)
+            region = None if play.region is None else play.region.name
+            gain = self.strengths.gain_db(key.source, play.player, region)
+            gains_db[key, target.is_short] = gain
             if key in waiting and target.is_short:
                 self._waiting[key] = waiting[key]
         felt = list[Target]()

@@ -1,4 +1,4 @@
-"""Strengths: a gain on all that a touch source or a client brings, kept by its name."""
+"""Strengths: a gain on what a source or client brings, or a region has, kept by its name."""
 
 import json
 import re
@@ -30,8 +30,9 @@ class Strengths:
     """Gains [dB] by name, 0 at most, which is what holds where none is set.
 
     A name is that of a touch input of the configuration, of a sender there
-    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, or of a client. At a
-    finger the gains of its names and of the client that plays its effect add up, each once.
+    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, of a client, or of a
+    region of a layout. At a finger the gains of its names, of its region and of the client that
+    plays its effect add up, each once.
     """
 
     def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
@@ -47,9 +48,12 @@ class Strengths:
         name, _ = self._names_of(source)
         self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
 
-    def gain_db(self, source: str, player: str | None = None) -> float:
-        """Return the gain at a finger of a source; player: the client that plays its effect."""
-        names = {*self._names_of(source), player} if self.gains_db else ()
+    def gain_db(self, source: str, player: str | None = None, region: str | None = None) -> float:
+        """Return the gain at a finger of a source; player: the client that plays its effect.
+
+        region: in which the effect is felt.
+        """
+        names = {*self._names_of(source), player, region} if self.gains_db else ()
         return sum([gain for name, gain in self.gains_db.items() if name in names])
 
     def set(self, name: str, gain_db: float) -> None:

@@ -28,7 +28,7 @@ export interface Methods {
   effects: { params: Empty; result: EffectsResult };
   /** Play an effect, or points, at a finger; only while armed. */
   play: { params: PlayParams; result: Empty };
-  /** Set the strength of a touch source or client, or show it; the status shows all. What plays is led there within 100 ms. */
+  /** Set the strength of a touch source, client or region, or show it; the status shows all. What plays is led there within 100 ms. */
   strength: { params: StrengthParams; result: StrengthResult };
   /** Receive notifications of topics. */
   subscribe: { params: SubscribeParams; result: Empty };
@@ -61,7 +61,7 @@ export interface Topics {
   plate: PlateEvent;
   /** touch inputs that are missing, mute or back; rejected touches, each second */
   inputs: InputsEvent;
-  /** strengths of touch sources and clients, at rate_hz */
+  /** strengths of sources, clients and regions, at rate_hz */
   strength: StrengthResult;
 }
 export type Topic = keyof Topics;
@@ -117,7 +117,7 @@ export interface StatusResult {
   /** the same, nominal */
   predicted_contrast_db?: number | null;
   predicted_level_db_sl: number | null;
-  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, and what else is set */
+  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, regions of the layout in use, and what else is set */
   strengths?: Record<string, number>;
   /** time of this response on CLOCK_MONOTONIC */
   time_s: number;
@@ -261,17 +261,17 @@ export interface PlayParams {
   loop?: boolean;
 }
 
-/** A touch source or client and its gain; without a gain nothing is set. */
+/** A touch source, client or region and its gain; without a gain nothing is set. */
 export interface StrengthParams {
-  /** of an input, a sender there, a source or a client */
+  /** of an input, a sender there, a source, a client or a region */
   name: string;
-  /** of all that it brings, 0 for what layout and limits allow */
+  /** of all that it brings or has, 0 for what layout and limits allow */
   gain_db?: number | null;
 }
 
-/** The strengths of touch sources and clients that are known. */
+/** The strengths of touch sources, clients and regions that are known. */
 export interface StrengthResult {
-  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, and what else is set */
+  /** gain in dB by name, 0 where none is set: of the inputs of the configuration, sources that had fingers, clients that are connected, regions of the layout in use, and what else is set */
   strengths?: Record<string, number>;
 }
 

@@ -119,7 +119,7 @@ export class EraClient extends EventEmitter {
     return this.call("stop", { client: this.#name });
   }
 
-  /** Set the strength of a touch source or client, by its name: -40 to 0 dB. */
+  /** Set the strength of a touch source, client or region, by its name: -40 to 0 dB. */
   async strength(name, gain_db) {
     if (gain_db != null) requireFinite({ gain_db });
     return this.call("strength", { name, gain_db });

@@ -250,7 +250,7 @@ export class Connection {
     this.socket.send(JSON.stringify({ jsonrpc: "2.0", method: "touch", params }));
   }
 
-  // Set the strength of a touch source or client, -40 to 0 dB, or ask for it; a promise of it.
+  // Set the strength of a touch source, client or region, -40 to 0 dB, or ask for it; a promise of it.
   async strength(name, gain_db = null) {
     if (gain_db !== null) requireFinite({ gain_db });
     return (await this.call("strength", { name, gain_db })).strengths[name];

@@ -1,4 +1,4 @@
-"""The strength of touch sources and clients, from the API to the skin, in virtual time."""
+"""The strength of touch sources, clients and regions, from the API to the skin, in virtual time."""
 
 import asyncio
 import json
@@ -157,7 +157,9 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
         held.cancel()
         await asyncio.gather(one.close(), other.close())
     async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
-        assert (await era.status()).strengths == {"pen": -3, "seat": -6, "test": -2}
+        regions = dict.fromkeys(PLACES, 0.0)
+        kept = {"pen": -3, "seat": -6, "test": -2}
+        assert (await era.status()).strengths == {**regions, **kept}
         one, other = await bench.client("seat"), await bench.client("another")
         held = asyncio.create_task(hold(1e3, (one, "pen", "left"), (other, "finger", "right")))
         assert await levels(era) == [11, 20]
@@ -175,7 +177,46 @@ async def test_strengths_are_kept_by_name(tmp_path: Path) -> None:
     async with seats(tmp_path, "strengths: kept.json\n") as (bench, era):
         assert (await era.strength(name="another", gain_db=-1)).strengths == {"another": -1}
         await bench.client("era")
-        assert (await era.status()).strengths.keys() == {"another", "pen", "seat", "test"}
+        assert (await era.status()).strengths.keys() == {"another", *PLACES, "pen", "seat", "test"}
+
+
+@in_virtual_time
+async def test_two_people_at_one_panel_differ_by_region(tmp_path: Path) -> None:
+    """6 dB less where one of them sits, for what is felt and what is played there; kept by name.
+
+    Gains of source and region add up.
+    """
+
+    async def levels(era: AsyncClient) -> dict[str, float]:
+        await asyncio.sleep(0.4)
+        places = {x: name for name, (x, _) in PLACES.items()}
+        contacts = (await era.status()).contacts
+        return {places[each.x_m]: round(each.level_db_sl or 0.0, 1) for each in contacts}
+
+    async def both(panel: AsyncClient) -> None:
+        while True:
+            await panel.touch([*PLACES.values()], source="panel")
+            await asyncio.sleep(0.02)
+
+    kept = "strengths: kept.json\n"
+    for gains, expected in (
+        ({"right": -6}, {"left": 20, "right": 14}),
+        ({"panel": -3}, {"left": 17, "right": 11}),  # and the region's, which was kept
+    ):
+        async with seats(tmp_path, kept) as (bench, era):
+            panel = await bench.client("seats")
+            held = asyncio.create_task(both(panel))
+            await asyncio.sleep(0.1)
+            for name, gain in gains.items():
+                await era.strength(name, gain)
+            assert await levels(era) == expected
+            await era.play("buzz", PLACES["right"])
+            assert await levels(era) == expected
+            with pytest.raises(RpcError, match=r"got 'rigt'; did you mean right\? "):
+                await era.strength("rigt", -6)
+            held.cancel()
+            await panel.close()
+    assert json.loads((tmp_path / "kept.json").read_text()) == {"right": -6, "panel": -3}
 
 
 @in_virtual_time

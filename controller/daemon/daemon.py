@@ -231,10 +231,12 @@ class Daemon:
             is_armed = self._supervisor.operation.state in ENERGISED
             if reasons := change.refusals(is_armed=is_armed):
                 reasons += [f"{each}, but not applied" for each in change.changes]
+                unused = [change.config]
             else:
                 reasons = [*change.changes, *self._layouts.apply(change)] or ["nothing has changed"]
-                replaced, self._config, is_done = [self._config], change.config, True
-                await in_thread(partial(self._layouts.applied, change, replaced), name="reload")
+                unused, self._config, is_done = [self._config], change.config, True
+            del change
+            await in_thread(unused.clear, name="reload")  # to free many objects takes as long
         except (InputError, OSError) as error:
             reasons = [line.strip() for line in str(error).splitlines()]
         except Exception as error:  # systemd and clients wait for the end of the reload

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.topics import LayoutEvent
 from controller.daemon.config import DaemonConfig
-from controller.daemon.reload import ConfigChange
+from controller.daemon.reload import ConfigChange, warn_of_bands
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
 from model.arrays import FloatArray
@@ -25,7 +25,6 @@ class LayoutChoice:
     def __init__(
         self, config: DaemonConfig, frequencies: FloatArray, *, changed: Callable[[], None]
     ) -> None:
-        self._frequencies = frequencies
         self._layouts = config.layouts
         self._changed = changed
         self.name = next(iter(self._layouts))
@@ -34,7 +33,7 @@ class LayoutChoice:
             self._layouts[self.name], Strengths(read_strengths(config.strengths))
         )
         """Plays the layout in use."""
-        self._warn_of_bands()
+        warn_of_bands(self._layouts, frequencies)
 
     @property
     def names(self) -> list[str]:
@@ -75,17 +74,3 @@ class LayoutChoice:
         self.player.replace(self._layouts[name])
         _logger.info("layout: %s in use", name or "none")
         self._changed()
-
-    def applied(self, change: ConfigChange, replaced: list[DaemonConfig]) -> None:
-        """Do what is left once a change is applied; outside of the event loop.
-
-        replaced: is emptied: to free many objects takes as long as to make them.
-        """
-        replaced.clear()
-        if change.layouts:
-            self._warn_of_bands()
-
-    def _warn_of_bands(self) -> None:
-        for name, layout in self._layouts.items():
-            for problem in layout.band_problems(self._frequencies):
-                _logger.warning("layout %s: %s", name, problem)

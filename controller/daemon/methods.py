@@ -75,9 +75,6 @@ _logger = logging.getLogger(__name__)
 PLAY_RADIUS = 0.020
 """Largest distance [m] from the position of a requested effect to the finger that feels it."""
 
-MAX_WAITING_PLAYS = 16
-"""Plays of all clients together whose content is being rendered."""
-
 _SAVE_TIMEOUT = 0.2  # s; of what is being written when the daemon ends
 
 _ENABLED = DaemonState.OPERATION_ENABLED
@@ -113,7 +110,7 @@ class ApiService:
         self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
         self._saving: asyncio.Task[None] | None = None
         self._save_problem = ""  # of the last attempt
-        self._preparing, self._waiting_plays = asyncio.Lock(), 0
+        self._preparing = asyncio.Lock()  # of what is played, for which clients wait
 
     def handlers(self) -> Mapping[str, Handler]:
         """Handlers by method name."""
@@ -321,7 +318,7 @@ class ApiService:
         return effects_result(self._layouts.player.layout)
 
     @api_method(is_repeated=False)
-    def play(self, client: Connection, params: PlayParams) -> Empty | Awaitable[Empty]:
+    async def play(self, client: Connection, params: PlayParams) -> Empty:
         """Play an effect, or points, at a finger; only while armed."""
         # At the contact nearest to the position, at the effect's own level or below.
         name, effect, level_max = self._played(params)
@@ -334,46 +331,32 @@ class ApiService:
                 where="level_db_sl",
                 remedy="choose one of these, or another level in the surface layout",
             )
-        self._nearest(params)
-        if effect.is_prepared(effect.level_db_sl if level is None else level):
-            return self._play(client, params, name, effect)
-        if self._waiting_plays >= MAX_WAITING_PLAYS:
-            raise RpcError(
-                ErrorCode.BUSY, "too much is being prepared to be played", remedy="try again"
-            )
-        return self._play_prepared(client, params, name, effect)
-
-    async def _play_prepared(
-        self, client: Connection, params: PlayParams, name: str, effect: Effect
-    ) -> Empty:
-        """Prepare an effect in a thread, one at a time, then play it."""
-        epoch, level = self._supervisor.operation.epoch, params.level_db_sl
-        made = effect.for_table(self._table.frequencies)  # its renditions are its own
-        work = partial(made.prepare, made.level_db_sl if level is None else level)
-        self._waiting_plays += 1
-        try:
-            async with self._preparing:
-                await in_thread(work, name="content")
-        finally:
-            self._waiting_plays -= 1
-        if self._supervisor.operation.epoch != epoch:
-            raise RpcError(
-                ErrorCode.WRONG_STATE, "stopped or disarmed meanwhile", remedy="play it again"
-            )
-        return self._play(client, params, name, made)
-
-    def _play(self, client: Connection, params: PlayParams, name: str, effect: Effect) -> Empty:
-        """Play an effect that is prepared at the finger that is there now."""
+        contact = self._nearest(params)
+        if not effect.is_prepared(effect.level_db_sl if level is None else level):
+            epoch, effect = self._supervisor.operation.epoch, await self._prepared(effect, level)
+            contact = self._nearest(params)
+            if self._supervisor.operation.epoch != epoch:
+                raise RpcError(
+                    ErrorCode.WRONG_STATE, "stopped or disarmed meanwhile", remedy="play it again"
+                )
         self._layouts.player.play(
             name,
-            self._nearest(params),
+            contact,
             clock.now(),
-            level_db_sl=params.level_db_sl,
+            level_db_sl=level,
             player=client.name,
             effect=effect,
         )
         self._controller.cycle.request_update()
         return Empty()
+
+    async def _prepared(self, effect: Effect, level_db_sl: float | None) -> Effect:
+        """Return an effect prepared at a level, its own by default: in a thread, one at a time."""
+        made = effect.for_table(self._table.frequencies)  # its renditions are its own
+        work = partial(made.prepare, made.level_db_sl if level_db_sl is None else level_db_sl)
+        async with self._preparing:
+            await in_thread(work, name="content")
+        return made
 
     def _nearest(self, params: PlayParams) -> Contact:
         """Return the contact at which is played; raises RpcError without one, or if disarmed."""

@@ -3,12 +3,17 @@
 Nothing here runs in the event loop, as large layouts take a while to compare.
 """
 
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig
+from controller.effects.layout import SurfaceLayout
 from model.arrays import FloatArray
 from registry.garbage_collection import without_collections
+
+_logger = logging.getLogger(__name__)
 
 _APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
 
@@ -46,7 +51,20 @@ def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
     Raises as `read_in_child`.
     """
     with without_collections():  # of large layouts
-        return config_change(old, read_in_child(old.source, frequencies))
+        change = config_change(old, read_in_child(old.source, frequencies))
+        warn_of_bands(
+            {name: change.config.layouts.get(name) for name in change.layouts}, frequencies
+        )
+        return change
+
+
+def warn_of_bands(
+    layouts: Mapping[str | None, SurfaceLayout | None], frequencies: FloatArray
+) -> None:
+    """Log what layouts play in place of bands that a table of frequencies [Hz] lacks."""
+    for name, layout in layouts.items():
+        for problem in layout.band_problems(frequencies) if layout else ():
+            _logger.warning("layout %s: %s", name, problem)
 
 
 def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:

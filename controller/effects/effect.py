@@ -204,7 +204,7 @@ class Effect(TunedSection, ABC):
         """Whether a start at a level takes no time; else it is prepared first."""
         return True
 
-    def prepare(self, level_db_sl: float | None) -> None:
+    def prepare(self, level_db_sl: float | None) -> object:
         """Make what a start at a level would take time for; called outside of the control loop."""
 
     def gives_level_in(self, region: Region | None) -> bool:

@@ -69,27 +69,28 @@ class File(Effect):
         return effect
 
     @cached_property
-    def _rendered(self) -> dict[float, tuple[Rendition, Rendition]]:
+    def _rendered(self) -> dict[float | None, tuple[Rendition, Rendition]]:
         """Renditions by level: no part of what is compared."""
         return {}
 
     def is_prepared(self, level_db_sl: float | None) -> bool:
         """Whether it is rendered at a level."""
-        return _level(level_db_sl) in self._rendered
+        return level_db_sl in self._rendered
 
-    def prepare(self, level_db_sl: float | None) -> None:
-        """Render it at a level.
+    def prepare(self, level_db_sl: float | None) -> tuple[Rendition, Rendition]:
+        """Render it at a level, for a finger that is alone, and for one among others.
 
-        Not by scaling another one: levels between the faintest and the strongest move by less.
+        Not by scaling another rendition: the faintest intensity has the same level in each.
         """
-        level = _level(level_db_sl)
-        self._rendered[level] = _renditions(self._pattern, level, self._frequencies)
+        if level_db_sl not in self._rendered:
+            level = MAX_DB_SL if level_db_sl is None else level_db_sl
+            alone = rendered(self._pattern, level, np.array(self._frequencies))
+            self._rendered[level_db_sl] = alone, alone.smoothed()
+        return self._rendered[level_db_sl]
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start at its beginning."""
-        if not self.is_prepared(level_db_sl):
-            self.prepare(level_db_sl)
-        alone, among = self._rendered[_level(level_db_sl)]
+        alone, among = self.prepare(level_db_sl)
         return _FileRun(alone, among, now, loop=self.loop, is_limit=level_db_sl is None)
 
     @property
@@ -105,23 +106,9 @@ def named_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, File]:
     }
 
 
-def _level(level_db_sl: float | None) -> float:
-    """The level [dB SL] of a rendition; None: for as strong as the neighbours allow."""
-    return MAX_DB_SL if level_db_sl is None else level_db_sl
-
-
 @lru_cache
 def _named(name: str) -> Pattern:
     return read_content(named_content(name))
-
-
-@lru_cache(maxsize=64)
-def _renditions(
-    pattern: Pattern, level_db_sl: float, frequencies: tuple[float, ...]
-) -> tuple[Rendition, Rendition]:
-    """How a pattern is played by a finger that is alone, and by one among others."""
-    found = rendered(pattern, level_db_sl, np.array(frequencies))
-    return found, found.smoothed()
 
 
 class _FileRun(EffectRun):

@@ -60,8 +60,7 @@ class SurfaceLayout:
         for each in effects.values():
             each.prepare(each.level_db_sl)
         for region, _, name in self.uses():
-            if not effects[name].is_prepared(level := self.level_of(name, region)):
-                effects[name].prepare(level)
+            effects[name].prepare(self.level_of(name, region))
         return replace(self, effects=effects)
 
     @property

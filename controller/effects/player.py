@@ -124,9 +124,9 @@ class EffectPlayer:
             )
             targets.append(target)
             self._targets.add(key)
-            region = None if play.region is None else play.region.name
-            gain = self.strengths.gain_db(key.source, play.player, region)
-            gains_db[key, target.is_short] = gain
+            gains_db[key, target.is_short] = self.strengths.gain_db(
+                key.source, play.player, play.region.name if play.region else None
+            )
             if key in waiting and target.is_short:
                 self._waiting[key] = waiting[key]
         felt = list[Target]()

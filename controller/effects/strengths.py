@@ -1,6 +1,7 @@
 """Strengths: a gain on what a source or client brings, or a region has, kept by its name."""
 
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,9 +11,9 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from controller.effects.gains import GainDb, SourceName
 from model.arguments import shown
+from model.config.document import read_bytes
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
-from registry.regular_file import regular_file
 
 MAX_NAMES = 64
 """How many touch sources are remembered, and how many names may have a gain."""
@@ -86,21 +87,16 @@ class Strengths:
 
 def read_strengths(file: Path | None) -> Mapping[str, float]:
     """Read the gains [dB] of a file, none where there is no file; raises InputError."""
-    if file is None:
+    if file is None or not os.path.lexists(file):
         return {}
+    text = read_bytes(file, _MAX_SIZE, is_for="remove it", give="a file of strengths")
     try:
-        with open(file, "rb", opener=regular_file) as stream:
-            text = stream.read(_MAX_SIZE + 1)
-        if len(text) > _MAX_SIZE:
-            raise InputError(f"{file}: must be up to {_MAX_SIZE >> 20} MiB long; remove it")
         # A number of many digits becomes infinite, and is refused as such.
         gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
         return _GAINS.validate_python(gains, strict=True)
-    except FileNotFoundError:
-        return {}
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
-    except (ValidationError, OSError) as error:
+    except ValidationError as error:
         raise InputError(
             f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
             "remove it"

@@ -106,11 +106,11 @@ class LineWriter(logging.Handler):
             if self._file is None:
                 sys.stderr.write(line)
                 sys.stderr.flush()
-                return
-            with open_log_file(self._file) as stream:
-                written = stream.write(data := line.encode())
-                if written < len(data):
-                    stream.truncate(stream.tell() - written)
+            else:
+                with open_log_file(self._file) as stream:
+                    written = stream.write(data := line.encode())
+                    if written < len(data):
+                        stream.truncate(stream.tell() - written)
 
 
 class LogThread(QueueHandler):

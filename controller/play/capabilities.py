@@ -90,7 +90,7 @@ def playback_capabilities(
     play, or a wired channel that its amplifier does not have.
     """
     for era, wired in rig.wiring.items():
-        channels = amplifiers[wired.amplifier].capabilities["channels"]
+        channels = amplifiers[wired.amplifier].ledger.capabilities["channels"]
         if wired.number >= channels:
             raise InputError(
                 f"channel of ERA {era} must be 0 to {channels - 1} on amplifier "
@@ -98,8 +98,8 @@ def playback_capabilities(
             )
     each = [
         playable_drive_modes(
-            level_step=_LEVEL.from_wire(one.capabilities["level_step"]),
-            phase_step=_PHASE_STEP.from_wire(one.capabilities["phase_step"]),
+            level_step=_LEVEL.from_wire(one.ledger.capabilities["level_step"]),
+            phase_step=_PHASE_STEP.from_wire(one.ledger.capabilities["phase_step"]),
         )
         for one in amplifiers.values()
     ]
@@ -109,24 +109,31 @@ def playback_capabilities(
             f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
             f"{drive_mode}; leave it out for the best"
         )
-    limits = {name: one.ledger.limits for name, one in amplifiers.items()}
-    levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
     return PlaybackCapabilities(
         drive_mode=drive_mode or playable[-1],
         playable=playable,
-        limits=Limits(
-            (
-                max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
-                min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
-            ),
-            {era.name: era.full_level * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
-            power=min(one.power for one in limits.values()),
-            slew=min(one.slew for one in limits.values()),
-        ),
+        limits=limits_of(rig, amplifiers),
         envelope_support=envelope_support(rig, amplifiers),
-        ramp_max=min(_RAMP.from_wire(one.capabilities["ramp_max"]) for one in amplifiers.values()),
-        layers=min(one.capabilities["layers"] for one in amplifiers.values()),
+        ramp_max=min(
+            _RAMP.from_wire(one.ledger.capabilities["ramp_max"]) for one in amplifiers.values()
+        ),
+        layers=min(one.ledger.capabilities["layers"] for one in amplifiers.values()),
         course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=MAX_STEP),
+    )
+
+
+def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
+    """Return what the amplifiers of a rig, by name, allow as they were identified last."""
+    limits = {name: one.ledger.limits for name, one in amplifiers.items()}
+    levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
+    return Limits(
+        (
+            max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
+            min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
+        ),
+        {era.name: era.full_level * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
+        power=min(one.power for one in limits.values()),
+        slew=min(one.slew for one in limits.values()),
     )
 
 
@@ -157,7 +164,7 @@ def _knots(
         _knots_on(line, [wired[name] for name in names], within) for line, names in by_line.items()
     ]
     carried += [
-        _knots_in(amplifiers[name].capabilities["set_words"], [count])
+        _knots_in(amplifiers[name].ledger.capabilities["set_words"], [count])
         for name, count in wired.items()
     ]
     each = min([_knots_of(amplifiers[name], step) for name in wired], default=0)
@@ -169,7 +176,7 @@ def _knots_of(amplifier: Amplifier, max_step: float) -> int:
 
     In steps from that of the model to a longest one, max_step [s].
     """
-    can = amplifier.capabilities
+    can = amplifier.ledger.capabilities
     low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
     return int(can["knots"]) if low <= KNOT_STEP <= max_step <= high else 0
 

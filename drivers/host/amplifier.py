@@ -163,7 +163,7 @@ class Amplifier(Dialogue):
     async def _arm(self, session: int, watchdog: float) -> Values:
         await self.identify(timeout=REPLY_TIMEOUT)  # before the watchdogs of others that are armed
         wire = _WATCHDOG.to_wire(watchdog)
-        low, high = (self.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
+        low, high = (self.ledger.capabilities[f"watchdog_{end}"] for end in ("min", "max"))
         if not low <= wire <= high:
             bounds = f"{_WATCHDOG.from_wire(low):g} to {_WATCHDOG.from_wire(high):g}"
             raise CommandError(f"watchdog must be {bounds} s, got {watchdog:g} s")
@@ -197,10 +197,9 @@ class Amplifier(Dialogue):
         shown = await self.request("GetAchieved", {"layer": one.layer}, Priority.SET)
         if one.renew or shown["token"] != token:
             return one
-        problem = achieved_problem(
-            one, shown, self.capabilities, is_exact=False, slack=_WIRE_ROUNDING
-        )
-        achieved = achieved_layer(one, shown, self.capabilities)
+        can = self.ledger.capabilities
+        problem = achieved_problem(one, shown, can, is_exact=False, slack=_WIRE_ROUNDING)
+        achieved = achieved_layer(one, shown, can)
         if problem is None:
             self._misachieved = 0
             self.ledger.correct(one, achieved, token)

@@ -51,7 +51,8 @@ class Clocks:
         for line in self._members.lines:
             of_line = [each for each in every if each.line is line]
             self._turns[line] = cycle(of_line)
-            if len(of_line) > 1 and all(has_feature(each.capabilities, "mark") for each in of_line):
+            know_mark = [has_feature(each.ledger.capabilities, "mark") for each in of_line]
+            if len(of_line) > 1 and all(know_mark):
                 self._marked.add(line)
         for each in every:
             each.clock.is_alone = len(every) == 1

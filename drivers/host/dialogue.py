@@ -39,6 +39,7 @@ from drivers.protocol.sets import (
     LayerSet,
     is_last,
     is_newer_token,
+    is_vibrating,
     pack_layers,
     parts,
 )
@@ -96,6 +97,7 @@ class Dialogue:
     def __init__(self, line: Line, address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
+        """Empty until it is identified, and while it is unsure who replies; its ledger keeps them."""
         self.session = 0
         self.may_be_armed = False
         """Whether an Arm of this host may have been carried out since it was disarmed."""
@@ -235,7 +237,9 @@ class Dialogue:
             delay += 2 * words / PART_WORDS * takes
         admitted = self.ledger.admit(layers, moment, delay=delay + longer)
         stream = pack_layers(admitted)
-        if len(stream) > (limit := self.capabilities["set_words"]):
+        if not self.capabilities and is_vibrating(*admitted):
+            raise CommandRefused(f"amplifier {self.name} must be identified first; open it again")
+        if len(stream) > (limit := self.ledger.capabilities["set_words"]):
             raise CommandRefused(f"a set must have at most {limit} words, got {len(stream)}")
         return delay, (admitted, stream)
 
@@ -317,7 +321,7 @@ class Dialogue:
             self._admitted = None
             if name == "Silence" and self._ledger is not None:
                 self.played_at = now
-                self._ledger.may_be_silent.update(range(self.capabilities["layers"]))
+                self._ledger.may_be_silent.update(range(self._ledger.capabilities["layers"]))
         elif admitted is not None and values.get("token") == admitted.token and self._ledger:
             is_now = name == "Set" and values["now"] and is_last(values)
             if name == "Commit" or is_now:

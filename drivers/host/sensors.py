@@ -74,7 +74,7 @@ class Reading:
 
 async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
     """Read what its sensors measure, and where; empty if it has none."""
-    if not has_feature(amplifier.capabilities, "sensors"):
+    if not has_feature(amplifier.ledger.capabilities, "sensors"):
         return ()
     found: list[Sensor] = []
     while True:
@@ -89,7 +89,7 @@ async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
 
 async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
     """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
-    if not has_feature(amplifier.capabilities, "electrical"):
+    if not has_feature(amplifier.ledger.capabilities, "electrical"):
         return []
     measured = await amplifier.request("GetMeasured", {}, Priority.READING)
     voltage, current = _Q["channel_voltage"].from_wire, _Q["channel_current"].from_wire

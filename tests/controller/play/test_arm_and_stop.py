@@ -12,7 +12,7 @@ from controller.play.loop import Controller
 from drivers.errors import LinkError
 from drivers.host.group import GroupState
 from drivers.opening import Lines
-from drivers.protocol.records import Values
+from drivers.protocol.records import Refusal, Values
 from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Channel
@@ -108,6 +108,38 @@ async def test_incomplete_set_is_silenced_before_the_next() -> None:
             assert sent == ["Set", "Commit", "Silence", "Set", "Commit"]
             commit, silence = end.times("Commit")[0], end.times("Silence")[1]
             assert not [time for time in end.times("Ping") if commit <= time <= silence]
+
+
+@in_virtual_time
+async def test_no_plan_fails_while_an_amplifier_is_identified_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A stop finds all closed, one by a lost line, and the other tells no capabilities any more.
+
+    The finger that rests is planned for meanwhile, and felt once both are open again and armed.
+    """
+    async with set_running("a", "b") as chain:
+        chain.far_ends[1].fault("unplug")
+        await chain.hold(0.5)
+        with pytest.raises(LinkError):
+            await chain.controller.open()
+        known, other = chain.far_ends
+
+        def refuse(name: str, values: Values) -> None:
+            if name == "GetCaps":
+                raise Refusal("as told", "WRONG_STATE")
+
+        known.lie(refuse)
+        await chain.controller.stop_all()
+        await chain.hold(0.5, down=[FINGER])
+        assert not [each for each in caplog.records if "plan failed" in each.getMessage()]
+        known.answer = lambda name, values: None
+        other.recover()
+        await chain.controller.open()
+        await chain.controller.clear()
+        await chain.controller.arm()
+        await chain.hold(0.1)
+        assert any(known.levels)
 
 
 @pytest.mark.parametrize(

@@ -173,3 +173,19 @@ async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()
+
+
+@in_virtual_time
+async def test_amplifier_that_is_not_identified_plays_nothing_and_is_silenced(wire: str) -> None:
+    """It is named by what is planned for it; what it plays is silenced as before."""
+    end = MemoryLine(wire, "a")
+    group = await group_of(end)
+    await group.apply({"a": [loud(0.5)]})
+    end.hosts["a"].capabilities = {}  # as of a stop that found its line closed
+    refusal = group.sets.refusal_of({"a": [loud(0.5)]})
+    assert "a must be identified" in str(refusal)
+    with pytest.raises(CommandRefused, match="a must be identified"):
+        await group.apply({"a": [loud(0.4)]})
+    await group.silence(0.005)
+    await asyncio.sleep(0.01)
+    assert end.levels("a") == [0.0, 0.0]

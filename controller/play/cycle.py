@@ -24,6 +24,7 @@ from drivers.errors import (
 )
 from drivers.host.group import Group
 from drivers.protocol.timing import HEARTBEAT
+from model.answer.answer import Limits
 from model.counting import counted
 from model.structure.plate import Plate
 from registry import clock
@@ -192,16 +193,18 @@ class Cycle:
         self._heartbeat_due = clock.now()
         self._wake.set()
 
-    def note_armed(self, *, was_armed: bool) -> None:
+    def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
         """Note that the amplifiers have been armed: what is to play is sent, watchdogs are fed.
 
-        was_armed: also before, so that what plays goes on. Raises CommandError without a planner.
+        limits: of the amplifiers as they are now; was_armed: also before, so that what plays goes
+        on. Raises CommandError without a planner.
         """
         if self.planner is None:
             raise CommandError("controller must be open; call open() first")
         self._is_armed_anew = True
         if not was_armed:
             self.planner.layers.may_play = frozenset()
+        self.planner.replace_limits(limits)
         self._schedule_expiry()  # fingers may have rested since before
         self.feed_at_once()
 

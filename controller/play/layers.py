@@ -52,6 +52,10 @@ Shorter ones are heard by the fingers that are on nulls, in time.
 FALL_AFTER = 0.27 * CROSSFADE
 """Time [s] by which the other falls later, so that its finger feels no dip between."""
 
+RETRY = 1.0
+"""Time [s] after which a set is planned again that was refused without an end, fingers that rest
+included."""
+
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
 _MIN_VALID_FOR = 2.0
@@ -485,13 +489,13 @@ class Layers:
         return False
 
     def _faded_by(self, contents: Sequence[Content], now: float) -> float:
-        """Return when [s] pulses that play, or what was ended, have faded; infinite for none."""
+        """Return when [s] pulses that play, or what was ended, have faded; after RETRY if none."""
         pulses = [target.pulse for one in contents for _, target in one.targets]
         started = [each for each in pulses if each is not None and each.started_at is not None]
         ends = [each.end for each in started if each.end > now]
         if now < self._fades_until:
             ends.append(now)
-        return max(ends, default=math.inf) + FADED_AFTER
+        return max(ends, default=now + RETRY) + FADED_AFTER
 
     def _change(self, number: int, **values: Any) -> None:
         """Give what plays in a layer other values of its fields."""

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
-from controller.play.capabilities import playback_capabilities
+from controller.play.capabilities import limits_of, playback_capabilities
 from controller.play.cycle import Cycle
 from controller.play.intent import IntentSource
 from controller.play.planner import Planner
@@ -94,8 +94,8 @@ class Controller:
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer touches by another table of this plate from now on, in one step.
 
-        What plays stays until its contacts change. Prepared by the caller: nothing is computed
-        here.
+        What plays stays until its contacts change or rest. Prepared by the caller: nothing is
+        computed here.
         """
         self.table, self._timing = table, timing
         if self.cycle.planner is not None:
@@ -184,7 +184,7 @@ class Controller:
         """Switch the high voltage on, so that touches are felt; `cycle` runs or starts at once."""
         was_armed = self.group.is_armed
         await self.group.arm()
-        self.cycle.note_armed(was_armed=was_armed)
+        self.cycle.note_armed(limits_of(self._rig, self.amplifiers), was_armed=was_armed)
 
     async def disarm(self) -> None:
         """Ramp to silence, then switch the high voltage off."""

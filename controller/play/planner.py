@@ -13,12 +13,13 @@ from controller.play.chooser import Chooser
 from controller.play.content import Prediction, Selection, no_layer_free
 from controller.play.counted_clocks import CountedClocks
 from controller.play.intent import IntentSource, Pulse
-from controller.play.layers import RELEASE_RAMP, Check, Layers, Sets
+from controller.play.layers import RELEASE_RAMP, RETRY, Check, Layers, Sets
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.timing import HEARTBEAT
+from model.answer.answer import Limits
 from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
 from model.answer.over_duration import FADE_RAMP
 from model.answer.plan import prepare_answers, query
@@ -31,10 +32,6 @@ ENDED = (
     "the vibration has ended by itself: it was not renewed, or a limit of time was reached; touch "
     "there again"
 )
-
-RETRY = 1.0
-"""Time [s] after which a set is planned again that was refused without an end, fingers that rest
-included."""
 
 _CLOCKS_INTERVAL = 2 * HEARTBEAT  # s; after which clocks are counted though fingers change
 
@@ -123,28 +120,35 @@ class Planner:
         self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Answer by another table of this plate from now on; what plays stays until it changes."""
+        """Answer by another table of this plate from now on; what plays stays until all rest."""
         self.timing, layers = timing, self.layers
         layers.builder = replace(layers.builder, timing=timing)
-        self._selector.chooser = Chooser(self.clocks.counted_by(table), layers.builder.shape)
+        self._answer_by(Chooser(self.clocks.counted_by(table), layers.builder.shape))
 
-    def _look_at_clocks(self, now: float) -> bool:
-        """Count the clocks at a time [s]; returns whether one is lost that was held.
+    def replace_limits(self, limits: Limits) -> None:
+        """Answer within other limits from now on: an amplifier was identified again."""
+        if limits != self.capabilities.limits:
+            self.capabilities = replace(self.capabilities, limits=limits)
+            self._answer_by(self._selector.chooser)
 
-        Where fingers change only if none was for long, since their answer waits for it.
+    def _count_clocks(self) -> None:
+        """Answer by the clocks as they are now; what plays stays until all rest.
+
+        Not over one that is held no longer.
         """
-        self._clocks_due, known = now + _CLOCKS_INTERVAL, self.clocks.known
-        if is_one_lost := self.clocks.is_one_lost(known):  # what plays may be part of it
-            self._selector.choose_anew()
-        self._count_clocks(known)
-        return is_one_lost
-
-    def _count_clocks(self, known: Mapping[str, float] | None = None) -> None:
-        """Answer by the clocks as they are now; what plays stays until it changes."""
-        chooser = self._selector.chooser
+        chooser, known = self._selector.chooser, self.clocks.known
+        is_one_lost = self.clocks.is_one_lost(known)
         counted = self.clocks.counted_by(chooser.table, known)
         if counted is not chooser.table:
-            self._selector.chooser = replace(chooser, table=counted)
+            self._answer_by(replace(chooser, table=counted), at_once=is_one_lost)
+
+    def _answer_by(self, chooser: Chooser, *, at_once: bool = False) -> None:
+        """Answer anew, by what has changed: once all rest; at once where nothing plays, too."""
+        selector = self._selector
+        selector.chooser = chooser
+        if at_once or not (self.layers.may_play or selector.is_choosing):
+            selector.choose_anew()
+        self.look_again()
 
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; seconds, of a large rig.
@@ -257,11 +261,11 @@ class Planner:
         before, contacts = self._plan, self._tracker.contacts
         from_rest, has_failed = now - self._played_until >= _RING_DOWN, False
         try:
-            is_one_lost = False
+            # Where fingers change only if none was counted for long: their answer waits for it.
             if now >= self._clocks_due or not self._tracker.changed:
-                is_one_lost = self._look_at_clocks(now)
-            is_due = self._tracker.changed or now >= self.due or is_one_lost
-            if before is not None and not is_due:
+                self._clocks_due = now + _CLOCKS_INTERVAL
+                self._count_clocks()
+            if before is not None and not (self._tracker.changed or now >= self.due):
                 return self._go_on(before, now)
             self._seen = contacts
             self._intent_due = math.inf

@@ -130,11 +130,12 @@ class Selector:
     targets and their levels do, no contact has moved more than 8 mm, none of several has set out,
     and none has another load, which changes by a factor of 1.5 or more. A contact that lifts, or
     whose effect ends, leaves the others as they are. Once all rest, contents are led to a better
-    answer, if there is one, a step after the other, until anything changes. An answer that takes
-    too long is given up: all that lasts is silent until its fingers change, or until that answer
-    has ended at last. chooser: answers the next question; what the thread computes goes on by the
-    former one. arrived: called when the thread is done; may_lead: whether contents may be led to
-    from what plays at a time [s].
+    answer, if there is one, a step after the other, until anything changes: fingers, the table with
+    its clocks, or what the amplifiers allow. Where a finger was held back before that, all are
+    chosen anew. An answer that takes too long is given up: all that lasts is silent until its
+    fingers change, or until that answer has ended at last. chooser: answers the next question; what
+    the thread computes goes on by the former one. arrived: called when the thread is done;
+    may_lead: whether contents may be led to from what plays at a time [s].
     """
 
     def __init__(
@@ -149,9 +150,9 @@ class Selector:
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
-        self._is_outdated = False  # what the thread computes
         self._is_limited = False  # what lasts, by pulses that play
         self._situation: object = None
+        self._asked: object = None  # the situation in which what lasts was asked for last
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; by the last step
         self._fading = _NOTHING  # what plays until that has been taken
@@ -198,14 +199,14 @@ class Selector:
         back = came.intersection([contact.key for contact, _ in self._lasting.targets])
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
-        if (situation := _situation_of(intended)) != self._situation:
+        situation = *_situation_of(intended), self.chooser.table, capabilities
+        if situation != self._situation:
             self._situation = situation
             self._rest_again(now)
         arrived = self._thread.take() if self._thread.is_busy else None
         if arrived is not None:
-            is_late = self._is_outdated or not self._is_intended(arrived, intended)
+            is_late = self._asked is None or not self._is_intended(arrived, intended)
             self._take(arrived, now, is_late=is_late)
-            self._is_outdated = False
         pulses, self._short = self._short, {}
         for contact, target in short:
             pulse = pulses.get(contact.key)
@@ -220,6 +221,8 @@ class Selector:
             for requested in self._to_request(
                 intended, pulses, now, has_waited=arrived is not None
             ):
+                if requested.intended.lasting:
+                    self._asked = situation
                 if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities), now)
                 elif self._thread.is_blocked:
@@ -239,7 +242,7 @@ class Selector:
 
     def choose_anew(self) -> None:
         """Choose anew what lasts, silent until then; what the thread computes is not taken."""
-        self._lasting, self._steps, self._is_outdated = _NOTHING, (), self._thread.is_busy
+        self._lasting, self._steps, self._asked = _NOTHING, (), None
 
     def _rest_again(self, now: float) -> None:
         """Leave the way to a better answer, if any, until all have rested."""
@@ -282,6 +285,10 @@ class Selector:
         if is_due:
             self.due = math.inf
             is_kept = is_kept and not self._is_limited  # by pulses that have ended
+            if self._asked != self._situation and any(
+                each.contact.key in self._fingers for each in self._lasting.not_served
+            ):
+                is_kept = False
         if lasting:
             takes_long = not is_alone(lasting, intended.protected) or _is_long(lasting)
         is_rested = is_due and is_kept and takes_long
@@ -336,7 +343,11 @@ class Selector:
             return True  # in doubt nothing plays
         return (
             found is not None
-            and (self._is_limited or not _is_met_by(intended, self._lasting))
+            and (
+                self._is_limited
+                or self._asked == self._situation
+                or not _is_met_by(intended, self._lasting)
+            )
             and _is_among(intended, found)
             and intended.protected <= found.protected
             and _of_any_course(intended.lasting) <= _of_any_course(found.targets)
@@ -345,7 +356,7 @@ class Selector:
     def _take(self, chosen: Choice, now: float, *, is_late: bool = False) -> None:
         """Take what was chosen, at a time [s]; is_late: without what lasts."""
         self._short = {**self._short, **chosen.short}
-        if chosen.steps and _situation_of(chosen.requested.intended) == self._situation:
+        if chosen.steps and self._asked == self._situation:
             self._steps, self.due = chosen.steps, now
         if chosen.lasting is not None and not is_late:
             self._lasting, self._is_limited = chosen.lasting, chosen.is_limited
@@ -356,7 +367,7 @@ class Selector:
                 self.due = max(ends) + FADED_AFTER
 
 
-def _situation_of(intended: Intention) -> object:
+def _situation_of(intended: Intention) -> tuple[object, ...]:
     """Equal as long as the same fingers are to feel the same of what lasts, in any places."""
     contacts = frozenset([(each.key, each.since, each.load) for each in intended.contacts])
     return contacts, _targets_of(intended.lasting), intended.protected

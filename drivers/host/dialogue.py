@@ -97,7 +97,7 @@ class Dialogue:
     def __init__(self, line: Line, address: int, name: str) -> None:
         self.line, self.address, self.name = line, address, name
         self.capabilities: Values = {}
-        """Empty until it is identified, and while it is unsure who replies; its ledger keeps them."""
+        """Empty until it is identified, or while it is not sure who replies: see its ledger."""
         self.session = 0
         self.may_be_armed = False
         """Whether an Arm of this host may have been carried out since it was disarmed."""

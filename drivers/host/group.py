@@ -112,7 +112,8 @@ class Group:
     async def arm(self) -> None:
         """Switch the high voltage on at level zero: on all amplifiers, or none stays armed.
 
-        One session, so that a broadcast reaches all of a line. If all are armed, also by a request
+        Each line has a session of its own: a broadcast reaches all of it, and one whose cable was
+        exchanged for another line's neither plays nor is fed. If all are armed, also by a request
         that came first, nothing changes. Raises DriverError, LinkDegraded where one only does not
         reply for now.
         """
@@ -144,8 +145,12 @@ class Group:
                 amplifier.check_other_host()  # before a disarm of what failed ends its vibration
             await self._clocks.settle()
             members.check_none_since(before)
-            session = self._draw(_SESSION.minimum, _SESSION.maximum)
-            arms = [each.arm(session, self._watchdog) for each in amplifiers]
+            drawn = self._draw(_SESSION.minimum, _SESSION.maximum)
+            sessions = {
+                line: (drawn + number) % _SESSION.maximum + 1
+                for number, line in enumerate(members.lines)
+            }
+            arms = [each.arm(sessions[each.line], self._watchdog) for each in amplifiers]
             arming = asyncio.ensure_future(outcomes(arms))
             try:
                 members.checked(await asyncio.shield(arming))

@@ -1,6 +1,7 @@
 """What a group does where something fails that should not: nobody feels more than is said."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -210,3 +211,43 @@ async def test_request_to_a_busy_amplifier_goes_again_whenever_its_timer_comes(
     altered(end.far["a"], busy)
     await asyncio.wait_for(group.beat(), 0.1)
     assert not refusals
+
+
+@pytest.mark.parametrize("what", ["cables", "replies"])
+@grouped(("a",), ("b",))
+async def test_lines_that_are_exchanged_while_armed_are_silenced(
+    group: Group, ends: list[MemoryLine], what: str
+) -> None:
+    """Each amplifier refuses the other's session, and a line takes no reply to the other's request.
+
+    Both are at address 1, alike and silent, so that no status contradicts what was sent.
+    """
+    first, second = ends
+    if what == "cables":
+        first._end, second._end = (
+            one.kind.far_end({1: far}, one._send)
+            for one, far in ((first, second.far["b"]), (second, first.far["a"]))
+        )
+    else:
+        await second.hosts["b"].read_status()  # numbers of requests begin anywhere on each line
+        first.line, second.line = second.line, first.line
+    async with asyncio.timeout(2.0):
+        while group.is_armed:
+            with contextlib.suppress(DriverError):
+                await group.beat()
+            await asyncio.sleep(0.05)
+    await asyncio.sleep(0.3)
+    for end in ends:
+        for far in end.far.values():
+            far.tick(end.loop.time())
+            assert far.state != "OPERATION_ENABLED"
+
+
+@grouped(("a", "b"), ("c",), wire="serial")
+async def test_session_is_one_on_each_line(group: Group, ends: list[MemoryLine]) -> None:
+    """A broadcast commit carries it to all amplifiers of its line, and plays on no other's."""
+    await group.apply({name: [layer(0, tone())] for name in "abc"})
+    await asyncio.sleep(0.01)
+    assert [ends[0].levels("a"), ends[0].levels("b"), ends[1].levels("c")] == [[0.5, 0.0]] * 3
+    a, b, c = (far.session for end in ends for far in end.far.values())
+    assert a == b != c

@@ -152,7 +152,7 @@ class Selector:
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]
         self._is_limited = False  # what lasts, by pulses that play
         self._situation: object = None
-        self._asked: object = None  # the situation in which what lasts was asked for last
+        self._requested: object = None  # the situation in which what lasts was requested last
         self._steps: Sequence[Selection] = ()  # to a better answer
         self._led_at = -math.inf  # s; by the last step
         self._fading = _NOTHING  # what plays until that has been taken
@@ -205,7 +205,7 @@ class Selector:
             self._rest_again(now)
         arrived = self._thread.take() if self._thread.is_busy else None
         if arrived is not None:
-            is_late = self._asked is None or not self._is_intended(arrived, intended)
+            is_late = self._requested is None or not self._is_intended(arrived, intended)
             self._take(arrived, now, is_late=is_late)
         pulses, self._short = self._short, {}
         for contact, target in short:
@@ -222,7 +222,7 @@ class Selector:
                 intended, pulses, now, has_waited=arrived is not None
             ):
                 if requested.intended.lasting:
-                    self._asked = situation
+                    self._requested = situation
                 if not requested.takes_long:
                     self._take(chooser.choose(requested, capabilities), now)
                 elif self._thread.is_blocked:
@@ -242,7 +242,7 @@ class Selector:
 
     def choose_anew(self) -> None:
         """Choose anew what lasts, silent until then; what the thread computes is not taken."""
-        self._lasting, self._steps, self._asked = _NOTHING, (), None
+        self._lasting, self._steps, self._requested = _NOTHING, (), None
 
     def _rest_again(self, now: float) -> None:
         """Leave the way to a better answer, if any, until all have rested."""
@@ -285,7 +285,7 @@ class Selector:
         if is_due:
             self.due = math.inf
             is_kept = is_kept and not self._is_limited  # by pulses that have ended
-            if self._asked != self._situation and any(
+            if self._requested != self._situation and any(
                 each.contact.key in self._fingers for each in self._lasting.not_served
             ):
                 is_kept = False
@@ -345,7 +345,7 @@ class Selector:
             found is not None
             and (
                 self._is_limited
-                or self._asked == self._situation
+                or self._requested == self._situation
                 or not _is_met_by(intended, self._lasting)
             )
             and _is_among(intended, found)
@@ -356,7 +356,7 @@ class Selector:
     def _take(self, chosen: Choice, now: float, *, is_late: bool = False) -> None:
         """Take what was chosen, at a time [s]; is_late: without what lasts."""
         self._short = {**self._short, **chosen.short}
-        if chosen.steps and self._asked == self._situation:
+        if chosen.steps and self._requested == self._situation:
             self._steps, self.due = chosen.steps, now
         if chosen.lasting is not None and not is_late:
             self._lasting, self._is_limited = chosen.lasting, chosen.is_limited

@@ -20,6 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
+from installed_program import needs  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
@@ -82,6 +83,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the slowest files first, all in one order; the order within each file stays."""
     place = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: (place.get(item.path.name, len(SLOWEST)), item.path))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test, before its fixtures, for what its marks `needs` name and the machine lacks."""
+    for mark in item.iter_markers("needs"):
+        needs(*mark.args)
 
 
 @pytest.hookimpl(trylast=True)

@@ -1,7 +1,6 @@
 """The firmware's programs, each built once where a test needs it."""
 
 import os
-import shutil
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -9,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from firmware_programs import build_firmware
+from installed_program import needs
 
 
 @pytest.fixture(scope="session")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of its programs; skipped where there is nothing to build them with."""
-    if not (shutil.which("cc") and shutil.which("make")):
-        pytest.skip("needs a C compiler and make")
+    needs("cc", "make")
     return tmp_path_factory.mktemp("firmware")
 
 

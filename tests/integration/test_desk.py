@@ -3,7 +3,6 @@
 Its short forms have no server, or no plate: tests/sim/desk/test_measuring.py, test_jack_card.py.
 """
 
-import shutil
 import subprocess
 from collections.abc import Iterator
 
@@ -22,9 +21,7 @@ from model.rig.file import load_rig
 pytestmark = [
     pytest.mark.long,
     pytest.mark.alone,
-    pytest.mark.skipif(
-        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-    ),
+    pytest.mark.needs("jackd", "cc"),
 ]
 
 SEED, MESH = 3, "6x4 Q3"

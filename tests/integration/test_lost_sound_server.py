@@ -5,7 +5,6 @@ Its short form has no daemon: tests/sim/desk/soft_amp/test_soft_amp_sound.py.
 
 import asyncio
 import os
-import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,9 +19,7 @@ from sound_card import SoftAmp, capture_on, jack_server
 pytestmark = [
     pytest.mark.long,
     pytest.mark.alone,
-    pytest.mark.skipif(
-        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-    ),
+    pytest.mark.needs("jackd", "cc"),
 ]
 
 CHANNELS = 4

@@ -1,24 +1,40 @@
-"""The `era` under test, and programs of the system that a machine may lack."""
+"""The `era` under test, and what of the system a machine may lack: skipped by name, not in CI."""
 
+import ctypes.util
 import os
 import shutil
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 ERA = str(Path(sys.executable).with_name("era"))
 
 
-def installed_program(*names: str, package: str) -> str:
-    """Path of the first program that is found; without any skip the test, fail it under CI=true.
+PACKAGES = {"cc": "gcc", "jackd": "jackd2", "portaudio": "libportaudio2"}
+"""What to install on Debian where the package has another name."""
+
+
+def installed_program(*names: str, package: str = "") -> str:
+    """Path of the first program that is found; without any skip the test, fail it where CI is set.
 
     package: what to install on Debian.
     """
+    found = next(filter(None, map(shutil.which, names)), None)
+    return found or _miss(names[0], package)
+
+
+def needs(*names: str) -> None:
+    """As `installed_program`, for programs and libraries, all of which the test needs."""
     for name in names:
-        if found := shutil.which(name):
-            return found
-    reason = f"{names[0]} is not installed; on Debian: apt install {package}"
-    if os.environ.get("CI") == "true":
+        if not (shutil.which(name) or ctypes.util.find_library(name)):
+            _miss(name, "")
+
+
+def _miss(name: str, package: str) -> NoReturn:
+    package = package or PACKAGES.get(name, name)
+    reason = f"{name} is not installed; on Debian: apt install {package}"
+    if os.environ.get("CI"):
         pytest.fail(reason)
     pytest.skip(reason)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 from collections.abc import Sequence
 from contextlib import closing
@@ -142,9 +141,7 @@ def _check(told: dict[str, dict[str, dict[str, float]]]) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.skipif(
-    not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-)
+@pytest.mark.needs("jackd", "cc")
 def test_parts_are_found_through_a_real_server(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,6 @@ A process has one server at a time, and PortAudio keeps it: commands try PortAud
 """
 
 import os
-import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -24,9 +23,7 @@ from sound_card import JackServer, capture_on, jack_server
 
 pytestmark = [
     pytest.mark.real_time,
-    pytest.mark.skipif(
-        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-    ),
+    pytest.mark.needs("jackd", "cc"),
 ]
 
 DESK = Path(__file__).parents[3] / "examples" / "desk"
@@ -76,6 +73,7 @@ def measure(server: JackServer, device: str, folder: Path) -> tuple[int, str]:
     )  # fmt: skip
 
 
+@pytest.mark.needs("portaudio")
 def test_unsuitable_cards_are_refused(server: JackServer, tmp_path: Path) -> None:
     """No such one; too few channels; no inputs: one message, exit status 2, and no file."""
     for device, ports, cause in (
@@ -92,6 +90,7 @@ def test_unsuitable_cards_are_refused(server: JackServer, tmp_path: Path) -> Non
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.needs("portaudio")
 def test_card_that_is_played_to_is_busy(server: JackServer) -> None:
     """For measurement and amplifier, also by PortAudio: JACK would add up what two play.
 
@@ -130,6 +129,7 @@ def test_measurement_without_its_server_is_lost(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.needs("portaudio")
 def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """44.1 kHz of a server or device, for an amplifier; a measurement takes any whole one."""
     name = f"rate{os.getpid()}"

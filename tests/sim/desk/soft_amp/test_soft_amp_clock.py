@@ -2,7 +2,6 @@
 
 import ctypes
 import multiprocessing
-import shutil
 import socket
 import struct
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from sim.desk.soft_amp.engine import Counters, JackCalls, start_engine, take_ove
 from sim.desk.soft_amp.library import library
 from sim.desk.soft_amp.settings import Protocol, Settings
 
-pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+pytestmark = pytest.mark.needs("cc")
 
 RATE, BLOCK = 48_000, 128
 TURN = 20.0  # s

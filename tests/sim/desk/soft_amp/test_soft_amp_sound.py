@@ -1,7 +1,6 @@
 """A software amplifier through a real JACK server, as a client that captures it hears it."""
 
 import os
-import shutil
 import signal
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
@@ -23,9 +22,7 @@ from steady_host import WATCHDOG, linear_amplifier
 
 pytestmark = [
     pytest.mark.real_time,
-    pytest.mark.skipif(
-        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-    ),
+    pytest.mark.needs("jackd", "cc"),
 ]
 
 CHANNELS = 3
@@ -153,6 +150,7 @@ def test_unsuitable_device_is_refused(
         open_output(replace(SETTINGS, **changed))
 
 
+@pytest.mark.needs("portaudio")
 @pytest.mark.parametrize("line", ["--tcp", "--modbus-tcp"])
 def test_all_of_it_killed_is_silent(
     sound: tuple[Capture, dict[str, str]], tmp_path: Path, line: str

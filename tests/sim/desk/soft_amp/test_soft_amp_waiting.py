@@ -3,7 +3,6 @@
 import asyncio
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -19,9 +18,7 @@ from steady_host import linear_amplifier
 
 pytestmark = [
     pytest.mark.real_time,
-    pytest.mark.skipif(
-        not (shutil.which("jackd") and shutil.which("cc")), reason="needs jackd2 and a C compiler"
-    ),
+    pytest.mark.needs("jackd", "cc"),
 ]
 
 CHANNELS = 2

@@ -124,7 +124,8 @@ class Finger:
     stimulus: what it is to feel, None for nothing; load: relative to the rig's fingertip; priority:
     lower ones give way first; sharing: whether it may feel the vibration of another finger:
     `never`, that of one of the same name (`by name`), of the nearest that may have `any`, or it
-    `must` feel one with all of its name; is_protected: whether it keeps the others' vibrations away
+    `must` feel one with all of its name; all but `never` also that of a finger so near that no
+    vibration could be kept from either; is_protected: whether it keeps the others' vibrations away
     where its own is given up; min_contrast_db: promised contrast to the vibrations of others below
     which these or its own give way; max_foreign_db_sl: level of others' vibrations here, by the
     rig's own thresholds, that nine of ten plates do not exceed, else they are held back.
@@ -175,17 +176,16 @@ class Finger:
         """Of its stimulus."""
         return None if self.stimulus is None else self.stimulus.name
 
-    def may_feel_one_with(self, other: "Finger") -> bool:
-        """Whether both fingers may feel one vibration."""
+    def may_feel_one_with(self, other: "Finger", *, are_apart: bool = True) -> bool:
+        """Whether both fingers may feel one vibration; are_apart: whether each could its own."""
         one, two = self.stimulus, other.stimulus
-        if one is None or two is None:
+        if one is None or two is None or NEVER in (self.sharing, other.sharing):
             return False
         if (one.duration, one.is_limit, one.course) != (two.duration, two.is_limit, two.course):
             return False
-        if self.sharing == other.sharing == ANY:
+        if not are_apart or self.sharing == other.sharing == ANY:
             return True
-        is_same = self.name is not None and self.name == other.name
-        return is_same and NEVER not in (self.sharing, other.sharing)
+        return self.name is not None and self.name == other.name
 
     def must_feel_one_with(self, other: "Finger") -> bool:
         """Whether both fingers feel one vibration from the start."""

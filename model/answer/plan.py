@@ -1,11 +1,11 @@
 """One answer to all fingers, and what is done where not all can be served.
 
-A promise below the least contrast at the worst finger is not served as requested. In this order,
-and each only where the fingers allow it: the nearest two that may share feel one vibration; the
-finger of the lowest priority that need not be protected gives up vibration and protection; the
-vibration of the lowest priority is held back. Of many vibrations several of these steps are one.
-Where nothing reaches it, the best tried is served, but for bounds that fingers state themselves:
-these hold, if by silence.
+A promise below the least contrast at the worst finger is not served as requested. First fingers
+share, the nearest first and only where they allow it: two that could not be kept apart were they
+alone on the plate, then two that may share anyway. What still does not fit is served in turn, by
+priority and arrival: each vibration that those before it leave room for. What could not be kept
+from the finger beside its own anyway comes last. Where the first cannot be served either, the best
+tried is, but for bounds that fingers state themselves: these hold, if by silence.
 """
 
 import math
@@ -39,7 +39,7 @@ from model.answer.strength import (
     with_gains,
 )
 from model.arrays import Point
-from model.choice import NEARLY, best_by, best_of
+from model.choice import NEARLY, best_by
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
 from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
@@ -139,16 +139,12 @@ def _changed(found: Answer) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which fingers, by index, feel which content and which are quiet.
+    """Which fingers, by index, feel which content; all others that are protected are quiet.
 
-    contents: the fingers of each, its own first; quiet: those that are protected; held: contents
-    given up, with the contrast that they would have had, and whether they would disturb a finger;
-    applied: what was changed, in words.
+    contents: the fingers of each, its own first; applied: what was changed, in words.
     """
 
     contents: tuple[tuple[int, ...], ...]
-    quiet: tuple[int, ...]
-    held: tuple[tuple[int, float, bool], ...] = ()
     applied: tuple[str, ...] = ()
 
 
@@ -166,14 +162,8 @@ class _Answering:
     limits: Limits
 
     def solve(self, min_contrast_db: float) -> Answer:
-        """Change the plan until the worst finger has the contrast, else take the best tried."""
-        quiet, is_modulated = list[int](), False
-        for number, finger in enumerate(self.fingers):
-            if finger.stimulus is None:
-                quiet.append(number)
-            elif finger.stimulus.modulation_hz is not None:
-                is_modulated = True
-        plan = _Plan(self._first_contents, tuple(quiet))
+        """Share and serve in turn until the worst finger has the contrast, else the best tried."""
+        plan = _Plan(self._first_contents)
         if len(plan.contents) > MAX_SEPARATE:
             plan = self._many_joined(plan)
         if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
@@ -183,33 +173,27 @@ class _Answering:
                 "the amplifiers play it"
             )
         tried = [found := self._measure(plan)]
-        while _is_out_of_bounds(found) or (
-            found.tones.worst_db < min_contrast_db and len(plan.contents) > 1
+        while (
+            _fails(found, min_contrast_db)
+            and (shared := self._with_more_shared(plan, min_contrast_db)) != plan
         ):
-            for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
-                plan = self._with_less(plan, found)
-            tried.append(found := self._measure(plan))
+            tried.append(found := self._measure(plan := shared))
+        if _fails(found, min_contrast_db):
+            found = self._in_turn(plan, tried, min_contrast_db)
         if found.tones.worst_db < min_contrast_db:  # NaN for a finger alone
-            allowed = [each for each in tried if not _is_out_of_bounds(each)]
             below = f"nothing reaches {min_contrast_db:g} dB: the best that was tried is served"
-            found = best_by(allowed, worst_of)
             found = replace(found, applied=(*found.applied, below))
-        if is_modulated and self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
+        if self.drive_mode == UNRESTRICTED and not self.table.clocks.groups:
             found = with_modulation(self.table, found, playable=self.limits.frequencies)
-        for stream in found.contents.streams:
-            if stream.limit_db_sl is not None:
-                return as_quiet_fingers_allow(self.table, found)
-        return found
+        is_limited = any(stream.limit_db_sl is not None for stream in found.contents.streams)
+        return as_quiet_fingers_allow(self.table, found) if is_limited else found
 
     def within_limits(self, found: Answer, min_contrast_db: float) -> Answer:
         """The answer lowered to what the amplifiers' limits allow.
 
         Where a finger would not be served any more, by the rule again at the lower levels.
         """
-        for stream in found.contents.streams:
-            if stream.duration is not None:
-                found = as_ramps_allow(self.table, found, self.limits)
-                break
+        found = as_ramps_allow(self.table, found, self.limits)
         if (factor := self.limits.factor_within(found.layers, self.table)) >= 1 - NEARLY:
             return found
         if len(found.contents.streams) > 1:
@@ -239,42 +223,98 @@ class _Answering:
                 found.append([number])
         return tuple(map(tuple, found))
 
-    def _with_less(self, plan: _Plan, found: Answer) -> _Plan:
-        """The plan after the next step of the rule."""
-        requests, contents = self.fingers, plan.contents
-        pairs = [
-            (one, other)
-            for number, one in enumerate(contents)
-            for other in contents[:number]
-            if all(requests[a].may_feel_one_with(requests[b]) for a in one for b in other)
+    def _with_more_shared(self, plan: _Plan, min_contrast_db: float) -> _Plan:
+        """The plan in which the nearest two fingers share that cannot be apart, else that may."""
+        for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
+            pair = self._nearest(plan, are_apart=False)
+            if not pair or self._contrast_alone(*pair) >= min_contrast_db:
+                pair = self._nearest(plan)
+            if not pair:
+                break
+            plan = self._joined(plan, pair)
+        return plan
+
+    def _nearest(self, plan: _Plan, *, are_apart: bool = True) -> tuple[tuple[int, ...], ...]:
+        """The nearest two contents that may be one, none without such.
+
+        are_apart: whether each finger could be served by one of its own.
+        """
+        fingers, pairs = self.fingers, dict[tuple[tuple[int, ...], ...], float]()
+        for number, one in enumerate(plan.contents):
+            for other in plan.contents[:number]:
+                both = [(fingers[a], fingers[b]) for a in one for b in other]
+                if all(a.may_feel_one_with(b, are_apart=are_apart) for a, b in both):
+                    pairs[other, one] = -min(math.dist(a.at, b.at) for a, b in both)
+        return best_by([*pairs], pairs.__getitem__) if pairs else ()
+
+    def _contrast_alone(self, own: Sequence[int], others: Sequence[int]) -> float:
+        """Contrast of the nearest two of own and other fingers, were only these on the plate.
+
+        Whatever they feel; infinite without others.
+        """
+        pairs = [(self.fingers[a], self.fingers[b]) for a in own for b in others]
+        if not pairs:
+            return math.inf
+        one, other = best_by(pairs, lambda each: -math.dist(each[0].at, each[1].at))
+        both = replace(one, stimulus=Stimulus()), replace(other, stimulus=None)
+        alone = replace(self, fingers=both, avoided=frozenset())
+        return alone._measure(_Plan(((0,),))).tones.worst_db
+
+    def _quiet_beside(self, felt: Sequence[int]) -> list[int]:
+        """The fingers that must not feel what these fingers feel."""
+        return [
+            number
+            for number, each in enumerate(self.fingers)
+            if number not in felt and (each.stimulus is None or each.is_protected)
         ]
-        if pairs:
-            near = [
-                -min(math.dist(requests[a].at, requests[b].at) for a in one for b in other)
-                for one, other in pairs
-            ]
-            return self._joined(plan, pairs[best_of(near)])
-        disturbed = found.disturbed[:1]
-        others = [each for each in contents if not {*disturbed}.intersection(each)]
-        least = min(requests[each[0]].priority for each in others)
-        lowest = [each for each in others if requests[each[0]].priority == least]
-        open_ = [
-            each for each in lowest if not any(requests[finger].is_protected for finger in each)
-        ]
-        given_up = (open_ or lowest)[-1]
-        had = [found.tones.contrast_db[finger][2] for finger in given_up]
-        verb = "is neither served nor protected" if open_ else "is held back"
-        return _Plan(
-            tuple(each for each in contents if each != given_up),
-            plan.quiet if open_ else (*plan.quiet, *given_up),
-            (
-                *plan.held,
+
+    def _in_turn(self, plan: _Plan, tried: Sequence[Answer], min_contrast_db: float) -> Answer:
+        """Serve each content that those served before it leave what all need.
+
+        A finger that others disturb first, then by priority, then who is protected, then the
+        earliest; last what could not be kept from the finger beside its own, were no other on the
+        plate. Where the first cannot be served, the best of tried is.
+        """
+        every, served = tried[-1], list[tuple[int, ...]]()
+        order = sorted(
+            plan.contents,
+            key=lambda each: (
+                self._contrast_alone(each, self._quiet_beside(each)) < min_contrast_db,
+                {*each}.isdisjoint(every.disturbed),
+                -self.fingers[each[0]].priority,
+                not self.fingers[each[0]].is_protected,
+            ),
+        )
+        found, without = self._measure(replace(plan, contents=())), dict.fromkeys(order, every)
+        for content in order:
+            more, chosen = every, [*served, content]
+            if len(chosen) < len(order):
+                contents = tuple([each for each in plan.contents if each in chosen])
+                more = self._measure(replace(plan, contents=contents))
+            without[content] = more
+            if not _fails(more, min_contrast_db):
+                found, served = more, chosen
+            elif content == order[0] and not _is_out_of_bounds(more):
+                allowed = [each for each in (*tried, more) if not _is_out_of_bounds(each)]
+                found = best_by(allowed, worst_of)
+                break
+        felt = {finger for stream in found.contents.streams for finger in stream.targets}
+        held = [each for each in order if felt.isdisjoint(each)]
+        return replace(
+            found,
+            held=tuple(
+                (finger, without[each].tones.contrast_db[finger][2], bool(without[each].disturbed))
+                for each in held
+                for finger in each
+            ),
+            applied=(
+                *found.applied,
                 *(
-                    (finger, -math.inf if math.isnan(each) else each, bool(disturbed))
-                    for finger, each in zip(given_up, had, strict=True)
+                    f"vibration of {_at(first)} is "
+                    f"{'held back' if first.is_protected else 'neither served nor protected'}"
+                    for first in [self.fingers[each[0]] for each in held]
                 ),
             ),
-            (*plan.applied, f"vibration of {_at(requests[given_up[0]])} {verb}"),
         )
 
     def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
@@ -345,14 +385,15 @@ class _Answering:
                     level, limit = min(level, FELT_DB_SL), level
             of_stimulus = duration, limit, course
             streams.append(Stream(fingers, float(level), own, priority, *of_stimulus))
-        if len(streams) == 1 and not plan.quiet:
+        quiet = tuple(self._quiet_beside(sum(plan.contents, ())))
+        if len(streams) == 1 and not quiet:
             places = [self.fingers[finger].at for finger in streams[0].targets]
             background = self.table.background(places)
         return Contents(
             tuple([each.at for each in self.fingers]),
             tuple([each.load for each in self.fingers]),
             tuple(streams),
-            plan.quiet,
+            quiet,
             self.apart_hz,
             background=background,
             drive_mode=self.drive_mode,
@@ -374,7 +415,7 @@ class _Answering:
             tones = Tones.none(len(contents.places), len(table.threshold_sets))
         if not tones.is_apart or len(contents.avoided) < len(self.avoided):
             applied += (f"frequencies are nearer than {self.apart_hz:g} Hz",)
-        given = self.fingers, contents, tones, plan.held, applied
+        given = self.fingers, contents, tones, (), applied
         return Answer(*given, table.eras, table.frequencies, table.highest_drives, table.thresholds)
 
 
@@ -398,6 +439,11 @@ def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
                 stimulus = replace(finger.stimulus, level_db_sl=level, band_hz=band)
                 softer[number] = replace(finger, stimulus=stimulus)
     return tuple(softer)
+
+
+def _fails(found: Answer, min_contrast_db: float) -> bool:
+    """Whether a finger has less contrast than any must have, or than it asks for."""
+    return _is_out_of_bounds(found) or found.tones.worst_db < min_contrast_db
 
 
 def _is_out_of_bounds(found: Answer) -> bool:

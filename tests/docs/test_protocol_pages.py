@@ -337,6 +337,17 @@ def test_data_name_the_registers_that_the_page_shows() -> None:
     assert int(status[place].replace(" ", ""), 16) == registers["reply_from"]
 
 
+def test_each_read_of_the_status_object_is_a_status() -> None:
+    """It uses up a Mark, as can.md says: the next subindex is of its own moment."""
+    amplifier = Amplifier("a", channels=4)
+    objects = ObjectServer(amplifier, 1)
+    (high,) = (at for at, word in enumerate(listed_words()["Status"], 1) if word == 0x6000)
+    amplifier.handle("Mark", {}, 1.0)
+    amplifier.withdraw_status()  # for all, without a reply
+    shown = [int.from_bytes(objects.read(0x2002, high, 3.0), "little") for _ in range(2)]
+    assert [round(each * 20 / 65536) for each in shown] == [1, 3]
+
+
 def written_by_hand(page: str) -> str:
     """A page without the parts that `make pages` writes."""
     return re.sub(r"<!-- begin: written by .*?<!-- end -->\n", "", page, flags=re.DOTALL)

@@ -4,6 +4,7 @@ MAC is 1 for the same shape with any gain and phase, about one over the number o
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,15 @@ class ShapeMatch:
     @property
     def error(self) -> float:
         """Share of the responses, rms over them, that is not of the shapes of the nearest ERAs."""
-        alike = self.mac[:, range(self.mac.shape[1]), self.nearest]
+        return self._error(self.nearest)
+
+    @property
+    def error_as_wired(self) -> float:
+        """The same, of the shapes of the ERAs that the rig says."""
+        return self._error(range(self.mac.shape[1]))
+
+    def _error(self, eras: Sequence[int]) -> float:
+        alike = self.mac[:, range(self.mac.shape[1]), eras]
         return (
             math.sqrt(max(0.0, float(np.nanmean(1 - alike))))
             if np.isfinite(alike).any()

@@ -7,7 +7,7 @@ from model.choice import best_of
 from model.counting import counted
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
-from model.diagnosis.exchanged_sensors import ExchangedSensors
+from model.diagnosis.exchanged_sensors import ExchangedSensors, ReversedAxes
 from model.diagnosis.grain_direction import TurnedGrain
 from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
 from model.diagnosis.resonance_meaning import MisreadResonance
@@ -277,6 +277,7 @@ def _beyond_as_json(beyond: BeyondTolerances) -> dict[str, Any]:
 
 def _corrections_as_json(verdict: Verdict) -> dict[str, Any]:
     found: dict[str, Any] = {"grain": None, "resonance_is": {}, "exchanged_sensors": {}}
+    found["reversed_axes"] = []
     for each in verdict.corrections:
         match each:
             case TurnedGrain():
@@ -290,6 +291,8 @@ def _corrections_as_json(verdict: Verdict) -> dict[str, Any]:
                 found["resonance_is"] |= each.meant
             case ExchangedSensors():
                 found["exchanged_sensors"] |= dict(each.pairs)
+            case ReversedAxes():
+                found["reversed_axes"] += each.axes
     return found
 
 

@@ -1,4 +1,9 @@
-"""Sensors at each other's places, by the responses that they read."""
+"""Sensors at each other's places or noted from another side, by the responses that they read.
+
+A plate that is turned over is another one by a mirror, and no fit of its values makes up for it.
+Both are fitted as coarsely as wiring is first looked at (`model.diagnosis.assignment`): shapes of
+boards as bought leave a quarter unexplained with the right side, nine tenths with another.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,9 +14,17 @@ from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
+from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.calibration.variable_projection import project_gains, row_rms
+from model.choice import best_by
+from model.diagnosis.assignment import ShapeMatch, match_shapes
+from model.quantities import percent
+from model.rig.rig import Rig
 
 _OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of a sensor that is elsewhere
+_CLEARLY = 0.6  # of the error as written
+_MAX_ERROR = 0.45  # of a coarse fit of the right board, a fault beside
+_X, _Y, _FREQUENCY = "x", "y", "frequency"
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,66 @@ class ExchangedSensors:
         for name, place in self.pairs:
             points[names.index(name)] = observation.points[names.index(place)]
         return replace(observation, points=points)
+
+
+@dataclass(frozen=True)
+class ReversedAxes:
+    """Axes along which a measurement is noted the wrong way round.
+
+    axes: "x", "y" or both of the places, or "frequency"; error, error_as_written: shares of the
+    responses that coarse fits of either leave unexplained; is_wiring: whether exchanged channels
+    explain them as well.
+    """
+
+    axes: tuple[str, ...]
+    error: float
+    error_as_written: float
+    is_wiring: bool
+
+    label = "PLACES"
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        names = " and ".join(self.axes)
+        found = (
+            f"with {names} from the other end a coarse fit leaves {percent(self.error)} of the "
+            f"responses unexplained, as written {percent(self.error_as_written)}"
+        )
+        if self.axes == (_FREQUENCY,):
+            return f"frequencies must be those of their responses, got reversed ones: {found}"
+        wiring = ", or plug the channels as the rig has them" if self.is_wiring else ""
+        return (
+            f"places of sensors must be from the corner from which those of ERAs are, got ones "
+            f"mirrored in {names}: {found}; correct the positions of all{wiring}"
+        )
+
+    def put_right(self, observation: Responses, rig: Rig) -> Responses:
+        """The same responses, noted the other way round."""
+        size = np.array([rig.plate.length, rig.plate.width])
+        mirrored = size * [axis in self.axes for axis in (_X, _Y)]
+        step = -1 if _FREQUENCY in self.axes else 1
+        points, values = np.abs(mirrored - observation.points), observation.values[::step]
+        return replace(observation, points=points, values=values)
+
+
+def reversed_axes(
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+) -> ReversedAxes | None:
+    """Find the axes whose other direction is clearly the measured one, of a rig's own wiring.
+
+    shapes: of the observation, by the rig's plate. None where that is right to a fault.
+    """
+    as_written = shapes.error_as_wired
+    if not as_written > _MAX_ERROR:
+        return None
+    tried = []
+    for axes in ((_X,), (_Y,), (_X, _Y), (_FREQUENCY,)):
+        put_right = ReversedAxes(axes, 0.0, as_written, False).put_right(observation, plate.rig)
+        error = match_shapes(plate_of(plate.rig, put_right), put_right.values).error_as_wired
+        is_wiring = shapes.error * _CLEARLY < error
+        tried.append(ReversedAxes(axes, error, as_written, is_wiring))
+    found = best_by(tried, lambda each: -each.error)
+    return found if found.error < min(_MAX_ERROR, _CLEARLY * as_written) else None
 
 
 def exchanged_sensors(observation: Responses, model: ComplexArray) -> ExchangedSensors | None:

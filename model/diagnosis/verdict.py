@@ -27,7 +27,12 @@ from model.diagnosis.diagnosis_screening import (
     off_scale,
     usable_sensors,
 )
-from model.diagnosis.exchanged_sensors import ExchangedSensors, exchanged_sensors
+from model.diagnosis.exchanged_sensors import (
+    ExchangedSensors,
+    ReversedAxes,
+    exchanged_sensors,
+    reversed_axes,
+)
 from model.diagnosis.glue import behind_glue
 from model.diagnosis.other_meaning import OtherMeaning, other_meaning
 from model.diagnosis.plate_match import (
@@ -120,7 +125,7 @@ class Verdict:
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
     promise_margins: tuple[float, ...] = ()
-    corrections: tuple[OtherMeaning | ExchangedSensors, ...] = ()
+    corrections: tuple[OtherMeaning | ExchangedSensors | ReversedAxes, ...] = ()
 
     @property
     def wiring_matches(self) -> bool:
@@ -207,7 +212,15 @@ def diagnose(
         plate = plate_of(rig, observation)
     shapes = match_shapes(plate, observation.values)
     live = replace(observation, values=np.where(dead[:, None], np.nan, observation.values))
-    other = other_meaning(plate, match_shapes(plate, live.values), live)
+    of_live = match_shapes(plate, live.values)
+    turned = reversed_axes(plate, of_live, live)
+    if turned is not None and (check is not None or not turned.is_wiring):
+        if check is not None:
+            raise InputError(str(turned))
+        put_right = turned.put_right(observation, rig)
+        found = diagnose(rig, put_right, false_alarm=false_alarm, has_form=has_form)
+        return replace(found, corrections=(turned, *found.corrections))
+    other = other_meaning(plate, of_live, live)
     if other is not None:
         if check is not None:
             raise InputError(str(other))

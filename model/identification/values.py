@@ -12,7 +12,8 @@ from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.actuators import Actuator
 from model.structure.attachments import Gain, PointLoad
-from model.structure.plate import LOSS_FREQUENCY, Plate
+from model.structure.exciter import Exciter
+from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_FACTOR, Plate
 
 _LEAST_MASS = 1e-5  # kg; less is none
 _GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
@@ -81,10 +82,11 @@ class Values:
         masses = own("masses").reshape(-1, 3)
         masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
         cells = own("foreign_mass")
+        loss = plate.loss_factor * np.exp(own("loss")[0]) + own("loss_added")[0]
         return cls(
             thickness=float(np.exp(own("thickness")[0])),
             modulus=float(np.exp(own("modulus")[0])),
-            loss_factor=float(plate.loss_factor * np.exp(own("loss")[0]) + own("loss_added")[0]),
+            loss_factor=float(np.clip(loss, 0.0, MAX_LOSS_FACTOR)),
             loss_exponent=float(plate.loss_exponent + own("loss_exponent")[0]),
             stiffness=k * np.exp(own("stiffness")),
             damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
@@ -121,6 +123,9 @@ class Values:
             for kind in era.fields.keys() - new:
                 new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
             fields: dict[str, Any] = {era.fields[kind]: float(value) for kind, value in new.items()}
+            if isinstance(era, Exciter):
+                most = era.largest_force_factor(fields["magnet_mass"])
+                fields["force_factor"] = min(fields["force_factor"], most)
             found.append(replace(era, gains=(), **fields))
         return tuple(found)
 
@@ -144,7 +149,7 @@ def plate_with(plate: Plate, values: Values) -> Plate:
     )
     return replace(
         plate.scaled(modulus=values.modulus, thickness=values.thickness),
-        loss_factor=max(values.loss_factor, 0.0),
+        loss_factor=values.loss_factor,
         loss_exponent=values.loss_exponent,
         mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
     )

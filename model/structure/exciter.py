@@ -24,7 +24,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from model.arguments import expect_values
+from model.arguments import MAX_VALUE, expect_values
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.structure.attachments import Factor, InTime, PointLoad, Source
@@ -68,13 +68,19 @@ class Exciter(Source):
             finite="x y",
         )
         super().__post_init__()
-        lag, allowed = -self.in_time.inertance, _MAX_LAG * self.magnet_mass
-        if lag > allowed:
+        if self.force_factor > self.largest_force_factor(self.magnet_mass):
+            lag, allowed = -self.in_time.inertance, _MAX_LAG * self.magnet_mass
             raise InputError(
                 f"inductance of exciter {self.name} must let the current follow its back EMF, "
                 f"Bl² L / R² at most {_MAX_LAG:g} of the magnet's mass, {1e3 * allowed:.3g} g, got "
                 f"{1e3 * lag:.3g} g; check inductance and force_factor"
             )
+
+    def largest_force_factor(self, magnet_mass: float) -> float:
+        """The largest Bl [N/A] with a magnet [kg] whose back EMF the current follows."""
+        if not self.inductance:
+            return MAX_VALUE
+        return self.loop_resistance * math.sqrt(_MAX_LAG * magnet_mass / self.inductance)
 
     @property
     def full_level(self) -> float:

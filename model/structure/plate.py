@@ -311,7 +311,7 @@ class AirGap:
         return (1.0 if s.real > 300 else cmath.tanh(s)) / s
 
 
-MAX_LOSS_EXPONENT = 2.0
+MAX_LOSS_FACTOR, MAX_LOSS_EXPONENT = 1.0, 2.0
 
 SCALED = {
     "length": "no mass or stiffness by itself",
@@ -362,7 +362,7 @@ class Plate(Sheet):
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
         expect_values(self, "plate", above="length width thickness")
-        expect_between(self.loss_factor, 0, 1, what="plate: loss_factor")
+        expect_between(self.loss_factor, 0, MAX_LOSS_FACTOR, what="plate: loss_factor")
         expect_between(
             self.loss_exponent, -MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT, what="plate: loss_exponent"
         )

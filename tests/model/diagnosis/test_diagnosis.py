@@ -7,6 +7,7 @@ measurement.
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,17 +17,21 @@ from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.calibration_result import MAX_OUTLIERS
 from model.calibration.fit import without_outliers
-from model.calibration.responses import Responses
+from model.calibration.responses import Responses, responses_of
+from model.calibration.responses_file import read_measured
 from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis import causes
+from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
 from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
 from model.fem.mesh import Mesh
+from model.rig.file import load_rig
 from model.rig.rig import Rig
 from perturbed_plate import noise_like, random_gains
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 FREQUENCIES = np.linspace(57.0, 487.0, 10)
 
 
@@ -126,6 +131,42 @@ def test_diagnose_puts_exchanged_sensors_right(coarse_rig: Rig, built: Responses
     assert verdict.wiring_matches
     assert verdict.plate_matches
     assert as_json(verdict)["plate"]["exchanged_sensors"] == {"P2": "P10", "P10": "P2"}
+
+
+@pytest.mark.parametrize(
+    "axes",
+    shortly([("x",), ("y",), ("x", "y"), ("frequency",)], [("x", "y"), ("frequency",)]),
+)
+def test_axes_noted_the_other_way_round_are_named_and_put_right(axes: tuple[str, ...]) -> None:
+    """Places from another edge, or frequencies backwards, of a board without symmetry: no plugs."""
+    rig = load_rig(EXAMPLES / "weekend" / "rig.yaml")
+    right = responses_of(read_measured(EXAMPLES / "weekend" / "measured.uff"), rig)
+    few = np.flatnonzero(right.frequencies < 400)[:: len(right.frequencies) // 12]
+    right = replace(right, frequencies=right.frequencies[few], values=right.values[few])
+    size = np.array([rig.plate.length, rig.plate.width])
+    mirrored = np.where(["x" in axes, "y" in axes], size - right.points, right.points)
+    values = right.values[::-1] if "frequency" in axes else right.values
+    noted = replace(right, points=mirrored, values=values)
+    with pytest.raises(InputError, match=" and ".join(axes)):
+        check_consistency(rig, noted)
+    verdict = diagnose(rig, noted)
+    row, *_ = verdict_rows(verdict)
+    assert row.startswith("PLACES: ")
+    assert as_json(verdict)["plate"]["reversed_axes"] == [*axes]
+    assert not verdict.is_well
+    assert verdict.wiring_matches
+
+
+def test_mirrored_places_on_a_symmetric_plate_may_be_exchanged_channels(
+    coarse_rig: Rig, built: Responses
+) -> None:
+    """The paper's corners: a calibration says both, a check what plugs would be."""
+    mirrored = np.array([coarse_rig.plate.length, 0]) - built.points * [1, -1]
+    noted = replace(built, points=mirrored)
+    with pytest.raises(InputError, match=r"mirrored in x.*channels"):
+        check_consistency(coarse_rig, noted)
+    cycles = {frozenset(each) for each in diagnose(coarse_rig, noted).swapped}
+    assert cycles == {frozenset({"SW", "SE"}), frozenset({"NW", "NE"})}
 
 
 def test_verdict_names_the_sensors_first_where_all_channels_are_inverted(

@@ -8,7 +8,8 @@ import pytest
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, RestingFinger, Sensor
-from model.identification.parameters import FINGER_PARTS, Space, inwards, space_of
+from model.identification.parameters import FINGER_PARTS, Space, inwards, space_by_sheets, space_of
+from model.identification.values import Values, rig_with
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.meshes import mesh_of
@@ -16,6 +17,7 @@ from model.rig.rig import Rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
+from model.structure.exciter import Exciter
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Bond, Laminate, LaminateLayer, Material
 
@@ -164,3 +166,26 @@ def test_finger_of_known_parts_has_its_dynamic_stiffness(model: ForwardModel) ->
     same = replace(model, fingers=[replace(FINGER, fingertip=other)], last_places={})
     expected = same.at(np.zeros(model.space.size)).responses
     np.testing.assert_allclose(model.at(x).responses, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["paper_plate", "glass_panel", "weekend/rig"])
+@pytest.mark.parametrize("of", ["fit", "sheets"])
+def test_values_that_a_search_tries_are_those_of_a_rig(name: str, of: str) -> None:
+    """Ten standard deviations off, within the space's bounds: no value that a file could not have.
+
+    A loss factor beyond 1, or a coil whose current does not follow its back EMF, would be refused
+    as if a person had given them.
+    """
+    rig = load_rig(example_rig_path().parent / f"{name}.yaml")
+    rig = replace(rig, plate=replace(rig.plate, loss_factor=0.6))
+    known = rig.uncertainty
+    space = space_of(rig, ["P"], known, masses=1) if of == "fit" else space_by_sheets(rig, ["P"], 3)
+    rng = np.random.default_rng(0)
+    for size in (1, 10):
+        for x in rng.normal(0, size, (50, space.size)).clip(space.lower, space.upper):
+            found = rig_with(rig, Values.of(rig, space, x), known)
+            assert 0 <= found.plate.loss_factor <= 1
+            for era in found.eras:
+                if isinstance(era, Exciter):
+                    current = (era.force_factor / era.loop_resistance) ** 2 * era.inductance
+                    assert current <= 0.1 * era.magnet_mass * (1 + 1e-9)

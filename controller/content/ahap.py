@@ -39,6 +39,9 @@ _CONTROL = {
 }
 """Lowest, highest and default value of each parameter."""
 
+_PHASES = ("AttackTime", "DecayTime", "ReleaseTime")
+_LASTING = (*_PHASES, "Sustained")  # without effect on a transient
+
 _MAX_TIME = 1e6  # s; of a parameter that comes after all events
 
 _Control: TypeAlias = tuple[list[float], list[float]]
@@ -119,7 +122,7 @@ class _AhapReading:
         self.count = 0  # points so far
         self._events: list[tuple[_Event, dict[str, float]]] = []
         self._controls: dict[str, list[Curve]] = {name: [] for name in _CONTROL}
-        self._skipped: Counter[str] = Counter()
+        self._skipped: Counter[tuple[str, str]] = Counter()
         self._clamped: dict[str, list[float]] = {}
 
     def add(self, entry: _Entry) -> None:
@@ -138,12 +141,12 @@ class _AhapReading:
     def _add_event(self, event: _Event) -> None:
         self.count += 1
         if event.EventType.startswith("Audio"):
-            self._skipped["audio event"] += 1
+            self._skipped["audio event", "audio events"] += 1
             return
         values = {name: default for name, (_, _, default) in _EVENT.items()}
         for each in event.EventParameters:
             if each.ParameterID not in _EVENT:
-                self._skipped["unknown parameter"] += 1
+                self._skipped["unknown parameter", "unknown parameters"] += 1
             elif each.ParameterValue is not None:
                 low, high, _ = _EVENT[each.ParameterID]
                 value = self._in_range(each.ParameterID, each.ParameterValue, low, high)
@@ -151,6 +154,10 @@ class _AhapReading:
         values["Time"] = self._in_range("Time", event.Time, 0.0, _MAX_TIME)
         duration = self._in_range("EventDuration", event.EventDuration, 0.0, _MAX_TIME)
         lasts = event.EventType == "HapticContinuous"
+        if not lasts and any(values[name] != _EVENT[name][2] for name in _LASTING):
+            self._skipped["envelope of a transient", "envelopes of transients"] += 1
+        if not lasts and duration:
+            self._skipped["duration of a transient", "durations of transients"] += 1
         values["End"] = values["Time"] + duration * lasts
         self._events.append((event, values))
         self.end = max(self.end, values["End"])
@@ -160,7 +167,7 @@ class _AhapReading:
     ) -> None:
         self.count += len(points)
         if name not in _CONTROL:
-            self._skipped["unknown parameter"] += 1
+            self._skipped["unknown parameter", "unknown parameters"] += 1
             return
         low, high, default = _CONTROL[name]
         curve = [
@@ -174,6 +181,8 @@ class _AhapReading:
         ]
         if curve:
             self._controls[name].append(tuple(sorted(curve, key=itemgetter(0))))
+        else:
+            self._skipped["curve without points", "curves without points"] += 1
 
     def _in_range(self, name: str, value: float, low: float, high: float) -> float:
         if low <= value <= high:
@@ -188,9 +197,12 @@ class _AhapReading:
         transients = []
         for event, values in self._events:
             if event.EventType == "HapticTransient":
-                factor = _at(controls["HapticIntensityControl"], values["Time"])
-                intensity = values["HapticIntensity"] * factor
-                transients.append(Transient(values["Time"], intensity, values["HapticSharpness"]))
+                time = values["Time"]
+                intensity = values["HapticIntensity"] * _at(
+                    controls["HapticIntensityControl"], time
+                )
+                sharp = values["HapticSharpness"] + _at(controls["HapticSharpnessControl"], time)
+                transients.append(Transient(time, intensity, min(max(sharp, 0.0), 1.0)))
             else:
                 segments += _segments(values, controls)
         intensity_curve, sharpness = mixed(
@@ -204,7 +216,14 @@ class _AhapReading:
 
     def remarks(self) -> tuple[str, ...]:
         """Return in words what was left out and clamped."""
-        skipped = [f"{counted(n, what)} left out" for what, n in self._skipped.items()]
+        lasts = any(event.EventType == "HapticContinuous" for event, _ in self._events)
+        for name in [] if lasts else [f"Haptic{each}Control" for each in _PHASES]:
+            self._skipped[name, f"{name}s"] += len(self._controls[name])
+        skipped = [
+            f"{counted(n, what, plural=plural)} left out"
+            for (what, plural), n in self._skipped.items()
+            if n
+        ]
         clamped = [
             f"{name}: {counted(len(values), 'value')} out of range clamped, "
             f"from {min(values):g} to {max(values):g}"

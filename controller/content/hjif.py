@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from controller.content.format import ContentFormat, refusal, too_much
-from controller.content.json_file import ContentSection, Entries, read_json
+from controller.content.json_file import ContentSection, Entries, read_json, unknown_keys
 from controller.content.mixing import Segment, between, mixed
 from controller.content.pattern import Pattern, Transient
 from controller.content.sharpness import MAX_HZ, MIN_HZ, sharpness_of
@@ -37,6 +37,13 @@ _RMS = {
     "SawToothDown": math.sqrt(2 / 3),
 }
 """Root mean square of a wave over that of a sine."""
+
+_NOT_FELT = (
+    *("id", "level", "date", "description", "avatars", "avatar_id", "semantic_keywords"),
+    *("reference_devices", "reference_device_id", "body_part_mask", "body_part_target"),
+    *("actuator_resolution", "actuator_target", "mixing_coefficient", "block_length", "phase"),
+)
+"""Keys of the standard that say nothing of what one channel's vibration feels like."""
 
 _Ticks = Annotated[float, Field(ge=0)]
 _Hz = Annotated[float, Field(ge=0, le=1e6)]
@@ -123,7 +130,7 @@ class Hjif(ContentFormat):
         skipped = sorted({repr(each[:40]) for each in others if each not in _VIBRATION})
         remarks = (f"channel {channel} of {len(found)} read",) * (len(found) > 1)
         remarks += (f"perceptions of {', '.join(skipped[:5])} left out",) * bool(skipped)
-        return reading.pattern(source, remarks)
+        return reading.pattern(source, (*remarks, *unknown_keys(file, _NOT_FELT)))
 
 
 class _HjifReading:
@@ -182,8 +189,14 @@ class _HjifReading:
             if self._curves > _MAX_CURVES:
                 self._validation.add(where, "has too many curves, or too long ones; leave some out")
                 return
-            if times:
-                self._play(band, effect, times)
+            if placed is not effect and placed.keyframes:
+                self._remarks += ("keyframes of references left out",)
+            if not times or (band.band_type != "Transient" and times[0] == times[-1]):
+                self._remarks += ("effects without a duration or keyframes left out",)
+                continue
+            if band.band_type != "VectorialWave" and effect.base_signal != "Sine":
+                self._remarks += (f"base_signal of {band.band_type} left out",)
+            self._play(band, effect, times)
 
     def _play(self, band: _Band, effect: _Effect, times: list[float]) -> None:
         if band.band_type == "Transient":
@@ -218,8 +231,10 @@ class _HjifReading:
         knots, first = np.unique(times, return_index=True)
         given = np.array([each.amplitude_modulation or 0.0 for each in effect.keyframes])[first]
         at = np.arange(knots[0], knots[-1], 1 / _RATE)
-        if not len(at):
-            return
+        if band.curve_type not in ("Unknown", "Cubic", "Linear"):
+            self._remarks += (f"curve: {band.curve_type} drawn as Cubic",)
+        if any(each.frequency_modulation is not None for each in effect.keyframes):
+            self._remarks += ("curve: frequencies of keyframes left out",)
         wave = (
             np.interp(at, knots, given)
             if band.curve_type == "Linear"

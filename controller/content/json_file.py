@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
 
@@ -19,6 +19,7 @@ _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20
 _MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
 _MAX_NAMED = 5  # unknown keys in remarks
+_EMPTY: tuple[object, ...] = (None, "", [], {})
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 _STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
@@ -90,9 +91,12 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
     return JsonDocument(source, text, data, {})
 
 
-def unknown_keys(section: ContentSection) -> tuple[str, ...]:
-    """Return in words which keys of a file are ignored, the first ones by name."""
-    found = Counter(_extra(section))
+def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
+    """Return in words which keys of a file are ignored, the first ones by name.
+
+    but: those that say nothing of what is felt, besides all that are empty.
+    """
+    found = Counter(name for name in _extra(section) if name not in but)
     if not found:
         return ()
     names = [key_name((name,)) for name in list(found)[:_MAX_NAMED]]
@@ -105,7 +109,7 @@ def _extra(value: Any) -> Iterator[str]:
         for entry in value:
             yield from _extra(entry)
     elif isinstance(value, ContentSection):
-        yield from value.model_extra or ()
+        yield from (k for k, each in (value.model_extra or {}).items() if each not in _EMPTY)
         for name in type(value).model_fields:
             yield from _extra(getattr(value, name))
 

@@ -42,7 +42,7 @@ def near(*points: tuple[float, float]) -> tuple[Any, ...]:
 
 
 def test_controls_multiply_intensity_and_add_to_sharpness(read: Read) -> None:
-    """Of what lasts both, of a transient the intensity alone; what is last holds on."""
+    """Of what lasts and of a transient; what is last holds on."""
     pattern = read(
         "ahap",
         {
@@ -63,7 +63,7 @@ def test_controls_multiply_intensity_and_add_to_sharpness(read: Read) -> None:
     )
     assert pattern.intensity == near((0.1, 0.8), (0.3, 0.4), (0.5, 0.4))
     assert pattern.sharpness == near((0.1, 0.3), (0.15, 0.3), (0.15, 0.7), (0.5, 0.7))
-    assert pattern.transients == (Transient(0.2, pytest.approx(0.6 * 0.75), 0.3),)
+    assert pattern.transients == (Transient(0.2, pytest.approx(0.6 * 0.75), 0.7),)
     assert (pattern.duration, pattern.remarks) == (0.5, ())
 
 
@@ -130,6 +130,39 @@ def test_what_apple_ignores_passes_and_is_said(read: Read) -> None:
         "HapticIntensity: 1 value out of range clamped, from 1.5 to 1.5",
         "1 unknown key ignored: Colour",
     )
+
+
+@pytest.mark.parametrize(
+    ("sharpness", "expected"),
+    [((0.8, 0.8), (0.9, 0.9)), ((0.0, 1.0), (0.1, 0.85)), ((1, 1), (1, 1))],
+)
+def test_a_sharpness_curve_is_added_to_transients(
+    read: Read, sharpness: tuple[float, float], expected: tuple[float, float]
+) -> None:
+    """Taps of 0.1 at 0 and 0.3 s below a line over 0.4 s: its value there more, up to 1."""
+    taps = [event("Transient", time, HapticSharpness=0.1) for time in (0.0, 0.3)]
+    line = curve("Sharpness", 0.0, (0.0, sharpness[0]), (0.4, sharpness[1]))
+    pattern = read("ahap", {"Pattern": [*taps, line]})
+    assert [each.sharpness for each in pattern.transients] == pytest.approx(expected)
+    assert pattern.remarks == ()
+
+
+def test_what_no_transient_has_is_said(read: Read) -> None:
+    """Envelopes, durations, and their controls where nothing lasts; a curve without points."""
+    given = [
+        event("Transient", 0.0, 0.2, AttackTime=0.5),
+        event("Transient", 0.1, 0.2),
+        curve("AttackTime", 0.0, (0.0, 0.5)),
+        curve("Intensity", 0.0),
+    ]
+    assert read("ahap", {"Pattern": given}).remarks == (
+        "1 envelope of a transient left out",
+        "2 durations of transients left out",
+        "1 curve without points left out",
+        "1 HapticAttackTimeControl left out",
+    )
+    lasting = event("Continuous", 0.0, 0.2, Sustained=0.0)
+    assert read("ahap", {"Pattern": [lasting, given[2]]}).remarks == ()
 
 
 @pytest.mark.parametrize(

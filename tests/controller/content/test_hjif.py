@@ -73,6 +73,30 @@ def test_bands_of_one_channel(read: Read) -> None:
     )
 
 
+def test_what_is_not_played_is_said(read: Read) -> None:
+    """Keys that would be felt, curves drawn otherwise, forms without effect, moments; no titles."""
+    frames = (0, 0.5, 100), (20, 0.9, 100)
+    bands = [
+        band("Curve", effect(0, *frames), curve_type="Akima"),
+        band("Transient", effect(0, *frames, base_signal="Square", phase=1.0)),
+        band("VectorialWave", effect(0), effect(0, (0, 0.5, 100))),
+    ]
+    own = effect(0, *frames) | {"effect_type": "Reference", "id": 3}
+    bands.append(band("VectorialWave", own, id=1))
+    given = hjif(bands, library=[effect(0, *frames, id=3)], syncs=[{"timestamp": 9}], level=1)
+    given["perceptions"][1] |= {"description": "Rain", "vertices": [1], "avatars": []}
+    remarks = {each for each in read("hjif", given).remarks if "energy" not in each}
+    assert remarks == {
+        "perceptions of 'Temperature' left out",
+        "2 unknown keys ignored: syncs, vertices",
+        "curve: Akima drawn as Cubic",
+        "curve: frequencies of keyframes left out",
+        "base_signal of Transient left out",
+        "effects without a duration or keyframes left out",
+        "keyframes of references left out",
+    }
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_level_over_time_is_that_of_the_wave(read: Read, seed: int) -> None:
     """Of HJIF, of the curve and of the WAV that are the same wave: within 1.5 dB in each 20 ms.

@@ -1,8 +1,10 @@
-"""Opening files that a user names: only regular ones, and without waiting."""
+"""Opening and reading files that a user names: only regular ones, bounded, without waiting."""
 
 import errno
 import os
 import stat
+from pathlib import Path
+from typing import BinaryIO
 
 
 def regular_file(name: str, flags: int) -> int:
@@ -17,3 +19,28 @@ def regular_file(name: str, flags: int) -> int:
         return descriptor
     os.close(descriptor)
     raise OSError(errno.EINVAL, "must be a regular file, got a pipe or a device", name)
+
+
+def open_regular(path: Path, max_bytes: int) -> BinaryIO:
+    """Open a file to read; raises OSError as `regular_file` does, and for a larger one.
+
+    Its `strerror` says what must be. A sparse file may be long without a disk behind it.
+    """
+    stream = open(path, "rb", opener=regular_file)  # noqa: SIM115
+    if os.fstat(stream.fileno()).st_size > max_bytes:
+        stream.close()
+        raise _too_long(path, max_bytes)
+    return stream
+
+
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Read a file as a whole; raises OSError as `open_regular` does."""
+    with open_regular(path, max_bytes) as stream:
+        content = stream.read(max_bytes + 1)
+    if len(content) > max_bytes:  # of a length that no system states
+        raise _too_long(path, max_bytes)
+    return content
+
+
+def _too_long(path: Path, max_bytes: int) -> OSError:
+    return OSError(errno.EFBIG, f"must be up to {max_bytes >> 20} MiB long", str(path))

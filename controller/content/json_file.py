@@ -25,7 +25,7 @@ _SPACE = re.compile(r"[ \t\n\r]*")
 _STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
 _STRINGS = re.compile(_STRING, re.DOTALL)
 _TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
-_DECODER = json.JSONDecoder()
+_DECODER = json.JSONDecoder(parse_int=float)  # of any number of digits
 
 
 _T = TypeVar("_T")

@@ -25,7 +25,6 @@ _SPLIT = (110.0, 178.0)  # Hz; half an octave on both sides of the split fades o
 _OUTER_LOW, _OUTER_HIGH = (45.0, MIN_HZ), (MAX_HZ, 430.0)  # Hz; faded out beyond
 _FLOOR = 0.03  # of the highest intensity; what rings beside a burst in the bands lies below
 _MIN_RATE, _MAX_RATE = 1000, 192_000
-_MAX_SAMPLE = 1e3  # times full scale
 _MIN_LOST = 0.01  # of the energy
 
 
@@ -44,10 +43,6 @@ class Wav(ContentFormat):
         if channel > count:
             raise refusal(source, f"channel must be 1 to {count}, got {channel}")
         signal = samples[:, channel - 1]
-        is_sample = abs(signal) <= _MAX_SAMPLE  # not for what is no number
-        if not is_sample.all():
-            message = f"sample {int(is_sample.argmin())} must be -1 to 1, or not far beyond"
-            raise refusal(source, message)
         intensity, sharpness, remarks = course_of(signal, rate)
         if count == 2:
             remarks = (f"channel {channel} of 2 read", *remarks)

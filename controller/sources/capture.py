@@ -17,7 +17,7 @@ from pathlib import Path
 from controller.sources.datagrams import MAX_DATAGRAM
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
-from registry.regular_file import regular_file
+from registry.regular_file import read_regular
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
@@ -65,12 +65,7 @@ def read_capture(path: Path | str) -> list[RecordedDatagram]:
 def _lines(path: Path) -> list[str]:
     """Read the lines of a capture; raises InputError."""
     try:
-        with open(path, "rb", opener=regular_file) as stream:
-            content = stream.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise InputError(
-                f"{path}: must have at most {MAX_BYTES >> 20} MiB; record a shorter time"
-            )
+        content = read_regular(path, MAX_BYTES)
         return content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
     except OSError as error:
         raise InputError(

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,8 @@ import typer
 from model.commands.options import JsonOption, QuietOption, TableArgument, print_report
 from model.config.points import parse_point
 from model.errors import InputError
+
+_MAX_LINE = 1 << 20  # characters of a question
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
 
@@ -215,7 +218,8 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
             if is_piped
             else open(batch, encoding="utf-8", opener=regular_file)
         ) as lines:
-            for answer in query_batch(table, lines, defaults):
+            bounded = iter(partial(lines.readline, _MAX_LINE), "")
+            for answer in query_batch(table, bounded, defaults):
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
     except BrokenPipeError:

@@ -6,6 +6,7 @@ checked before a value is made. No key is given twice. Words are text unless the
 numbers, true, false or null (core schema of YAML 1.2).
 """
 
+import errno
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from model.errors import InputError
-from registry.regular_file import regular_file
+from registry.regular_file import read_regular
 
 MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50
@@ -140,19 +141,17 @@ def read_bytes(path: Path, max_size: int, *, is_for: str, give: str) -> bytes:
     """
     source = str(path)
     try:
-        with open(path, "rb", opener=regular_file) as stream:
-            content = stream.read(max_size + 1)
+        return read_regular(path, max_size)
     except FileNotFoundError as error:
         raise _whole(source, "no such file; check its name and folder") from error
     except IsADirectoryError as error:
         raise _whole(source, "is a folder; give the file in it") from error
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise _whole(source, f"{error.strerror}; {is_for}") from error
         raise _whole(source, f"cannot be read: {error.strerror}; give {give}") from error
     except ValueError as error:
         raise _whole(repr(source), f"is no file name: {error}") from error
-    if len(content) > max_size:
-        raise _whole(source, f"is larger than {max_size >> 20} MiB; {is_for}")
-    return content
 
 
 def decoded(source: str, content: bytes) -> str:

@@ -1,6 +1,8 @@
 """Where ERAs may stand: along the edge, anywhere, in polygons, on the white of a picture."""
 
+import io
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from model.arrays import FloatArray
-from model.config.document import read_document
+from model.config.document import read_bytes, read_document
 from model.config.sections import Section, Validation
 from model.config.shapes import Polygon, PolygonSection
 from model.errors import InputError
@@ -28,6 +30,7 @@ PROPORTION_TOLERANCE = 0.02
 """By how much the height of a picture may differ from the plate's proportions, relative."""
 
 _PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
+_MAX_BYTES = 16 << 20
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
 
@@ -73,8 +76,9 @@ def area_of(where: str, plate: Plate) -> Area:
         return Area(where, length, width, contains)
     path = Path(where)
     if path.suffix.lower() in PICTURES:
-        contains = partial(_is_white, _white(path, plate), length, width)
-        return Area(path.read_bytes().hex(), length, width, contains)
+        content = read_bytes(path, _MAX_BYTES, is_for="draw it smaller", give="a picture")
+        contains = partial(_is_white, _white(path, content, plate), length, width)
+        return Area(content.hex(), length, width, contains)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(
             f"where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
@@ -143,7 +147,7 @@ class _PolygonsSection(Section):
     polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
 
 
-def _white(path: Path, plate: Plate) -> NDArray[np.bool_]:
+def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
     """Pixels brighter than half, (rows, columns), of a picture with the plate's proportions.
 
     To PROPORTION_TOLERANCE, or half a pixel.
@@ -151,11 +155,13 @@ def _white(path: Path, plate: Plate) -> NDArray[np.bool_]:
     from matplotlib.image import imread
 
     try:
-        pixels = np.asarray(imread(path), dtype=float)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check its name and folder") from error
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"{path}: cannot be read as a picture ({error})") from error
+        with warnings.catch_warnings(action="error"):  # of one that takes more memory than it may
+            pixels = np.asarray(imread(io.BytesIO(content), path.suffix[1:].lower()), dtype=float)
+    except Exception as error:  # of a damaged file anything
+        raise InputError(
+            f"{path}: cannot be read as a picture; save it as PNG or JPEG, of {_PICTURE_SIDE} "
+            "pixels a side or less"
+        ) from error
     rows, columns = pixels.shape[:2]
     expected = columns * plate.width / plate.length
     if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):

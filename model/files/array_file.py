@@ -20,11 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arguments import shown
-from registry.regular_file import regular_file
+from registry.regular_file import open_regular
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
-UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError)
+UNREADABLE = (
+    *(OSError, ValueError, EOFError, RecursionError),
+    *(zipfile.BadZipFile, NotImplementedError),
+)
 """Errors of `read_arrays` for a file that is missing, damaged or unexpected."""
 
 _RANDOM = 12  # letters of a temporary name
@@ -69,7 +72,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict[str, NDArray[Any]]:
     """Read arrays of exactly these names and types (`dtype.str`); raises one of UNREADABLE."""
-    with open(path, "rb", opener=regular_file) as file, zipfile.ZipFile(file) as archive:
+    with open_regular(path, max_bytes) as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if sorted(members) != sorted(types) or len(archive.infolist()) != len(types):
             given = shown(", ".join(sorted(members)))
@@ -79,7 +82,7 @@ def read_arrays(path: Path, types: Mapping[str, str], *, max_bytes: int) -> dict
         if any(info.flag_bits & _ENCRYPTED for info in members.values()):
             raise ValueError("members must not be encrypted")
         declared = sum(info.file_size for info in members.values())
-        if declared > min(path.stat().st_size, max_bytes):
+        if declared > os.fstat(file.fileno()).st_size:
             raise ValueError(f"size must be that of the file, got {declared} bytes")
         arrays = {}
         for name, info in members.items():
@@ -110,6 +113,8 @@ def _check_npy_header(stream: IO[bytes], name: str, kind: str, *, member_bytes: 
         raise ValueError(f"{name}: unreadable header") from error
     if dtype.str != kind:
         raise ValueError(f"{name}: type must be {kind}, got {dtype.str}")
+    if any(type(count) is not int or count < 0 for count in shape):
+        raise ValueError(f"{name}: shape must be of whole numbers, got {shape}")
     size = dtype.itemsize * math.prod(shape)  # Python integers: no overflow
     if size + stream.tell() != member_bytes:
         raise ValueError(f"{name}: size must be that of the member, got {size} bytes")

@@ -1,12 +1,13 @@
 """CSV files: columns of numbers as one and as a pandas DataFrame, and lines of named columns."""
 
+import cmath
 import csv
 import io
 import logging
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -15,15 +16,35 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from model.arguments import MAX_VALUE
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.uff import read_bytes, text_of
 from registry.suggestions import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
-_SEPARATORS = (",", ";", "\t")
 _POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one
 _BLANK = "\n ,;\t"  # of lines without content
+_MAX_DB = 200.0
+_REMARK = re.compile(r"\s*(?:[*#!]|//)[*#!/\s]*")
+_NUMERIC = re.compile(r"\s*[-+.]?\d[-+.,;\d\seE]*$")  # a line of numbers alone
+_SPACED = re.compile(r"\d[ \t]+[-+.\d]")
+_MEANINGS = {
+    column: re.compile(pattern, re.IGNORECASE)
+    for column, pattern in {
+        "frequency_hz": r"\b(f|fre[qk]\w*|[kM]?hz)\b",
+        "phase_deg": r"\b(ph|pha\w*|deg\w*|rad|theta|angle|arg|winkel)\b|[°φθ]",
+        "imag": r"\b(im|ima\w*|xs?|reactance)\b",
+        "real": r"\b(re|real\w*|rs?|resist\w*)\b",
+        "magnitude_db": r"\bdB\b",
+        "magnitude": r"\b(z|mag\w*|mod\w*|abs\w*|amp\w*|imped\w*|betrag|[km]?ohms?)\b"
+        r"|[\u03a9\u2126]",
+    }.items()
+}
+"""What programs that measure call their columns, by ours: the first that is in a name."""
+
+_UNIT = re.compile(r"([kKmM]?)(?:[hH][zZ]|[oO]hms?|[\u03a9\u2126])")
+_PREFIXES = {"": 1.0, "k": 1e3, "K": 1e3, "m": 1e-3, "M": 1e6}
 
 _logger = logging.getLogger(__name__)
 
@@ -65,17 +86,26 @@ def as_frame(columns: Columns) -> Any:
 class Line:
     """A line of a file: its file and number, for errors, and the text of each column.
 
-    has_decimal_comma: whether a number may have a comma in place of a point.
+    has_decimal_comma: whether a number may have a comma in place of a point; factors: on numbers of
+    columns in other units.
     """
 
     place: str
     cells: Mapping[str, str]
     has_decimal_comma: bool = False
+    factors: Mapping[str, float] = field(default_factory=dict)
 
-    def number(self, column: str, default: float | None = None) -> float:
+    def number(
+        self,
+        column: str,
+        default: float | None = None,
+        *,
+        at_least: float = -MAX_VALUE,
+        at_most: float = MAX_VALUE,
+    ) -> float:
         """The number in a column, or what stands for a column that the file does not have.
 
-        Raises InputError for anything but a finite number.
+        Raises InputError for anything but a number within these bounds.
         """
         if default is not None and column not in self.cells:
             return default
@@ -85,37 +115,88 @@ class Line:
             value = float(text.replace(",", ".") if self.has_decimal_comma else text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        value *= self.factors.get(column, 1.0)
+        if not at_least <= value <= at_most:
             form = "; write all with a decimal point, or all with a comma" if "," in text else ""
+            least = f" from {at_least:g}" if at_least > -MAX_VALUE else ""
+            most = f" up to {at_most:g}" if at_most < MAX_VALUE else ""
             raise InputError(
-                f"{self.place}: {column} must be a finite number, got {text[:30]!r}{form}"
+                f"{self.place}: {column} must be a finite number{least}{most}, got "
+                f"{text[:30]!r}{form}"
             )
         return value
 
+    def complex_number(self) -> complex:
+        """The number of real and imag, or of magnitude or magnitude_db with phase_deg.
 
-def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()) -> list[Line]:
+        Raises InputError where the file has neither.
+        """
+        given = self.cells.keys()
+        if {"real", "imag"} <= given:
+            return complex(self.number("real"), self.number("imag"))
+        if "phase_deg" in given and ("magnitude" in given or "magnitude_db" in given):
+            if "magnitude" in given:
+                size = self.number("magnitude", at_least=0)
+            else:
+                size = 10 ** (self.number("magnitude_db", at_most=_MAX_DB) / 20)
+            return cmath.rect(size, math.radians(self.number("phase_deg")))
+        raise InputError(
+            f"{self.place}: columns must have real with imag, or magnitude or magnitude_db with "
+            f"phase_deg, got {', '.join(name[:30] for name in given)}"
+        )
+
+
+def read_lines(
+    path: Path,
+    columns: Sequence[str],
+    *,
+    optional: Sequence[str] = (),
+    unnamed: Sequence[str] = (),
+) -> list[Line]:
     """Read a file whose first line names its columns, in any order.
 
-    Columns are separated by commas, semicolons or tabs; with the latter two a decimal comma is read
-    as well, unless another number has a decimal point: it may separate thousands. Empty lines,
-    empty cells behind the last column and further columns are skipped. Raises InputError with file
-    and line for missing and repeated columns, names that may be misspelt, lines of another length,
-    and a file without any.
+    Columns are separated by commas, semicolons, tabs or spaces; but for commas a decimal comma is
+    read as well, unless another number has a decimal point: it may separate thousands. Empty lines,
+    remarks (with *, #, ! or // before them), empty cells behind the last column and further columns
+    are skipped. unnamed: columns of a file that has numbers alone, as programs that measure write
+    it; then names of quantities and units are read by their meaning, also from a remark. Raises
+    InputError with file and line for missing and repeated columns, names that may be misspelt,
+    lines of another length, and a file without any.
     """
     text = text_of(path, read_bytes(path)).replace("\r\n", "\n").replace("\r", "\n")
-    first = text.partition("\n")[0]
-    if first.lower().startswith("sep="):  # of a spreadsheet program
-        text = text[len(first) :]
-    separator = max(_SEPARATORS, key=text.lstrip(_BLANK).partition("\n")[0].count)
-    rows = csv.reader(io.StringIO(text), strict=True, skipinitialspace=True, delimiter=separator)
-    has_decimal_comma = separator != "," and _POINT.search(text) is None
+    given, begin = text.split("\n"), 0
+    if given[0].lower().startswith("sep="):  # of a spreadsheet program
+        given[0] = ""
+    plain = ["" if _REMARK.match(row) else row for row in given]
+    first = next((row for row in plain if row.strip(_BLANK)), "")
+    if unnamed:
+        begin = next((number for number, row in enumerate(plain) if _NUMERIC.match(row)), 0)
+        first = plain[begin] if begin else first
+    if is_spaced := _SPACED.search(first) is not None and not (";" in first or "\t" in first):
+        plain = ["\t".join(row.split()) for row in plain]
+    separator = "\t" if is_spaced else next((each for each in "\t;" if each in first), ",")
+    names: list[str] = []
+    if unnamed and _NUMERIC.match(first):
+        count = len([cell for cell in plain[begin].split(separator) if cell.strip()])
+        above = [_REMARK.sub("", row).strip(_BLANK) for row in given[:begin]]
+        split = [_columns(row, separator, count) for row in above if row]
+        usual = [*unnamed] if count == len(unnamed) else [f"column {n + 1}" for n in range(count)]
+        names = next((row for row in reversed(split) if len(row) == count), usual)
+        plain[:begin] = [""] * begin
+    rows = csv.reader(
+        io.StringIO("\n".join(plain)), strict=True, skipinitialspace=True, delimiter=separator
+    )
+    has_decimal_comma = separator != "," and _POINT.search("\n".join(["", *plain, ""])) is None
     filled = (row for row in rows if any(map(str.strip, row)))
     lines = []
     try:
-        header = [name.strip() for name in next(filled, ())]
+        header = names or [name.strip() for name in next(filled, ())]
+        place, factors = f"{path}:{rows.line_num or 1}", dict[str, float]()
         while header and not header[-1]:
             del header[-1]
-        _check_header(f"{path}:{rows.line_num}", header, columns, optional)
+        if unnamed:
+            header, factors = _meant(header, (*columns, *optional))
+        _check_header(place, header, columns, optional)
         for row in filled:
             place = f"{path}:{rows.line_num}"
             while len(row) > len(header) and not row[-1].strip():
@@ -125,8 +206,8 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
                     f"{place}: line must have {len(header)} values as the first line has, got "
                     f"{len(row)}; the file is damaged"
                 )
-            cells = map(str.strip, row)
-            lines.append(Line(place, dict(zip(header, cells, strict=True)), has_decimal_comma))
+            cells = dict(zip(header, map(str.strip, row), strict=True))
+            lines.append(Line(place, cells, has_decimal_comma, factors))
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"
@@ -134,6 +215,30 @@ def read_lines(path: Path, columns: Sequence[str], *, optional: Sequence[str] = 
     if not lines:
         raise InputError(f"{path}:1: at least one line of values must follow, got none")
     return lines
+
+
+def _columns(row: str, separator: str, count: int) -> list[str]:
+    """Names in a line above numbers, which may be separated otherwise than these."""
+    tried = (row.split(separator), row.split(","), re.split(r"\t| {2,}", row), row.split())
+    found = next((each for each in tried if len(each) == count), [])
+    return [name.strip() for name in found]
+
+
+def _meant(header: Sequence[str], known: Sequence[str]) -> tuple[list[str], dict[str, float]]:
+    """Columns by what their names mean, where one is known, and factors of their units."""
+    found, factors = list[str](), dict[str, float]()
+    for name in header:
+        words = name.replace("_", " ")
+        meant = (each for each, pattern in _MEANINGS.items() if pattern.search(words))
+        column = name if name in known else next(meant, name)
+        if column in found or column not in known:
+            column = name
+        elif unit := _UNIT.search(words):
+            factors[column] = _PREFIXES[unit[1]]
+        elif re.search(r"\brad", words):
+            factors[column] = math.degrees(1)
+        found.append(column)
+    return found, factors
 
 
 def _check_header(
@@ -149,9 +254,9 @@ def _check_header(
         problems = [f"{', '.join(missing)} missing"] if missing else []
         problems += [f"{named} unknown"] if unknown else []
         problems += ["a column is repeated"] if not problems else []
+        also = f", optionally {', '.join(optional)}" if optional else ""
         raise InputError(
-            f"{place}: columns must be {', '.join(columns)}, optionally {', '.join(optional)}, "
-            f"got {'; '.join(problems)}"
+            f"{place}: columns must be {', '.join(columns)}{also}, got {'; '.join(problems)}"
         )
     if unknown:
         _logger.warning("%s: columns not read: %s", place, named)

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from model.arguments import MAX_VALUE
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
-from registry.regular_file import regular_file
+from registry.regular_file import read_regular
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types
@@ -37,7 +38,8 @@ _NOT_METRES = (2, 4, 5, 6, 7, 8, 10)  # such codes: feet, millimetres, centimetr
 _MARK = re.compile(rb"^ {4}-1[ \t]*(?:\r?\n|\r|\Z)", re.MULTILINE)
 _BINARY_END = re.compile(rb" {4}-1[ \t]*(?:\r?\n|\r|\Z)")  # no line end before it
 _HEADER = re.compile(
-    rb"[ \t]*(?P<kind>\d+)(?:(?P<binary>[bB])(?:\s*\d+){3}[ \t]+(?P<bytes>\d+))?[^\r\n]*"
+    rb"[ \t]*(?P<kind>\d{1,9})(?!\d)"
+    rb"(?:(?P<binary>[bB])(?:\s*\d+){3}[ \t]+(?P<bytes>\d{1,18})(?!\d))?[^\r\n]*"
 )
 # As Fortran writes them: they may touch, with D for E, or without a letter.
 _NUMBER = re.compile(
@@ -164,14 +166,11 @@ def text_of(path: Path, content: bytes) -> str:
 def read_bytes(path: Path) -> bytes:
     """Read a measured file; raises InputError if it is missing, empty or too large."""
     try:
-        with open(path, "rb", opener=regular_file) as stream:
-            content = stream.read(_MAX_BYTES + 1)
+        content = read_regular(path, _MAX_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not content.strip():
         raise InputError(f"{path}: file is empty; export the measurement again")
-    if len(content) > _MAX_BYTES:
-        raise InputError(f"{path}: size must be up to {_MAX_BYTES >> 20} MiB; export fewer records")
     return content
 
 
@@ -276,14 +275,16 @@ def _function(path: Path, block: _Block, found: Mapping[str, Any]) -> Function:
             f"{len(values)}; the file is damaged, export it again"
         )
     values = values.reshape(shape)
-    if not np.isfinite(values).all():
-        raise InputError(f"{place}: values of the record must be finite; measure it again")
+    if not (np.abs(values) <= MAX_VALUE).all():
+        raise InputError(
+            f"{place}: values of the record must be finite, up to {MAX_VALUE:g}; measure it again"
+        )
     x = (
         found["abscissa_min"] + np.arange(count) * found["abscissa_inc"]
         if is_even
         else values[:, 0]
     )
-    if count == 0 or (np.diff(x) <= 0).any():
+    if count == 0 or not ((np.diff(x) > 0).all() and abs(x[-1]) <= MAX_VALUE):
         raise InputError(f"{place}: abscissa of the record must ascend; export it again")
     data = values[:, -2] + 1j * values[:, -1] if is_complex else values[:, -1]
     names = (_name(found["rsp_ent_name"]), _name(found["ref_ent_name"]))

@@ -16,6 +16,7 @@ _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE  # formats; the last has another one in
 _EXTENDED = 24  # where that is
 _LONG = b"ds64"  # a chunk of RF64 with sizes of 64 bits
 _UNKNOWN_SIZE = 0x7FFF0000  # and larger: of what was not known yet
+_MAX_SAMPLE = 1e3  # times full scale
 _KINDS = {
     (_PCM, 1): "u1",
     (_PCM, 2): "i2",
@@ -47,7 +48,11 @@ def samples_of(content: bytes) -> tuple[int, FloatArray]:
         raw = np.pad(raw, ((0, 0), (0, missing) if order == ">" else (missing, 0)))
     if not raw.size:
         raise InputError("has no samples")
-    return rate, _scaled(raw.ravel().view(f"{order}{kind}")).reshape(-1, channels)
+    samples = _scaled(raw.ravel().view(f"{order}{kind}")).reshape(-1, channels)
+    is_sample = np.abs(samples).max(axis=1) <= _MAX_SAMPLE  # not for what is no number
+    if not is_sample.all():
+        raise InputError(f"sample {int(is_sample.argmin())} must be -1 to 1, or not far beyond")
+    return rate, samples
 
 
 def _chunks(content: bytes, order: str) -> tuple[bytes, memoryview]:
@@ -78,9 +83,9 @@ def _refused(why: str) -> InputError:
 
 
 def _scaled(given: Any) -> FloatArray:
-    plain = given.astype(np.float32)
+    with np.errstate(all="ignore"):  # of float what is too large or no number is refused then
+        plain = given.astype(np.float32)
     if given.dtype == np.uint8:
         return np.asarray((plain - 128) / 128)
     full = 1.0 if given.dtype.kind == "f" else -float(np.iinfo(given.dtype).min)
-    with np.errstate(all="ignore"):  # of float what is too large or no number is refused later
-        return np.asarray(plain / full)
+    return np.asarray(plain / full)

@@ -78,8 +78,9 @@ def load_learned(file: Path, *, table: str) -> LearnedPlate:
             str(header["change"]),
         )
     except (*UNREADABLE, KeyError, TypeError) as error:
+        why = (isinstance(error, OSError) and error.strerror) or error
         raise InputError(
-            f"{file}: must be a learned plate: {error}; remove the file to learn anew"
+            f"{file}: must be a learned plate: {why}; remove the file to learn anew"
         ) from error
     p = len(names)
     if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):

@@ -143,11 +143,11 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
             f"{path}: format must be {FORMAT!r} version {FORMAT_VERSION}, got {header.format!r} "
             f"version {header.format_version}; {rebuild}"
         )
-    if _digest(json.loads(text), content) != header.sha256:
-        raise InputError(f"{path}: content does not match its checksum; {rebuild}")
     try:
+        if _digest(json.loads(text), content) != header.sha256:
+            raise InputError("content does not match its checksum")
         table = _assemble(header, content)
-    except InputError as error:
+    except ValueError as error:  # also of numbers with more digits than Python takes
         raise InputError(f"{path}: {error}; {rebuild}") from error
     if table.fingerprint != header.fingerprint:
         raise InputError(f"{path}: fingerprint does not match the plate of the file; {rebuild}")

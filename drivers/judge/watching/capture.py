@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -20,6 +21,7 @@ from registry.regular_file import regular_file
 
 Direction: TypeAlias = Literal["amplifier", "host"]
 """Direction of transfer: toward the amplifier or the host."""
+_MAX_LINE = 1 << 20  # characters
 _ARROWS: dict[Direction, str] = {"amplifier": ">", "host": "<"}
 
 
@@ -45,7 +47,8 @@ def read_capture(path: Path, *, wires: Collection[str]) -> Iterator[Piece]:
     last = -math.inf
     try:
         with open(path, encoding="utf-8", errors="backslashreplace", opener=regular_file) as lines:
-            for number, line in enumerate(lines, start=1):
+            # A line that is longer has no end, as in a sparse file, and no piece is as long.
+            for number, line in enumerate(iter(partial(lines.readline, _MAX_LINE), ""), start=1):
                 text = line.partition("#")[0].strip()
                 if text:
                     piece = _piece(text, f"{path}:{number}", wires, last)

@@ -23,6 +23,8 @@ from sim.desk.measuring.sound_card import SoundCard
 
 _PLACES = ("before the exciter", "over the resistor")
 _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
+_READ = ("frequency_hz", "real", "imag", "magnitude", "phase_deg")
+_UNNAMED = ("frequency_hz", "magnitude", "phase_deg")
 
 
 LINES: FloatArray = np.unique(np.geomspace(LOW, HIGH, 120).round())
@@ -62,10 +64,13 @@ def write_impedance(path: Path, frequencies: FloatArray, impedance: ComplexArray
 
 
 def read_impedance(path: Path) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of a file; raises InputError."""
-    rows = np.array(
-        [[line.number(name) for name in _COLUMNS] for line in read_lines(path, _COLUMNS)]
-    ).reshape(-1, 3)
-    if len(rows) and rows[:, 0].min() <= 0:
-        raise InputError(f"{path}: frequency_hz must be above 0, got {rows[:, 0].min():g}")
-    return rows[:, 0], rows[:, 1] + 1j * rows[:, 2]
+    """Frequencies (f,) [Hz] and impedance (f,) [ohm] of a file, or of one of another program.
+
+    That may have magnitude and phase (ZMA, LIMP, REW) or real and imaginary part, in other words
+    and units (`model.files.csv_file.read_lines`). Raises InputError.
+    """
+    lines = read_lines(path, _READ[:1], optional=_READ[1:], unnamed=_UNNAMED)
+    frequencies = np.array([line.number("frequency_hz") for line in lines])
+    if frequencies.min() <= 0:
+        raise InputError(f"{path}: frequency_hz must be above 0, got {frequencies.min():g}")
+    return frequencies, np.array([line.complex_number() for line in lines])

@@ -7,7 +7,6 @@ or its number from 1. What a file does not say is in its name: SENSOR-OUTPUT.csv
 """
 
 import cmath
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,11 +19,12 @@ from model.calibration.responses_file import write_responses
 from model.calibration.sensor_file import WiredSensor, are_places
 from model.counting import counted
 from model.errors import InputError
-from model.files.csv_file import Line, read_lines
+from model.files.csv_file import read_lines
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import CLOSE, tones_of
 
 _OPTIONAL = ("output", "sensor", "magnitude", "magnitude_db", "phase_deg", "real", "imag")
+_UNNAMED = ("frequency_hz", "magnitude_db", "phase_deg")
 _ENDINGS = (".csv", ".wav")
 
 
@@ -89,7 +89,7 @@ def read_stepped(source: Path, desk: Desk) -> list[MeasuredValue]:
 
 
 def _of_lines(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
-    for line in read_lines(path, ("frequency_hz",), optional=_OPTIONAL):
+    for line in read_lines(path, ("frequency_hz",), optional=_OPTIONAL, unnamed=_UNNAMED):
         sensor, output = (
             line.cells.get(column) or _in_name(path, number, column)
             for number, column in enumerate(("sensor", "output"))
@@ -99,27 +99,7 @@ def _of_lines(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
         if frequency <= 0:
             raise InputError(f"{line.place}: frequency_hz must be above 0, got {frequency:g}")
         era = _era(desk, output, line.place)
-        yield _value(desk, era, place, frequency, _ratio(line), line.place)
-
-
-def _ratio(line: Line) -> complex:
-    """What a line has of a sensor's samples by the reference's."""
-    given = line.cells.keys()
-    if {"real", "imag"} <= given:
-        return complex(line.number("real"), line.number("imag"))
-    if "phase_deg" in given and ("magnitude" in given or "magnitude_db" in given):
-        size = (
-            line.number("magnitude")
-            if "magnitude" in given
-            else 10 ** (line.number("magnitude_db") / 20)
-        )
-        if size < 0:
-            raise InputError(f"{line.place}: magnitude must be 0 or more, got {size:g}")
-        return cmath.rect(size, math.radians(line.number("phase_deg")))
-    raise InputError(
-        f"{line.place}: columns must have magnitude or magnitude_db with phase_deg, or real with "
-        f"imag, got {', '.join(given)}"
-    )
+        yield _value(desk, era, place, frequency, line.complex_number(), line.place)
 
 
 def _of_recording(path: Path, desk: Desk) -> Iterator[MeasuredValue]:

@@ -26,6 +26,7 @@ from sim.desk.measuring.loopback import SILENT, check_levels
 CLOSE = 2e-4
 """Of a frequency: nearer ones are the same, played for several ERAs."""
 
+_MIN_RATE, _MAX_RATE = 1000, 1_000_000  # Hz
 _FRAME = 0.05  # s
 _HIGHEST = 1500.0  # Hz, of a tone
 _HELD = 0.3  # Hz between two frames of one tone
@@ -53,18 +54,18 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
     """Tones of a recording of sensors, that ERAs played; raises InputError, with the time."""
     try:
         rate, samples = samples_of(read_bytes(path))
+        if not _MIN_RATE <= rate <= _MAX_RATE:
+            raise InputError(f"rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate} Hz")
+        first = max(sensor.input for sensor in sensors)
+        references = samples[:, first:]
+        if references.shape[1] not in (1, len(eras)):
+            raise InputError(
+                f"channels must be {first} of sensors and 1 or {len(eras)} references behind them, "
+                f"got {samples.shape[1]}"
+            )
         check_levels(samples, {sensor.input: f"sensor {sensor.name}" for sensor in sensors})
     except (InputError, LinkError) as error:
         raise InputError(f"{path}: {error}") from error
-    if not np.isfinite(samples).all():
-        raise InputError(f"{path}: samples must be finite")
-    first = max(sensor.input for sensor in sensors)
-    references = samples[:, first:]
-    if references.shape[1] not in (1, len(eras)):
-        raise InputError(
-            f"{path}: channels must be {first} of sensors and 1 or {len(eras)} references behind "
-            f"them, got {samples.shape[1]}"
-        )
     columns = [sensor.input - 1 for sensor in sensors]
     found, number, before = list[Tone](), 0, 0.0
     for begin, end in _held(path, references.sum(axis=1), rate):

@@ -1,9 +1,7 @@
 """Recorded TUIO streams, and files that are none."""
 
 import asyncio
-import os
 import socket
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.cli.main import run
-from controller.effects.layout_file import load_layout
 from controller.sources.capture import (
     HEADER,
     MAX_BYTES,
@@ -21,10 +18,7 @@ from controller.sources.capture import (
 )
 from drivers.errors import LinkError
 from examples.make_touches import write_capture
-from model.calibration.responses_file import read_measured
 from model.errors import InputError
-from model.rig.file import load_rig
-from model.table.file import load_table
 from virtual_loop import in_virtual_time
 
 
@@ -105,30 +99,6 @@ def test_era_touch_sends_a_capture(tmp_path: Path) -> None:
         assert [receiver.recv(100) for _ in range(2)] == [b"one", b"two"]
         assert run(["touch", "0.1,0.1", *options], commands) == 2
     assert run(["touch"], commands) == 2
-
-
-READERS: dict[str, Callable[[Path], object]] = {
-    "rig.yaml": load_rig,
-    "layout.yaml": lambda path: load_layout(path, None),
-    "taps.tuio": read_capture,
-    "measured.csv": read_measured,
-    "measured.uff": read_measured,
-    "table.npz": load_table,
-}
-
-
-@pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_reader_refuses_what_is_no_regular_file(tmp_path: Path, name: str, kind: str) -> None:
-    """A pipe into which nothing writes, and a device that never ends; the error names the file."""
-    path = tmp_path / name
-    if kind == "pipe":
-        os.mkfifo(path)
-    else:
-        path.symlink_to("/dev/zero")
-    with pytest.raises(InputError, match=name) as caught:
-        READERS[name](path)
-    assert "Errno" not in str(caught.value)
 
 
 def test_capture_has_a_maximum_size(tmp_path: Path) -> None:

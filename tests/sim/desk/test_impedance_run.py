@@ -17,8 +17,10 @@ from exciter_circuit import ExciterCircuit
 from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
+from model.errors import InputError
 from model.rig.file import parse_rig
 from sim.desk.impedance_cli import app
+from sim.desk.measuring.impedance_run import read_impedance
 from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
 
@@ -162,3 +164,78 @@ def test_parts_are_found_through_a_real_server(
                 )  # fmt: skip
                 plate.wait(0)
     _check(json.loads(done.stdout))
+
+
+def _impedance(frequency: float) -> complex:
+    """A voice coil at a resonance of 80 Hz [ohm]."""
+    return 4 + 2j * np.pi * frequency * 1e-4 + 12 / (1 + 3j * (frequency / 80 - 80 / frequency))
+
+
+ROWS = [(f, _impedance(f)) for f in np.geomspace(10, 1000, 60).tolist()]
+
+
+def _written(form: str, above: str = "", *, comma: bool = False, unit: float = 1.0) -> str:
+    """A file of lines of a form, below others; comma: with decimal commas; unit: of ohms."""
+    lines = [
+        form.format(
+            f=f"{f:.4f}",
+            k=f"{1e-3 * f:.7f}",
+            z=f"{abs(z) / unit:.7f}",
+            d=f"{np.degrees(np.angle(z)):.5f}",
+            a=f"{np.angle(z):.7f}",
+            r=f"{z.real / unit:.7f}",
+            x=f"{z.imag / unit:.7f}",
+        )
+        for f, z in ROWS
+    ]
+    text = "\n".join(lines)
+    return above + (text.replace(".", ",") if comma else text) + "\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        _written("{f} {z} {d}"),
+        _written("{f}\t{z}\t{d}", "* Freq(Hz)\tZ(Ohm)\tPhase(deg)\n"),
+        _written("{f}, {z}, {d}", "* Saved at 28.11.\n* Freq(Hz), Z(Ohms), Phase(degrees)\n"),
+        _written("{f} {z} {d}", "* Freq(Hz), Z(Ohms), Phase(degrees)\n"),
+        _written("{f} {z} {d}", "* Freq(Hz), Z(Ohms), Phase(degrees)\n", comma=True),
+        _written(" {f}   {z}  {d} ", "Freq [Hz]   Magn [Ohm]   Phase [deg]\n"),
+        _written("{f};{z};{d}", "Frequenz;Betrag (Ohm);Phase (\N{DEGREE SIGN})\n", comma=True),
+        _written("{k};{z};{a}", "Freq (kHz);|Z| (kOhm);Phase (rad)\n", unit=1e3),
+        _written("{f},{z},{d}", "Frequency,Impedance\n\nHz,m\N{OHM SIGN},deg\n", unit=1e-3),
+        _written("{f},{r},{x}", "Frequency (Hz),R (ohm),X (ohm)\n"),
+        _written("{f},{x},{r}", "frequency_hz,imag_ohm,real_ohm\n"),
+        _written("{f}\t{r}\t{x}", "\N{BYTE ORDER MARK}! VNA\r\nfreq[Hz]\tre:Z\tim:Z\r\n"),
+        _written("{f},{z},{d},{r},{x}", "f,|Z|,Phase(deg),Real,Imag\n"),
+        _written('"{f}";"{z}";"{d}"', "sep=;\nf/Hz;Z/Ohm;phi/deg\n", comma=True),
+    ],
+)  # fmt: skip
+def test_impedance_of_other_programs_is_read_by_its_meaning(tmp_path: Path, text: str) -> None:
+    """Remarks, separators, decimal commas, units and parts as they have them: the coil's values."""
+    path = tmp_path / "coil.zma"
+    path.write_text(text, encoding="utf-8")
+    frequencies, impedance = read_impedance(path)
+    assert frequencies == pytest.approx([f for f, _ in ROWS], rel=1e-4)
+    assert impedance == pytest.approx(np.array([z for _, z in ROWS]), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 2 3\n2 x 3\n", r":2: magnitude must be a finite number from 0, got 'x'"),
+        ("1 2\n2 3\n", r"columns must be frequency_hz, optionally real, imag"),
+        ("f,Z\n1,2\n", r"columns must have real with imag, or magnitude"),
+        ("f,Z,phase\n1,-2,0\n", r"magnitude must be a finite number from 0"),
+        ("f,Z,phase\n1,1e19,0\n", r"magnitude must be a finite number from 0, got '1e19'"),
+        ("f,Z,phase\n0,2,0\n", r"frequency_hz must be above 0"),
+        ("f,Z,phase\n1,2,0\n2,3\n", r":3: line must have 3 values"),
+        ("* f Z phase\n", r"frequency_hz missing|at least one line"),
+    ],
+)
+def test_impedance_that_cannot_be_read_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    """With what its columns must be, in a whole sentence."""
+    path = tmp_path / "coil.zma"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_impedance(path)

@@ -141,8 +141,8 @@ class Line:
                 size = 10 ** (self.number("magnitude_db", at_most=_MAX_DB) / 20)
             return cmath.rect(size, math.radians(self.number("phase_deg")))
         raise InputError(
-            f"{self.place}: columns must have real with imag, or magnitude or magnitude_db with "
-            f"phase_deg, got {', '.join(name[:30] for name in given)}"
+            f"{self.place}: columns must have magnitude or magnitude_db with phase_deg, or real "
+            f"with imag, got {', '.join(name[:30] for name in given)}"
         )
 
 

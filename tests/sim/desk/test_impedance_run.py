@@ -225,7 +225,7 @@ def test_impedance_of_other_programs_is_read_by_its_meaning(tmp_path: Path, text
     [
         ("1 2 3\n2 x 3\n", r":2: magnitude must be a finite number from 0, got 'x'"),
         ("1 2\n2 3\n", r"columns must be frequency_hz, optionally real, imag"),
-        ("f,Z\n1,2\n", r"columns must have real with imag, or magnitude"),
+        ("f,Z\n1,2\n", r"columns must have magnitude .* or real with imag"),
         ("f,Z,phase\n1,-2,0\n", r"magnitude must be a finite number from 0"),
         ("f,Z,phase\n1,1e19,0\n", r"magnitude must be a finite number from 0, got '1e19'"),
         ("f,Z,phase\n0,2,0\n", r"frequency_hz must be above 0"),

@@ -118,10 +118,10 @@ class Line:
         value *= self.factors.get(column, 1.0)
         if not at_least <= value <= at_most:
             form = "; write all with a decimal point, or all with a comma" if "," in text else ""
-            least = f" from {at_least:g}" if at_least > -MAX_VALUE else ""
-            most = f" up to {at_most:g}" if at_most < MAX_VALUE else ""
+            lower = f" from {at_least:g}" if at_least > -MAX_VALUE else ""
+            upper = f" up to {at_most:g}" if at_most < MAX_VALUE else ""
             raise InputError(
-                f"{self.place}: {column} must be a finite number{least}{most}, got "
+                f"{self.place}: {column} must be a finite number{lower}{upper}, got "
                 f"{text[:30]!r}{form}"
             )
         return value
@@ -157,17 +157,20 @@ def read_lines(
 
     Columns are separated by commas, semicolons, tabs or spaces; but for commas a decimal comma is
     read as well, unless another number has a decimal point: it may separate thousands. Empty lines,
-    remarks (with *, #, ! or // before them), empty cells behind the last column and further columns
-    are skipped. unnamed: columns of a file that has numbers alone, as programs that measure write
-    it; then names of quantities and units are read by their meaning, also from a remark. Raises
-    InputError with file and line for missing and repeated columns, names that may be misspelt,
-    lines of another length, and a file without any.
+    remarks above the names (with *, #, ! or // before them), empty cells behind the last column and
+    further columns are skipped. unnamed: columns of a file that has numbers alone, as programs that
+    measure write it; then names of quantities and units are read by their meaning, also from a
+    remark. Raises InputError with file and line for missing and repeated columns, names that may be
+    misspelt, lines of another length, and a file without any.
     """
     text = text_of(path, read_bytes(path)).replace("\r\n", "\n").replace("\r", "\n")
     given, begin = text.split("\n"), 0
     if given[0].lower().startswith("sep="):  # of a spreadsheet program
         given[0] = ""
-    plain = ["" if _REMARK.match(row) else row for row in given]
+    # Below names a line may begin with the name of a sensor, such as #1.
+    above = next((n for n, row in enumerate(given) if row and not _REMARK.match(row)), 0)
+    marked = given if unnamed else given[:above]
+    plain = ["" if _REMARK.match(row) else row for row in marked] + given[len(marked) :]
     first = next((row for row in plain if row.strip(_BLANK)), "")
     if unnamed:
         begin = next((number for number, row in enumerate(plain) if _NUMERIC.match(row)), 0)
@@ -178,10 +181,10 @@ def read_lines(
     names: list[str] = []
     if unnamed and _NUMERIC.match(first):
         count = len([cell for cell in plain[begin].split(separator) if cell.strip()])
-        above = [_REMARK.sub("", row).strip(_BLANK) for row in given[:begin]]
-        split = [_columns(row, separator, count) for row in above if row]
-        usual = [*unnamed] if count == len(unnamed) else [f"column {n + 1}" for n in range(count)]
-        names = next((row for row in reversed(split) if len(row) == count), usual)
+        heads = [_REMARK.sub("", row).strip(_BLANK) for row in given[:begin]]
+        split = [_columns(row, separator, count) for row in heads if row]
+        names = [*unnamed] if count == len(unnamed) else [f"column {n + 1}" for n in range(count)]
+        names = next((row for row in reversed(split) if len(row) == count), names)
         plain[:begin] = [""] * begin
     rows = csv.reader(
         io.StringIO("\n".join(plain)), strict=True, skipinitialspace=True, delimiter=separator

@@ -124,8 +124,8 @@ class Values:
                 new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
             fields: dict[str, Any] = {era.fields[kind]: float(value) for kind, value in new.items()}
             if isinstance(era, Exciter):
-                most = era.largest_force_factor(fields["magnet_mass"])
-                fields["force_factor"] = min(fields["force_factor"], most)
+                largest = era.largest_force_factor(fields["magnet_mass"])
+                fields["force_factor"] = min(fields["force_factor"], largest)
             found.append(replace(era, gains=(), **fields))
         return tuple(found)
 

@@ -48,6 +48,15 @@ def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
 
 
+def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() -> None:
+    """Of a page whose marks name what writes it, which its test imports without naming the page."""
+    module, page = "drivers/protocol/table.py", "docs/reference/can.md"
+    order = [*nearest([module, page])]
+    beside = [each for each in order if Path("tests", module).parent in Path(each).parents]
+    assert order.index("tests/docs/test_protocol_pages.py") <= len(beside) + 4
+    assert nearest([page])["tests/docs/test_protocol_pages.py"] == 0
+
+
 def test_rows_name_what_there_is() -> None:
     """Files or folders, and targets of the Makefile."""
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)

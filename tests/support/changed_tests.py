@@ -11,6 +11,7 @@ exit status 3 where no test had time. pytest loads this file as a plug-in, too.
 import argparse
 import ast
 import os
+import re
 import subprocess
 import sys
 import time
@@ -71,6 +72,7 @@ _UNTIL = "ERA_TESTS_UNTIL"
 _NO_TIME = "without time"
 _NOTHING_RAN = 3
 _MODULES = (".py", ".pyi")
+_WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")
 _LAST = ("pyproject.toml", "examples/")
 """What many tests name or import that its change does not concern."""
 
@@ -116,15 +118,16 @@ def nearest(changed: Sequence[str]) -> dict[str, int]:
     """The files of tests that changed files reach, by path: 0 in their folder, then by imports.
 
     Of a file that is no module those are 0 that name it, then come those of its folder. The order:
-    tests that are changed themselves; those of the folders of changed modules; the nearest by
-    imports, of as many those of a near folder first, and those that take long last; what is reached
-    from _LAST alone.
+    tests that are changed themselves; those of the folders of changed modules and of changed pages;
+    the nearest by imports, of as many those of a near folder first, and those that take long last;
+    what is reached from _LAST alone.
     """
     last = [path for path in changed if path.startswith(_LAST)]
     near = _reached([path for path in changed if path not in last])
     distances = _reached(last) | near
     modules = [each for each in {*changed} - {*last, *_tests()} if each.endswith(_MODULES)]
     beside = {test for path in modules for test in _tests_beside(path)}
+    beside |= {test for path in changed if path.endswith(".md") for test in _tests_of_page(path)}
 
     def place(test: str) -> tuple[bool, bool, bool, int, int, bool, str]:
         common = (os.path.commonpath([test, f"tests/{path}"]) for path in changed)
@@ -148,7 +151,7 @@ def _reached(changed: Sequence[str]) -> dict[str, int]:
         else:
             package = str(Path(path).parent).replace("/", ".")
             first += [each for each in _importers() if each.rpartition(".")[0] == package]
-            first += _tests_that_name(Path(path).name)
+            first += _tests_of_page(path)
         start = dict.fromkeys(second, 1) | start | dict.fromkeys(first, 0)
     distances = _distances(start)
     return dict.fromkeys(_tests(), 1) | distances if "conftest" in start else distances
@@ -179,6 +182,14 @@ def _tests_beside(path: str) -> Iterator[str]:
 
 def _tests_that_name(file: str) -> Iterator[str]:
     return (path for path in _tests() if file in (ROOT / path).read_text("utf-8"))
+
+
+def _tests_of_page(path: str) -> Iterator[str]:
+    """The tests that name a file, and those that import what writes parts of it, by its marks."""
+    yield from _tests_that_name(Path(path).name)
+    if path.endswith(".md") and (ROOT / path).exists():
+        for writer in {*_WRITER.findall((ROOT / path).read_text("utf-8"))}:
+            yield from _importers().get(writer, set()) & {*_tests()}
 
 
 def _distances(start: Mapping[str, int]) -> dict[str, int]:

@@ -17,7 +17,6 @@ from model.answer.plan import answer, prepare_answers
 from model.answer.search import APART_HZ
 from model.answer.timing import Timing
 from model.arrays import Point, nullable
-from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL, highest_measured
 from model.table.table import LocalizationTable
@@ -105,19 +104,19 @@ def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line
 def answer_as_json(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
     """Answer a line; with vibrations of their own its loads are those of the quiet fingers."""
     if asked.own:
-        fingers, mode = [each.finger(asked.level_db_sl) for each in asked.own], UNRESTRICTED
+        fingers = [each.finger(asked.level_db_sl) for each in asked.own]
         loads = _loads(asked, len(asked.quiet), what="quiet finger")
     else:
         targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
         stimulus = Stimulus(asked.level_db_sl, duration=asked.duration, name="target")
-        loads, mode = _loads(asked, len(targets) + len(asked.quiet), what="finger"), None
+        loads = _loads(asked, len(targets) + len(asked.quiet), what="finger")
         fingers = [Finger(_point(at), stimulus, loads.pop(0), sharing=MUST) for at in targets]
     started = time.perf_counter()
     found = answer(
         table,
         fingers,
         quiet=[Finger(_point(at), load=load) for at, load in zip(asked.quiet, loads, strict=True)],
-        drive_mode=asked.mode or mode,
+        drive_mode=asked.mode,
         shaped=asked.envelopes,
         apart_hz=asked.apart_hz,
         bands_may_swap=asked.bands_may_swap,
@@ -219,7 +218,7 @@ def _envelopes_as_json(
 def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
     """Answer one question, of the keys of a batch's line. Raises InputError."""
     asked, timing = _parsed(values, {}), Timing(table)
-    prepare_answers(table, asked.mode or (UNRESTRICTED if asked.own else None))
+    prepare_answers(table, asked.mode)
     timing.prepare(table.frequencies.tolist())
     return answer_as_json(table, asked, timing)
 

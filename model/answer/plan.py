@@ -169,8 +169,8 @@ class _Answering:
         if len(plan.contents) > 1 and self.drive_mode != UNRESTRICTED:
             raise InputError(
                 f"drive mode must be {UNRESTRICTED} for a vibration of each of several fingers, "
-                f"got {self.drive_mode}, which plays one; give drive_mode={UNRESTRICTED!r} where "
-                "the amplifiers play it"
+                f"got {self.drive_mode}, which plays one; where the amplifiers play it give "
+                f"drive_mode={UNRESTRICTED!r}, or --mode {UNRESTRICTED} to era table query or build"
             )
         tried = [found := self._measure(plan)]
         while (

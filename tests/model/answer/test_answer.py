@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import era_haptics
 from model.answer.as_json import query_one
 from model.answer.fingers import NEVER, Finger, Placement, Stimulus
 from model.answer.plan import answer as answer_by_table
@@ -204,7 +205,7 @@ def test_two_fingers_that_share_and_no_other_are_served():
 def test_what_is_not_felt_is_null_in_json():
     """A higher priority takes the whole stroke: JSON has no infinity."""
     own = [{"at": NEAR, "level_db_sl": 60.0, "priority": 1}, {"at": FAR, "level_db_sl": 12.0}]
-    found = query_one(smooth_table(), {"own": own})
+    found = query_one(smooth_table(), {"own": own, "mode": "phased"})
     assert found["fingers"][1]["verdict"] == "held back"
     json.dumps(found, allow_nan=False)
 
@@ -435,13 +436,48 @@ def test_a_request_refuses_what_no_content_has(given):
 def table_file(tmp_path_factory):
     """The table on disk."""
     path = tmp_path_factory.mktemp("tables") / "t.npz"
-    save_table(smooth_table(), path)
+    save_table(replace(smooth_table(), drive_mode="phased"), path)
     return str(path)
 
 
 def run(*words):
     """`era table query` with options; its lines."""
     return CliRunner().invoke(app, ["table", "query", *words])
+
+
+@pytest.mark.parametrize("way", ["era.answer", "--own", "--batch"])
+def test_a_table_of_on_and_off_plays_one_content_only(way, tmp_path):
+    """Built `switched`: a finger of its own gets ERAs that are on or off, several are refused.
+
+    Unless the question says `phased`.
+    """
+    table, path, lines = smooth_table(), tmp_path / "t.npz", tmp_path / "lines"
+    save_table(table, path)
+
+    def modes(places, *, drive_mode=None):
+        """Drive modes of the layers; raises InputError."""
+        if way == "era.answer":
+            found = era_haptics.answer(table, [wants(at) for at in places], drive_mode=drive_mode)
+            return [each.drive_mode for each in found.layers]
+        options = [] if drive_mode is None else ["--mode", drive_mode]
+        if way == "--batch":
+            lines.write_text(json.dumps({"own": [{"at": at} for at in places]}))
+            result = run(str(path), "--batch", str(lines), *options)
+            found = json.loads(result.stdout)
+            if "error" in found:
+                raise InputError(found["error"])
+        else:
+            own = [word for x, y in places for word in ("--own", f"{x},{y}")]
+            result = run(str(path), *own, *options, "--json")
+            if isinstance(result.exception, InputError):
+                raise result.exception
+            found = json.loads(result.stdout)
+        return [each["mode"] for each in found["layers"]]
+
+    assert modes([NEAR]) == ["switched"]
+    with pytest.raises(InputError, match="phased"):
+        modes([NEAR, FAR])
+    assert modes([NEAR, FAR], drive_mode="phased") == ["phased"] * 2
 
 
 def test_the_command_answers_as_python_does(table_file):

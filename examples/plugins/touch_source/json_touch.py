@@ -16,10 +16,9 @@ class JsonTouch(UdpSource):
 
     def read(self, datagram: bytes, peer: tuple[str, int], arrived: float) -> TouchFrame | None:
         """Return the frame of a datagram; a malformed one is counted."""
-        place = f"{peer[0]}:{peer[1]}"
         try:
             touches = tuple(Touch(int(id), float(x), float(y)) for id, x, y in json.loads(datagram))
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
-            self.rejects.count("malformed", f"datagram from {place}: {error}")
+            self.rejects.count("malformed", f"datagram from {peer[0]}: {error}")
             return None
-        return TouchFrame(place, arrived, touches, self.timeout)
+        return TouchFrame(f"{peer[0]}:{peer[1]}", arrived, touches, self.timeout)

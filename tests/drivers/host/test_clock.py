@@ -263,10 +263,17 @@ def test_bits_of_a_request_are_no_lead() -> None:
     assert abs(talk.counter.lead) < 2e-6
 
 
+def _prompt(rng: random.Random) -> float:
+    """Draw how long a reply takes without bits [s]."""
+    return rng.uniform(30e-6, 70e-6) + 0.2e-3 * (rng.random() < 0.1)
+
+
 @pytest.mark.parametrize("takes", [0.0, 0.2e-3], ids=["all", "late at first"])
 @pytest.mark.parametrize("bits", [0.3e-3, 0.6e-3], ids=["pty", "slcan over TCP"])
 def test_bits_that_take_no_time_do_not_count(bits: float, takes: float) -> None:
     """921 600 baud on a pseudo-terminal, 500 kbit/s on TCP: 30 us and up to 40 more each way.
+
+    One reply of ten takes 0.2 ms more, which makes no reading early.
 
     So two of +-40 ppm that are read alike differ by what is late in the lowest readings: 9 us rms,
     as over a network. Nothing is said of them, also where bits seemed to count at first.
@@ -275,12 +282,13 @@ def test_bits_that_take_no_time_do_not_count(bits: float, takes: float) -> None:
     for seed, crystal in enumerate((40e-6, -40e-6)):
         rng = random.Random(seed)
         late = partial(rng.uniform, 30e-6, 70e-6)
-        talk = Exchanges(Counter(crystal), late, bits, takes=takes and bits, back=late)
+        back = partial(_prompt, rng)
+        talk = Exchanges(Counter(crystal), late, bits, takes=takes and bits, back=back)
         talk.held.identified(10, bits=2 * bits)
         if takes:
             talk.back = partial(rng.uniform, 2 * bits, 3 * bits)
         talk.run(0.2)
-        talk.back, talk.takes = late, 0.0
+        talk.back, talk.takes = back, 0.0
         talk.arm()
         for _ in range(60):
             talk.run(0.5)
@@ -297,12 +305,13 @@ def test_bits_that_take_a_little_less_than_stated_count() -> None:
     """
     rng = random.Random(1)
     back = partial(rng.uniform, 1.6e-3, 1.65e-3)
-    talk = Exchanges(Counter(40e-6), bits=0.5e-3, takes=0.4e-3, back=back)
+    late = partial(rng.uniform, 0.0, 40e-6)
+    talk = Exchanges(Counter(40e-6), late, bits=0.5e-3, takes=0.4e-3, back=back)
     talk.held.identified(10, bits=2e-3)
     talk.arm()
     talk.run(10.0)
-    assert talk.counter.rate == pytest.approx(-40e-6, abs=0.5e-6)
-    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead - 0.1e-3, abs=1e-6)
+    assert talk.counter.rate == pytest.approx(-40e-6, abs=3e-6)
+    assert talk.held.lead(talk.now) == pytest.approx(talk.counter.lead - 0.1e-3, abs=20e-6)
 
 
 def test_clock_goes_round_unnoticed() -> None:

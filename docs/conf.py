@@ -1,9 +1,15 @@
 """How Sphinx builds these pages; `make docs` does it, with warnings as errors."""
 
+import os
 import re
+import subprocess
+import sys
 from importlib.metadata import version as version_of
+from pathlib import Path
 
+from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
 
 project = "era-haptics"
 project_copyright = "the era-haptics developers"
@@ -59,15 +65,39 @@ def _named(text: str) -> str:
 
 
 def _leave_out(app: Sphinx, doctree: object) -> None:
-    """Keep decisions and measured figures out of the side bar, and decisions out of the search."""
+    """Keep what has an index page out of the side bar, and decisions out of the search."""
     metadata = app.env.metadata[app.env.docname]
-    if app.env.docname.startswith(("decisions/", "measured/")):
+    if app.env.docname.startswith(("decisions/", "gallery/", "measured/")):
         metadata["orphan"] = True
     if app.env.docname.startswith("decisions/"):
         metadata["nosearch"] = True
 
 
+class Notebook(SphinxDirective):
+    """`{notebook} FILE`: an example in percent format, run while the page is read."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """The nodes of all cells; a notebook that fails is an error of the page."""
+        root = Path(__file__).parents[1]
+        runner, name = root / "docs" / "generators" / "notebooks.py", self.arguments[0]
+        for read in (runner, root / name):
+            self.env.note_dependency(str(read))
+        ran = subprocess.run(  # noqa: S603  # an example of the project
+            [sys.executable, runner, name],
+            cwd=root,
+            env=os.environ | {"PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+        )
+        if ran.returncode:
+            raise self.error(f"{name} ended with {ran.returncode}:\n{ran.stderr}")
+        return self.parse_text_to_nodes(ran.stdout, allow_section_headings=True)
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-signature", _shorten)
+    app.add_directive("notebook", Notebook)
     app.connect("doctree-read", _leave_out)

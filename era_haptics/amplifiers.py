@@ -18,6 +18,12 @@ def open_amplifier(
     name: optional if the rig has only one; url: instead of the rig's. Commands beyond the rig's
     limits are refused. Raises InputError for an unknown name; in the block CommandError for an
     invalid URL, LinkError without a reply, CommandRefused.
+
+    Example:
+        >>> url = "sim://examples/paper_plate.yaml"
+        >>> with era.open_amplifier(rig, url=url) as amplifier:
+        ...     print(amplifier.capabilities["channels"], "channels")
+        4 channels
     """
     expect_rig(rig)
     known = tuple(rig.amplifiers)
@@ -35,6 +41,11 @@ def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...
 
     One for each layer of an answer, and for each of its side bands, with its ramp, onset and
     ending; channels by the rig's wiring. Raises InputError for a drive that the rig cannot play.
+
+    Example:
+        >>> layers = era.commands_for(rig, only)["main"]
+        >>> [(tone.channel, round(tone.level, 3)) for tone in layers[0].tones]
+        [(0, 0.027), (1, 0.038), (2, 0.005), (3, 0.008)]
     """
     expect_rig(rig)
     voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]

@@ -22,6 +22,11 @@ def calibrate(
     the fits done and all. The result's `rig` has the fitted values and their uncertainty, its
     `parameters` their standard errors; use it only if `is_good`. Raises InputError for responses
     that are not what they claim, by their cause.
+
+    Example:
+        >>> fit = era.calibrate(rig, "examples/measured.csv")
+        >>> fit.is_good
+        True
     """
     expect_rig(rig)
     check_progress(progress)

@@ -26,6 +26,9 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
     """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
 
     The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
+
+    Example:
+        >>> era.draw_map(plate, {"SW": 110}).savefig("map.png")
     """
     expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     layers = layers_of(drive, plate.rig)
@@ -37,6 +40,9 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     """Draw the level of a layer of an answer over the plate [dB SL], and the fingers.
 
     Raises InputError for a layer that it does not have.
+
+    Example:
+        >>> era.draw_answer(table, only).savefig("answer.png")
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.query(table, target)")
@@ -53,6 +59,9 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
 
     Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
     picture of `era demo`. Raises InputError for an answer without layers.
+
+    Example:
+        >>> era.draw_contents(table, both).savefig("contents.png")
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
@@ -74,6 +83,9 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
     """Draw promised contrast of every place to quiet fingers, drive modes side by side.
 
     The picture of `era table map`.
+
+    Example:
+        >>> era.draw_contrast_map(table, found).savefig("contrast.png")
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")
@@ -85,6 +97,9 @@ def draw_playback(playback: Playback) -> Figure:
 
     The peak within a period of the lowest frequency, of signals within 30 ms: the mean over the
     fingertip of a target, the loudest point of a quiet finger, as in contrast.
+
+    Example:
+        >>> era.draw_playback(plate.play(only)).savefig("playback.png")
     """
     expect(playback, Playback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")

@@ -45,6 +45,11 @@ class SolvedPlate:
 
     seed: of a plate, ERAs, channels and fingers drawn within the rig's uncertainty, as `era table
     verify` draws them, on another mesh; None for the rig's own. Solved once, at the first use.
+
+    Example:
+        >>> plate = era.SolvedPlate(rig)
+        >>> plate.modes.natural_frequencies[:3].round(1).tolist()
+        [31.6, 67.9, 75.5]
     """
 
     def __init__(self, rig: Rig, *, seed: int | None = None) -> None:
@@ -90,6 +95,10 @@ class SolvedPlate:
         `rig.eras`: weights w in full strokes give a(t) = Im[h w exp(i omega t)], without fingers
         the field of `map`. Raises InputError for points and fingers off the plate, and frequencies
         for which it is not solved.
+
+        Example:
+            >>> plate.responses([(0.08, 0.06), (0.22, 0.16)], [110, 240]).shape
+            (2, 4, 2)
         """
         if seed is not None:
             drawn = SolvedPlate(self.rig, seed=seed)
@@ -115,6 +124,11 @@ class SolvedPlate:
         All layers of an answer play, without the fingers: these move nulls, as `responses` and
         `play` show. ERAs at one frequency add as complex amplitudes, magnitudes of several
         frequencies add (paper Eq. 28). Raises InputError for a drive that the rig cannot play.
+
+        Example:
+            >>> field = plate.map({"SW": 110, "NE": era.Drive(110, level=0.5, phase_deg=90)})
+            >>> f"largest {field.peak.max():.0f} m/s², {len(field.nulls)} nulls"
+            'largest 113 m/s², 16 nulls'
         """
         points = (
             None
@@ -152,6 +166,11 @@ class SolvedPlate:
         which say the duration and where records are sampled. The plate in time is solved exactly,
         without steps (`docs/concepts/plant.md`). Raises InputError for fingers off the plate, a
         duration in which the slowest vibration does not decay to 5 %, and what no ERA can play.
+
+        Example:
+            >>> felt = plate.play({"SW": 110}, target=(0.08, 0.06), quiet=(0.22, 0.16))
+            >>> f"{felt.contrast_db:.0f} dB"
+            '-4 dB'
         """
         if duration is not None:
             expect_number(duration, what="duration", unit="seconds")

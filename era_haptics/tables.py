@@ -44,6 +44,9 @@ def table(
     ascending, within the rig's limits, by default 40 to 500 in steps of 10 within these; grid:
     target cells; progress: called with the parts built and all. The table of `era table build`;
     `load_table` and `save_table` are for files. Raises InputError.
+
+    Example:
+        >>> table = era.table(rig, drive_mode="phased")
     """
     expect_rig(rig)
     expect(grid, Grid, what="grid", made_by="era.Grid(12, 9)")
@@ -70,6 +73,11 @@ def query(
     target: one position or several; level_db_sl: above the detection threshold, 20 dB is strong;
     duration [s]: of a short effect, whose level is over it. The rest as of `answer`, of which this
     is the short form. The same as `era table query --target`.
+
+    Example:
+        >>> only = era.query(table, one, quiet=other)
+        >>> f"{only.layers[0].frequency:.0f} Hz, {only.fingers[0].promised_contrast_db:.0f} dB"
+        '240 Hz, 15 dB'
     """
     stimulus = Stimulus(level_db_sl, duration=duration, name="target")
     fingers = [Finger(at, stimulus, sharing=MUST) for at in as_points(target, what="target")]
@@ -95,6 +103,12 @@ def answer(
     vibrations are shared or held back as the fingers allow, and levels are lowered to what the
     ERAs' stroke allows (`Answer.applied`). Raises InputError for fingers off the plate or at one
     place, and for a band without frequencies. The same as `era table query --own`.
+
+    Example:
+        >>> one, other = (0.08, 0.06), (0.22, 0.16)
+        >>> both = era.answer(table, [era.Finger(at, era.Stimulus()) for at in (one, other)])
+        >>> [(each.verdict, f"{each.promised_contrast_db:.0f} dB") for each in both.fingers]
+        [('own', '15 dB'), ('own', '15 dB')]
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(fingers, Sequence, what="fingers", made_by="[era.Finger((0.08, 0.06), era.Stimulus())]")
@@ -120,6 +134,10 @@ def measures(table: LocalizationTable, answer: Answer) -> Measures:
     """Compute the transient contrast of an answer's first layer, its residual, its concentration.
 
     Takes some ten milliseconds.
+
+    Example:
+        >>> f"{era.measures(table, only).transient_contrast_db:.0f} dB in the first 100 ms"
+        '23 dB in the first 100 ms'
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.query(table, target)")
@@ -140,6 +158,11 @@ def contrast_map(
     drive_modes: the table's own for none, several to compare them; level_db_sl: at each place;
     grid: places, the table's cells if None; progress: called with the questions asked and all.
     Raises InputError for fingers off the plate, and for an unknown drive mode.
+
+    Example:
+        >>> found = era.contrast_map(table, quiet=other, grid=era.Grid(6, 4))
+        >>> found.promised_db["phased"].shape
+        (4, 6)
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(drive_modes, Sequence, what="drive_modes", made_by="['switched', 'phased']")

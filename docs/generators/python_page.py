@@ -3,7 +3,8 @@
 Each block goes up to the next section, below the comment that has its names: `<!-- api: query;
 Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and one
 that is made elsewhere, with all of its members. Functions are a list, a class has a heading and a
-list of its members. Defaults are of what a program makes.
+list of its members. Defaults are of what a program makes. `Example:` at the end of a docstring is a
+session, which tests/docs/test_python_examples.py types.
 """
 
 import ast
@@ -17,7 +18,6 @@ from typing import Any, TypeAlias
 import era_haptics
 
 _BLOCK = re.compile(r"(<!-- api: (.+?) -->\n\n).*?(?=\n## |\Z)", re.DOTALL)
-_WIDTH = 140
 
 Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -102,7 +102,7 @@ def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> I
     for member in described:
         yield from _item(member)
     others = [f"`{_signature(each)}`" for each in listed if each not in described]
-    yield from _wrapped(f"- {', '.join(others)}: as in the API.", "  ") if others else []
+    yield from [f"- {', '.join(others)}: as in the API."] if others else []
 
 
 def _item(tree: Function) -> Iterator[str]:
@@ -121,18 +121,15 @@ def _signature(tree: Function) -> str:
     return f"{keyword}{tree.name}({arguments}){result}"
 
 
-def _text(tree: ast.ClassDef | Function, start: str, indent: str) -> list[str]:
-    """The docstring as one filled paragraph; items of a list are parts of a sentence."""
-    text = re.sub(r"(?<=[^.])\n\n(?=[A-Z])", ". ", ast.get_docstring(tree) or "")
-    text = re.sub(r"\n+- ", "; ", text).replace(".; ", ". ")
-    return _wrapped(start + text, indent)
+def _text(tree: ast.ClassDef | Function, start: str, indent: str) -> Iterator[str]:
+    """The docstring as one line, as on the other written pages, and the example below it.
 
-
-def _wrapped(text: str, indent: str) -> list[str]:
-    return textwrap.wrap(
-        " ".join(text.split()),
-        _WIDTH,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    Items of a list are parts of a sentence.
+    """
+    told, _, example = (ast.get_docstring(tree) or "").partition("\n\nExample:\n")
+    told = re.sub(r"(?<=[^.])\n\n(?=[A-Z])", ". ", told)
+    told = re.sub(r"\n+- ", "; ", told).replace(".; ", ". ")
+    yield start + " ".join(told.split())
+    if example:
+        session = textwrap.dedent(example).splitlines()
+        yield from (f"{indent}{line}" for line in ("```pycon", *session, "```"))

@@ -65,6 +65,10 @@ def design(
     given layouts that are judged by their tables' answers; starts: of a search; workers: processes,
     one for None; cluster: address of a Dask scheduler in their place; progress: called with the
     tasks done and all, of one stage after the other. Raises InputError.
+
+    Example:
+        >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
+        >>> better = designed.best.rig
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     check_progress(progress)

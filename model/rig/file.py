@@ -28,6 +28,11 @@ def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
 
     Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh given
     here may be coarser than a file's, to study its error.
+
+    Example:
+        >>> rig = era.load_rig("examples/paper_plate.yaml")
+        >>> [each.name for each in rig.eras]
+        ['SW', 'SE', 'NE', 'NW']
     """
     if mesh is not None and not isinstance(mesh, str):
         raise InputError(f"mesh must be text such as '48x36' or 'auto', got {shown(mesh)}")
@@ -98,7 +103,12 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
 
 
 def example_rig_path() -> Path:
-    """The path of the commented rig of the paper's plate."""
+    """The path of the commented rig of the paper's plate.
+
+    Example:
+        >>> era.example_rig_path().name
+        'paper_plate.yaml'
+    """
     here = Path(__file__).parents[1]  # a wheel has it in the model's data
     installed = here / "data" / "paper_plate.yaml"
     return installed if installed.exists() else here.parent / "examples" / "paper_plate.yaml"

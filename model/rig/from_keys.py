@@ -64,6 +64,13 @@ def rig(
     channels in order; uncertainty, fingertip: also an `Uncertainty` and a `Fingertip`, "none" for
     weightless fingers. What is left out, or None, has the file's default. Raises ConfigError with
     all problems, by argument and key.
+
+    Example:
+        >>> sheet = era.Plate(length=0.4, width=0.3, thickness="3 mm", material="aluminium")
+        >>> places = {"SW": (0, 0), "SE": (0.4, 0), "NE": (0.4, 0.3), "NW": (0, 0.3)}
+        >>> keys = {"stiffness": "15 kN/m", "stroke": "50 um"}
+        >>> eras = {name: era.Era(at=at, **keys) for name, at in places.items()}
+        >>> mine = era.rig(sheet, eras)
     """
     if amplifiers is None:
         expect(eras, Mapping, what="eras", made_by='{"SW": era.Era(at=(0, 0), stiffness=17e3)}')
@@ -91,6 +98,11 @@ def save_rig(rig: Rig, path: Path | str) -> None:
 
     Values of a fitted rig, as of `calibrate`, are rounded. Raises InputError for a rig that no file
     states, OSError if the file cannot be written.
+
+    Example:
+        >>> era.save_rig(mine, "mine.yaml")
+        >>> era.load_rig("mine.yaml").fingerprint == mine.fingerprint
+        True
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)

@@ -124,6 +124,9 @@ class Rig:
         masses keep their share of the sides. None leaves a key, or an ERA, out: it has its default,
         so a finger, which is weightless as fingertip="none". Raises ConfigError with all problems,
         InputError for `modes` identified on another plate.
+
+        Example:
+            >>> thick = rig.replaced(thickness=0.002, eras={"SW": {"stiffness": 2e4}})
         """
         made: Rig = resolve_name(_REPLACED)(self, changes)
         return made

@@ -83,7 +83,11 @@ _WholeHeader = create_model("_WholeHeader", __base__=_Header, **_PHYSICS)
 
 
 def save_table(table: LocalizationTable, path: Path | str) -> None:
-    """Write a table; the file is replaced as a whole or stays as it was. Raises OSError."""
+    """Write a table; the file is replaced as a whole or stays as it was. Raises OSError.
+
+    Example:
+        >>> era.save_table(table, "table.npz")
+    """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     place = expect_path(path, what="path")
     arrays = _arrays(table)
@@ -111,6 +115,10 @@ def load_table(path: Path | str, *, rig: Rig | None = None) -> LocalizationTable
 
     rig: that it must be of, but for what may differ (`model.rig.rig.MAY_DIFFER`). Raises InputError
     for a missing, damaged or foreign file, with the keys in which it is of another rig.
+
+    Example:
+        >>> era.save_table(table, "table.npz")
+        >>> again = era.load_table("table.npz", rig=rig)
     """
     path = expect_path(path, what="path")
     if rig is not None:

@@ -1,0 +1,39 @@
+"""The examples of docs/reference/python-api.md, typed one after the other in one session."""
+
+import doctest
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import era_haptics
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
+
+
+def test_every_function_has_an_example() -> None:
+    """Each entry of a function is followed by a session; methods may do without."""
+    entries = re.findall(r"^- `(\w+)\(.*\n((?:  .*\n)*)", PAGE, re.MULTILINE)
+    shown = {name: ">>> " in text for name, text in entries if hasattr(era_haptics, name)}
+    assert len(shown) > 15
+    assert [name for name, has_example in shown.items() if not has_example] == []
+
+
+def test_examples_print_what_the_page_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the order of the page, from a folder beside the examples."""
+    shutil.copytree(
+        ROOT / "examples",
+        tmp_path / "examples",
+        ignore=shutil.ignore_patterns("*.c", "node_modules"),
+    )
+    monkeypatch.chdir(tmp_path)
+    sessions = "\n".join(re.findall(r"^ *```pycon\n(.*?)^ *```$", PAGE, re.MULTILINE | re.DOTALL))
+    test = doctest.DocTestParser().get_doctest(sessions, {"era": era_haptics}, "page", None, 0)
+    printed: list[str] = []
+    doctest.DocTestRunner().run(test, out=printed.append)
+    assert len(test.examples) > 25
+    assert "".join(printed) == ""

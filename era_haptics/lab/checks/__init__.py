@@ -1,0 +1,1 @@
+"""Checks of content and layouts on the plate of a table."""

@@ -1,0 +1,1 @@
+"""Conformance: whether an amplifier does what protocol 4 demands."""

@@ -1,0 +1,1 @@
+"""Design: places of actuators for the best promised contrast."""

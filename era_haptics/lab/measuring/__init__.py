@@ -1,0 +1,1 @@
+"""Measuring plates, actuators and outputs through a sound card."""

@@ -1,0 +1,1 @@
+"""The witness: checks the traffic between hosts and amplifiers."""

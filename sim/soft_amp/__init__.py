@@ -1,0 +1,1 @@
+"""An amplifier made of software, played by a sound device."""

@@ -14,7 +14,7 @@ from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.playing.contents import Layer, Tone
 from drivers.wires.serial_line.host import SerialWire
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -39,7 +39,7 @@ class _Port:
 
     def carry_out(self, data: bytes) -> None:
         """Have the amplifier take bytes: nothing in here is the host's."""
-        self._end.receive(data, clock.now())
+        self._end.receive(data, threads.now())
 
     def poll(self) -> None:
         """All that has come was handed over."""

@@ -30,7 +30,7 @@ __all__ = sorted(_HOMES)
 
 def __getattr__(name: str) -> Any:
     """Load a name at its first use."""
-    from registry.posix import posix_needed
+    from registry.files import posix_needed
 
     if name not in _HOMES:
         raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")

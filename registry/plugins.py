@@ -2,17 +2,38 @@
 
 A plug-in is an entry point of a group. It is imported only when its name is looked up, so that a
 broken one affects nothing else. A name that several packages claim is refused.
+
+Suggestions for mistyped names.
 """
 
+import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from registry.suggestions import did_you_mean
+_NEAR = 0.65
+"""Least similarity of a suggestion; `unobtainium` is not similar to `aluminium`."""
+
+
+def did_you_mean(name: str, known: Iterable[str], *, ending: str = "") -> str:
+    """Return `did you mean SW? ` for a name similar to a known one, ignoring case, else "".
+
+    Also for a word of known names: glass of soda-lime-glass, level of level_db_sl. ending: appended
+    to suggestions.
+    """
+    from difflib import get_close_matches  # not loaded for --help
+
+    by_lower = {each.lower(): each for each in known}
+    close = get_close_matches(name.lower(), by_lower, n=1, cutoff=_NEAR)
+    close = close or [each for each in by_lower if name.lower() in re.split("[-_]", each)]
+    return (
+        f"did you mean {' or '.join(by_lower[each] + ending for each in close)}? " if close else ""
+    )
+
 
 _T = TypeVar("_T")
 _Made = TypeVar("_Made")

@@ -23,7 +23,7 @@ from drivers.wires.serial_line.host import SerialWire
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
@@ -143,7 +143,7 @@ class _SharedRig:
 
     def _make(self, rig: Rig, seed: int | None) -> Bench:
         imperfections = Imperfections() if seed is None else draw_imperfections(rig, seed=seed)
-        return Bench(rig, now=clock.now(), imperfections=imperfections)
+        return Bench(rig, now=threads.now(), imperfections=imperfections)
 
 
 _rigs: WeakValueDictionary[object, _SharedRig] = WeakValueDictionary()

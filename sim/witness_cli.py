@@ -14,7 +14,7 @@ import typer
 
 from model.counting import counted
 from model.errors import InputError
-from registry.regular_file import regular_file
+from registry.files import regular_file
 
 if TYPE_CHECKING:
     from drivers.judge.watching.witness import Witness

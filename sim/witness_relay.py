@@ -19,7 +19,7 @@ from drivers.ports.serial_port import open_port
 from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError
-from registry import clock
+from registry import threads
 from sim.transport.pseudo_terminal import make_terminal
 
 _KINDS: dict[str, WireKind] = {
@@ -100,7 +100,7 @@ class _Observer:
 
     def __init__(self, witness: Witness) -> None:
         self.witness = witness
-        self._due = clock.now()
+        self._due = threads.now()
 
     def record(self, wire: str, direction: Direction, at: float, data: bytes) -> None:
         """Pass on bytes that were read or written at a time [s]."""
@@ -110,12 +110,12 @@ class _Observer:
     async def watch(self) -> None:
         """Measure how late this program wakes up, until cancelled."""
         while True:
-            self._due = clock.now() + _WAKE_INTERVAL
+            self._due = threads.now() + _WAKE_INTERVAL
             await asyncio.sleep(_WAKE_INTERVAL)
             self._check()
 
     def _check(self) -> None:
-        now = clock.now()
+        now = threads.now()
         if (late := now - self._due) > _WAKE_INTERVAL:
             self.witness.delayed(now, late)
             self._due = now
@@ -128,18 +128,18 @@ async def _serial_relay(
     """Relay a serial port through a pseudo-terminal."""
 
     def to_amplifier(data: bytes) -> None:
-        before = clock.now()  # it arrives afterwards, however long this program is delayed
+        before = threads.now()  # it arrives afterwards, however long this program is delayed
         with contextlib.suppress(LinkError):
             port.write(data)
         observer.record(name, "amplifier", before, data)
 
     def to_host(data: bytes) -> None:
-        at = clock.now()
+        at = threads.now()
         terminal.write(data)
         observer.record(name, "host", at, data)
 
     def lost(cause: str) -> None:
-        observer.witness.closed(name, clock.now())
+        observer.witness.closed(name, threads.now())
 
     terminal = make_terminal(to_amplifier)
     with contextlib.closing(terminal):
@@ -159,7 +159,7 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
 
     async def relay(from_host: StreamReader, to_host: StreamWriter) -> None:
         def received(data: bytes) -> None:
-            at = clock.now()
+            at = threads.now()
             to_host.write(data)
             observer.record(name, "host", at, data)
 
@@ -171,12 +171,12 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
                 return
             with contextlib.closing(port), contextlib.suppress(OSError, LinkError):
                 while data := await from_host.read(_READ_MAX):
-                    before = clock.now()
+                    before = threads.now()
                     port.write(data)
                     observer.record(name, "amplifier", before, data)
 
     def opened(from_host: StreamReader, to_host: StreamWriter) -> None:
-        observer.witness.opened(name, clock.now())
+        observer.witness.opened(name, threads.now())
         task = asyncio.ensure_future(relay(from_host, to_host))
         running.add(task)
         task.add_done_callback(closed)
@@ -184,7 +184,7 @@ async def _tcp_relay(endpoint: WireEndpoint, name: str, observer: _Observer) -> 
     def closed(task: asyncio.Task[None]) -> None:
         running.discard(task)
         if not running:
-            observer.witness.closed(name, clock.now())
+            observer.witness.closed(name, threads.now())
 
     server = await asyncio.start_server(opened, "127.0.0.1", 0)
     try:

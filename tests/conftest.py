@@ -26,7 +26,7 @@ from model.rig.file import example_rig_path, load_rig  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.table.build import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
-from registry import garbage_collection  # noqa: E402
+from registry import threads  # noqa: E402
 from slowest_files import SLOWEST  # noqa: E402
 
 # Forty examples of each property, a hundred without it, however long a busy machine takes.
@@ -39,7 +39,7 @@ settings.load_profile("short")
 free_plate.FiniteElementModes = lru_cache(12)(free_plate.FiniteElementModes)
 """Free plates are solved once in a process: hundreds of tests are of the same ones."""
 
-garbage_collection.gc = SimpleNamespace(**vars(gc) | {"collect": partial(gc.collect, 1)})  # type: ignore[attr-defined]
+threads.gc = SimpleNamespace(**vars(gc) | {"collect": partial(gc.collect, 1)})  # type: ignore[attr-defined]
 """A daemon in a test starts without visiting all objects of the suite: a fifth of a second each."""
 
 

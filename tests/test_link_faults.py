@@ -21,8 +21,8 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.timing import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig
-from registry import clock
-from registry.garbage_collection import no_long_collections
+from registry import threads as clock
+from registry.threads import no_long_collections
 from rig_on_wire import WIRES, HostedRig, rig_on_wire
 from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow

@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 from benchmarks.clocks.firmware import firmware_skew
 from benchmarks.clocks.session import NAMES, Arrangement, Session, armed, run_virtual
-from registry import clock
+from registry import threads
 
 ARRANGEMENTS = {
     "native UART, each its own": Arrangement("serial", "native"),
@@ -43,13 +43,13 @@ async def skews(lines: Arrangement, seed: int, moments: Sequence[float]) -> list
     """Return those in a second from each moment after arming on."""
     found = []
     async with armed(lines, seed) as session:
-        begin = clock.now()
+        begin = threads.now()
         await asyncio.sleep(0.5)
         for moment in moments:
             session.touch((0.3, 0.4))
-            await asyncio.sleep(max(0.0, begin + moment - clock.now()))
+            await asyncio.sleep(max(0.0, begin + moment - threads.now()))
             differences, stated = list[float](), list[float]()
-            while clock.now() < begin + moment + _WINDOW:
+            while threads.now() < begin + moment + _WINDOW:
                 differences += session.differences()
                 stated += session.controller.group.clock_errors.values()
                 await asyncio.sleep(_STEP)
@@ -78,7 +78,7 @@ async def taps(lines: Arrangement, seed: int, names: tuple[str, ...]) -> list[tu
 
 def _starts(session: Session, since: float) -> list[float]:
     """When each amplifier began to play what it plays [s]; none before a time."""
-    session.far.bench.advance(clock.now())
+    session.far.bench.advance(threads.now())
     return [
         min(begun)
         for each in session.far.bench.amplifiers.values()

@@ -15,7 +15,7 @@ from benchmarks.clocks.session import NAMES, make_controller, make_rig
 from drivers.host.amplifier import Amplifier
 from drivers.protocol.clock import ahead, clock_at
 from drivers.protocol.records import Values
-from registry import clock
+from registry import threads
 from sim.firmware.processes import find_firmware, running
 
 _JUDGED = 10  # exchanges with the shortest times: one in so many
@@ -30,7 +30,7 @@ class _Readings:
         amplifier.note_reply = self._take  # type: ignore[method-assign]
 
     def _take(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
-        now = clock.now()
+        now = threads.now()
         if "clock" in reply:
             middle = clock_at((sent_at + now) / 2)
             self.taken.append((now - sent_at, ahead(reply["clock"], middle)))
@@ -61,8 +61,8 @@ async def firmware_skew(seconds: float) -> tuple[float, float]:
         loop = asyncio.create_task(controller.cycle.run())
         await controller.arm()
         for is_judged in (False, True):
-            until = clock.now() + seconds / 2
-            while clock.now() < until:
+            until = threads.now() + seconds / 2
+            while threads.now() < until:
                 await asyncio.sleep(0.2)
                 for each in far.values():
                     each.read()  # or its samples would fill the pipe

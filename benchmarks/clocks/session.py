@@ -18,7 +18,7 @@ from drivers.opening import Lines
 from drivers.protocol.table import CLOCK_TURN, FEATURES
 from model.answer.timing import Timing
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 
@@ -69,13 +69,13 @@ class Session:
     def touch(self, *places: tuple[float, float]) -> float:
         """Report these fingers alone; returns the time [s]."""
         touches = tuple(Touch(number, *place) for number, place in enumerate(places, start=1))
-        now = clock.now()
+        now = threads.now()
         self.controller.cycle.deliver(TouchFrame("panel", now, touches))
         return now
 
     def differences(self) -> list[float]:
         """Return by how much the clocks of each two amplifiers differ now [s]."""
-        now = clock.now()
+        now = threads.now()
         shown = [each.clock.seconds(now) for each in self.far.bench.amplifiers.values()]
         return [math.remainder(one - other, CLOCK_TURN) for one, other in combinations(shown, 2)]
 

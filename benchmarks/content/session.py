@@ -23,7 +23,7 @@ from controller.play.intent import CLICK
 from model.answer.timing import Timing
 from model.config.shapes import Circle
 from model.finger.fingertip import FINGERTIP_RADIUS
-from registry import clock
+from registry import threads
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.line_kinds import PROMPT
@@ -70,11 +70,11 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
         imperfections=drawn,
     ) as on:
         on.must_be_felt = False
-        log = Log(rig, drawn, clock.now())
+        log = Log(rig, drawn, threads.now())
         log.watch(on.far.bench)
         on.at[1] = quiet
         await on.hold(_BEFORE)
-        on.at[0], since = at, clock.now()
+        on.at[0], since = at, threads.now()
         await on.hold(pattern.duration + _AFTER)
         promises = dict[int, float]()
         for applied in on.applied:
@@ -83,10 +83,10 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
             for one in applied.contents.values():
                 contrast = one.content.predictions[0].promised_contrast_db
                 promises.setdefault(one.content.key[1], contrast)
-        on.far.bench.advance(clock.now())
+        on.far.bench.advance(threads.now())
         voice = 0 if 0 in promises else CLICK
-        played = log.replayed(partial(operator.eq, ~0 if voice == CLICK else 0), clock.now())
-        span = since, clock.now()
+        played = log.replayed(partial(operator.eq, ~0 if voice == CLICK else 0), threads.now())
+        span = since, threads.now()
         own = Heard(0, played, played).own_db_sl(span, strongest=True)
         leaked = Heard(1, played, played).foreign_db_sl(span, strongest=True)
         return promises[voice], float((own - leaked).min())

@@ -19,7 +19,7 @@ from controller.play.content import Prediction
 from controller.play.intent import CLICK, Pulse, Target
 from controller.play.observer import PlayReport
 from controller.sources.contacts import ContactKey
-from registry import clock
+from registry import threads
 
 DURATION, LEVEL_DB_SL, RINGING, PAUSE = 0.040, 20.0, 0.060, 0.6  # s, dB SL
 
@@ -56,7 +56,7 @@ async def clicks(on: Any, wanted: Any, fingers: Sequence[int]) -> list[tuple[int
     found = list[tuple[int, PlayReport]]()
     for id in fingers:
         count = len(on.applied)
-        wanted.click = click_at(ContactKey("panel", id), clock.now())
+        wanted.click = click_at(ContactKey("panel", id), threads.now())
         on.controller.cycle.request_update()
         await asyncio.sleep(0)
         await on.hold(PAUSE)

@@ -31,7 +31,7 @@ from model.ensemble.delays import ClockErrors
 from model.finger.fingertip import FINGERTIP_RADIUS
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.table import read_fingertips
-from registry import clock
+from registry import threads
 
 CASE = Case("two contents", None, "car_display", is_identified=True)
 BANDS = ((40.0, 110.0), (140.0, 190.0))
@@ -114,7 +114,7 @@ async def _held(lines: Arrangement, seed: int, moment: float) -> tuple[FloatArra
             known = session.controller.group.clock_errors
             errors.append([known[name] for name in NAMES])
             await asyncio.sleep(STEP)
-            clock.now()
+            threads.now()
     return np.array(delays), MARGIN * np.max(errors, axis=0)
 
 

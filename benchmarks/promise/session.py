@@ -35,7 +35,7 @@ from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.observer import PlayReport
 from model.answer.timing import Timing
 from model.finger.fingertip import FINGERTIP_RADIUS
-from registry import clock
+from registry import threads
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.line_kinds import PROMPT
@@ -182,7 +182,7 @@ class _Session:
             imperfections=self._drawn,
         ) as on:
             on.must_be_felt = False
-            log = Log(self._rig, self._drawn, clock.now())
+            log = Log(self._rig, self._drawn, threads.now())
             log.watch(on.far.bench)
             case = self._case
             contents = self._places[: case.contents]
@@ -199,9 +199,9 @@ class _Session:
                 await on.hold(SETTLING)
                 clicked = await clicks(on, self._wanted, case.clicks)
                 self._note_owners(log, on)
-                on.far.bench.advance(clock.now())
+                on.far.bench.advance(threads.now())
                 count = case.contents + case.quiet
-                found = measured(log, clicked, count, clock.now())
+                found = measured(log, clicked, count, threads.now())
                 return Outcome((0.0, 0.0), len(clicked) / len(case.clicks), clicked=found)
             before = first = await self._settled(on)
             events = []
@@ -220,15 +220,15 @@ class _Session:
 
     async def _settled(self, on: Any) -> _Steady:
         await on.hold(SETTLING)
-        return _Steady(on.applied[-1], clock.now())
+        return _Steady(on.applied[-1], threads.now())
 
     async def _event(self, on: Any, name: str, before: _Steady) -> _Event:
-        count, began, path = len(on.applied), clock.now(), [clock.now()]
+        count, began, path = len(on.applied), threads.now(), [threads.now()]
         if name == LEAVES:
             for load in LIFTING:
                 self._place(on, {str(self._last): float(load)})
                 await asyncio.sleep(STEP)
-            began = clock.now()
+            began = threads.now()
             del on.at[self._last]
         elif name == JOINS:
             on.at[self._last] = self._landing
@@ -242,7 +242,7 @@ class _Session:
                 else:
                     self._place(on, {})
                 await asyncio.sleep(STEP)
-                path.append(clock.now())
+                path.append(threads.now())
         after = await self._settled(on)
         first = on.applied[min(count, len(on.applied) - 1)]
         answers = [each for each in on.applied[count:] if path[0] < each.time < path[-1] - NEXT]
@@ -252,7 +252,7 @@ class _Session:
     def _place(self, on: Any, loads: Mapping[str, float]) -> None:
         """Place the fingers on the plate without a report of the panel."""
         fingers = {str(id): place for id, place in on.at.items()}
-        on.far.bench.place_fingers(fingers, now=clock.now(), loads=loads)
+        on.far.bench.place_fingers(fingers, now=threads.now(), loads=loads)
 
     def _other_band(self, before: _Steady) -> tuple[float, float]:
         """A band of the changed content without its frequency."""

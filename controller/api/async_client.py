@@ -33,7 +33,7 @@ from controller.api.methods import DEFAULT_LEASE, ArmResult, ClearParams, HelloP
 from controller.api.place import find_socket
 from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import Empty, Message, Topic, headline
-from registry.pauses import pauses
+from registry.threads import pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
 _MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s

@@ -34,7 +34,7 @@ from controller.api.turns import Turns
 from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
-from registry import clock
+from registry import threads
 
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
 _RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
@@ -108,7 +108,7 @@ class ApiServer:
         is_busy: Callable[[], bool] = lambda: False,
         stop_all: Callable[[], object] = lambda: None,
         requested: Callable[[str, str, float], dict[str, Any]] = lambda *_: {},
-        clock: Callable[[], float] = clock.now,
+        clock: Callable[[], float] = threads.now,
         processor_time: Callable[[], float] = time.thread_time,
     ) -> None:
         self._handlers = handlers

@@ -18,7 +18,7 @@ from drivers.by_hand.cli import EXIT_STATUS
 from drivers.errors import CommandRefused, LinkError
 from model.commands.options import JsonOption, print_report
 from model.errors import InputError
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 if TYPE_CHECKING:
     from controller.api.client import Client

@@ -22,8 +22,8 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_group
 
+from registry.files import posix_needed
 from registry.plugins import failed_plugin, failure_text
-from registry.posix import posix_needed
 from registry.wording import reworded
 
 COMMANDS = (

@@ -14,8 +14,7 @@ from controller.content.pattern import Pattern, misfit
 from controller.content.wav import Wav
 from model.config.document import read_bytes
 from model.errors import InputError
-from registry.plugins import PluginRegistry, WrongResultError
-from registry.suggestions import did_you_mean
+from registry.plugins import PluginRegistry, WrongResultError, did_you_mean
 
 BUILT_IN: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
 """The formats of the project itself."""

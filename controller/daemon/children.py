@@ -25,8 +25,8 @@ from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.process.child import child_command, ended
 from model.arrays import FloatArray
 from model.errors import InputError
-from registry import clock
-from registry.pauses import Backoff
+from registry import threads
+from registry.threads import Backoff
 
 _MAX_PAUSE = 30.0  # s
 _TERMINATE_TIMEOUT = 0.3  # s
@@ -58,7 +58,7 @@ async def keep_gateway(options: list[str]) -> None:
     """Keep a gateway running until cancelled; then it is terminated, or killed if it is late."""
     backoff = Backoff(first=1.0, maximum=_MAX_PAUSE)
     while True:
-        started_at = clock.now()
+        started_at = threads.now()
         try:
             process = await asyncio.create_subprocess_exec(
                 *child_command(*_GATEWAY, *options),
@@ -75,7 +75,7 @@ async def keep_gateway(options: list[str]) -> None:
                     process.terminate()
                 await ended(process, _TERMINATE_TIMEOUT)
                 raise
-        pause = backoff.pause(ran_for=clock.now() - started_at)
+        pause = backoff.pause(ran_for=threads.now() - started_at)
         _logger.info("gateway: restarting in %g s", pause)
         await asyncio.sleep(pause)
 

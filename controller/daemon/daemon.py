@@ -32,9 +32,8 @@ from drivers.opening import Lines
 from model.answer.timing import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
-from registry import clock
-from registry.garbage_collection import no_long_collections
-from registry.threads import DaemonThreads, in_thread
+from registry import threads
+from registry.threads import DaemonThreads, in_thread, no_long_collections
 
 _CLOSE_TIMEOUT = 0.2  # s; for the control loop to end after all reachable amplifiers are silent
 
@@ -79,7 +78,7 @@ class Daemon:
                 self._follow_state,
             ),
             link_changed=lambda *change: self._publisher.link_changed(*change),
-            alive=lambda: manager.alive(clock.now()),
+            alive=lambda: manager.alive(threads.now()),
         )
         self.started = self._supervisor.started
         """Set once it serves, and its amplifiers are open or searched for."""
@@ -153,7 +152,7 @@ class Daemon:
             is_busy=lambda: cycle.is_preparing,
             stop_all=self._supervisor.stop_anyhow,
             requested=self._dumps.requested,
-            clock=clock.now,
+            clock=threads.now,
         )
         self._gateway: asyncio.Task[None] | None = None
 

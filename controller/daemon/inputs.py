@@ -13,10 +13,9 @@ from controller.daemon.config import TouchInput
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from model.errors import InputError
-from registry import clock
-from registry.pauses import Backoff
+from registry import threads
 from registry.plugins import failure_text
-from registry.threads import in_thread
+from registry.threads import Backoff, in_thread
 
 _MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
 _CLOSE_TIMEOUT = 0.2  # s
@@ -88,7 +87,7 @@ class TouchInputs:
 
         backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
         while True:
-            started_at = clock.now()
+            started_at = threads.now()
             try:
                 # A plug-in may block.
                 source = await in_thread(touch_input.make, name="touch source")
@@ -107,7 +106,7 @@ class TouchInputs:
             finally:
                 self._lift(prefix)
             # A panel may be plugged in later, a port be released.
-            await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
+            await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
     def _look(self, *changed: tuple[TouchInput, TouchSource | str | None]) -> None:
         """Look at all inputs, of which some have changed."""

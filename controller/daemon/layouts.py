@@ -10,7 +10,7 @@ from controller.daemon.reload import ConfigChange, warn_of_bands
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
 from model.arrays import FloatArray
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _logger = logging.getLogger(__name__)
 

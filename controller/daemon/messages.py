@@ -48,7 +48,7 @@ from drivers.protocol.table import (
 from model.answer.answer import is_felt
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 
 _LEVEL = QUANTITIES["level"]
 
@@ -327,7 +327,7 @@ def _amplifier_status(
         is_degraded = is_known and amplifier.silence_cause is not None
         status_at = amplifier.status_at
         serial_number = amplifier.identity.get("serial_number")
-        recent = clock.now() - REPORT_LIFE
+        recent = threads.now() - REPORT_LIFE
         reports = [
             _report(kind, targets) for kind, at in amplifier.reported_at.items() if at > recent
         ]
@@ -344,13 +344,13 @@ def _amplifier_status(
         levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
         high_voltage=has_flag(status, "high_voltage") if status else None,
         **readings,
-        reply_age_s=None if status_at is None else max(0.0, clock.now() - status_at),
+        reply_age_s=None if status_at is None else max(0.0, threads.now() - status_at),
         clock_skew_us=1e6 * clock_error if status and clock_error < math.inf else None,
         degraded=is_degraded,
         lost=status is None and not closed_with_lost,
         closed_with_lost=status is None and closed_with_lost,
         reports=reports,
-        silence=AmplifierSilence(**what_may_play(name).rows(clock.now()))
+        silence=AmplifierSilence(**what_may_play(name).rows(threads.now()))
         if status is None or is_degraded
         else None,
         statistics=LinkCounters(

@@ -66,8 +66,8 @@ from model.compiled.kernels import why_slow
 from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.table.table import LocalizationTable
-from registry import clock
-from registry.suggestions import did_you_mean
+from registry import threads
+from registry.plugins import did_you_mean
 from registry.threads import in_thread
 
 _logger = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ class ApiService:
         self._learning = learning
         self._reload = reload
         self._next_number = itertools.count(1)
-        self._started = clock.now()
+        self._started = threads.now()
         self._clients = set[Connection]()  # that are connected and have said or done something
         self._strengths = layouts.player.strengths
         self._strengths.clients = lambda: [(_origin(each), each.name) for each in self._clients]
@@ -125,7 +125,7 @@ class ApiService:
 
     def holds_lease(self, client: Connection) -> bool:
         """Whether a client armed or renewed the current lease: it is never evicted."""
-        lease = self._supervisor.operation.lease_at(clock.now())
+        lease = self._supervisor.operation.lease_at(threads.now())
         return lease is not None and client.lease == lease.token
 
     @api_method(in_reserve=True)
@@ -146,7 +146,7 @@ class ApiService:
     @api_method(in_reserve=True)
     def status(self, client: Connection, params: Empty) -> StatusResult:
         """Show daemon, amplifiers and contacts."""
-        operation, view, now = self._supervisor.operation, self._publisher.view, clock.now()
+        operation, view, now = self._supervisor.operation, self._publisher.view, threads.now()
         lease = operation.lease_at(now)
         return StatusResult(
             time_s=now,
@@ -182,7 +182,7 @@ class ApiService:
     @api_method(needs_reply=True, is_repeated=False)
     async def arm(self, client: Connection, params: ArmParams) -> ArmResult:
         """Switch the high voltage on. Touches are felt until the lease expires."""
-        if self._supervisor.operation.is_lease_over(clock.now()):  # what plays is not inherited
+        if self._supervisor.operation.is_lease_over(threads.now()):  # what plays is not inherited
             await self._supervisor.handle(LEASE_OVER)
         lease = Lease(params.owner, params.lease_s)
         cause = f"armed by {params.owner!a}"
@@ -208,7 +208,7 @@ class ApiService:
     def renew(self, client: Connection, params: RenewParams) -> RenewResult:
         """Extend the lease."""
         lease = self._supervisor.renew(
-            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+            check_lease(self._supervisor.operation.lease, params.lease, threads.now())
         )
         client.lease = lease.token
         return RenewResult(lease_s=lease.duration)
@@ -220,7 +220,7 @@ class ApiService:
         Any client may. While a link is lost it stops all amplifiers.
         """
         if params.lease is not None:
-            check_lease(self._supervisor.operation.lease, params.lease, clock.now())
+            check_lease(self._supervisor.operation.lease, params.lease, threads.now())
         if self._supervisor.operation.state is DaemonState.COMM_LOST:  # then a stop is all there is
             await self.stop(client, params)
         cause = f"disarmed by {params.client or client.name!a}"
@@ -342,7 +342,7 @@ class ApiService:
         self._layouts.player.play(
             name,
             contact,
-            clock.now(),
+            threads.now(),
             level_db_sl=level,
             player=client.name,
             effect=effect,
@@ -501,14 +501,14 @@ def _armed_already(operation: Operation) -> RpcError:
     """Return the error of a client that arms what another has armed, or is arming."""
     what, lease = "another client is arming", operation.lease
     if operation.state is _ENABLED and lease is not None:
-        what = f"armed by {lease.owner!a} for {lease.expires_at - clock.now():.1f} s more"
+        what = f"armed by {lease.owner!a} for {lease.expires_at - threads.now():.1f} s more"
     return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
 
 
 async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> StopResult:
     """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
-    now = clock.now()
+    now = threads.now()
     amplifiers = {name: AmplifierSilence(**each.rows(now)) for name, each in outcomes.items()}
     if not (outcomes and all(outcome.is_confirmed for outcome in outcomes.values())):
         raise NotSilent(amplifiers)

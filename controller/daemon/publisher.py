@@ -37,7 +37,7 @@ from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Operation
 from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
-from registry import clock
+from registry import threads
 
 _MAX_MESSAGE = 1000  # characters
 
@@ -87,7 +87,7 @@ class EventPublisher:
                 "inputs": inputs,
                 "strength": self.strengths,
             },
-            clock=clock.now,
+            clock=threads.now,
         )
 
     def observe(self, loop: Observers) -> None:
@@ -172,7 +172,7 @@ class EventPublisher:
         at = learning.estimated_at
         return LearningSummary(
             **learning.status.model_dump(),
-            last_estimate_s=None if at is None else max(0.0, clock.now() - at),
+            last_estimate_s=None if at is None else max(0.0, threads.now() - at),
             latency_ms=self.learning_latencies.summary(),
         )
 
@@ -181,12 +181,12 @@ class EventPublisher:
         return None if learning is None else plate_event(learning.status)
 
     def _refused(self, reason: str) -> None:
-        self._noted({"time_s": clock.now(), "refused": reason})
+        self._noted({"time_s": threads.now(), "refused": reason})
         _logger.warning("refused: %s", reason)
 
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self.view.contacts = contacts
-        self._noted({"time_s": clock.now(), "contacts": contacts})
+        self._noted({"time_s": threads.now(), "contacts": contacts})
         self.hub.publish("contacts", self.view.contacts_event)
 
     def _reported(

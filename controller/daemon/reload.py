@@ -11,7 +11,7 @@ from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig
 from controller.effects.layout import SurfaceLayout
 from model.arrays import FloatArray
-from registry.garbage_collection import without_collections
+from registry.threads import without_collections
 
 _logger = logging.getLogger(__name__)
 

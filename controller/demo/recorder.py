@@ -22,7 +22,7 @@ from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import HELD_BACK
 from model.transients.measures import ONSET_WINDOW
-from registry import clock
+from registry import threads
 
 STEADY_WINDOW = 0.25
 """Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.
@@ -100,7 +100,7 @@ class TouchRecorder:
         self._plate = plate
         self._tasks = tasks
         self._on_row = on_row
-        self._start = clock.now()
+        self._start = threads.now()
         self._playing: _PlayedPattern | None = None
         self._changes: list[float] = []  # when fingers landed, moved or lifted
         self._sensors: dict[str, Position] = {}
@@ -115,7 +115,7 @@ class TouchRecorder:
     async def start(self) -> None:
         """Wait until the plate is armed, and set the start of the recording to then."""
         await self._is_armed.wait()
-        self._start = clock.now()
+        self._start = threads.now()
 
     def armed(self) -> None:
         """Note that the plate is armed, again after a fault."""
@@ -126,7 +126,7 @@ class TouchRecorder:
         """Note that the plate is armed no longer; rows of touches that this spoils say so."""
         self.fault = cause.partition("; ")[0]  # without its remedy
         since = -math.inf if self._playing is None else self._playing.applied.time
-        self._end_pattern(clock.now(), is_measured=False)  # silent since a time that is not known
+        self._end_pattern(threads.now(), is_measured=False)  # silent since a time that is not known
         for touch in self.touches.values():
             if touch.contact.since > since:
                 touch.reason = self.fault
@@ -134,13 +134,13 @@ class TouchRecorder:
     def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
         self._move_sensors(contacts)
         if change.down or change.up:
-            self._changes.append(clock.now())
+            self._changes.append(threads.now())
         for contact in change.down:
             others = {_id(other): _place(other) for other in contacts if other != contact}
             self.touches[contact.key] = _Touch(contact, others, reason=self.fault)
         for contact in change.up:
             touch = self.touches.pop(contact.key)
-            touch.contact, touch.until = contact, clock.now()
+            touch.contact, touch.until = contact, threads.now()
             self._complete(touch)
 
     def _pattern_applied(self, applied: PlayReport) -> None:
@@ -201,7 +201,7 @@ class TouchRecorder:
             is_at_rest = math.dist(before, position) < MIN_MOVEMENT
             sensors[_id(contact)] = before if is_at_rest else position
         if any(sensors.get(id, position) != position for id, position in self._sensors.items()):
-            self._changes.append(clock.now())
+            self._changes.append(threads.now())
         loads = {_id(contact): contact.load for contact in contacts}
         if sensors != self._sensors or loads != self._loads:
             self._sensors, self._loads = sensors, loads

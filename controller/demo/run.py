@@ -33,7 +33,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 
 MIN_ERAS_FOR_THREE = 8
 """Number of ERAs from which three people have contents of their own, else two."""
@@ -287,10 +287,10 @@ async def _keep_armed(daemon: Daemon, path: Path, recorder: TouchRecorder) -> No
 
 async def _armed(era: AsyncClient) -> str:
     """Clear a fault, but no stop, and arm; return the lease. Raises LinkError after `RECOVERY`."""
-    end = clock.now() + RECOVERY
+    end = threads.now() + RECOVERY
     while True:
         status = await era.status()
-        if status.state == DaemonState.QUICK_STOP_ACTIVE or clock.now() > end:
+        if status.state == DaemonState.QUICK_STOP_ACTIVE or threads.now() > end:
             raise LinkError(f"demonstration aborted: {status.cause}")
         with contextlib.suppress(RpcError):  # the state has changed meanwhile
             if status.state == DaemonState.FAULT:

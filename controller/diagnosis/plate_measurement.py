@@ -25,7 +25,7 @@ from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.progress import Progress, unseen
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
-from registry import clock
+from registry import threads
 
 LEVEL = 0.1
 """Usual level of every tone, 20 dB below full stroke."""
@@ -86,11 +86,11 @@ class PlateSelfMeasurement:
             )
             await self._player.group.arm()
             await self._hold_clocks()
-            started = clock.now()
+            started = threads.now()
             heard, half, last = await self._all(tones, sensors.used)
             await self._player.silence()
             await self._wait(self._player.ramp)
-            duration = clock.now() - started
+            duration = threads.now() - started
         finally:
             await self._player.close()
         return MeasuredPlate(
@@ -104,8 +104,8 @@ class PlateSelfMeasurement:
 
     async def _hold_clocks(self) -> None:
         """Wait until the clocks of the amplifiers agree, or as long as that takes at most."""
-        end = clock.now() + CLOCK_SETTLING
-        while clock.now() < end and max(self._player.group.clock_errors.values()) > _AGREED:
+        end = threads.now() + CLOCK_SETTLING
+        while threads.now() < end and max(self._player.group.clock_errors.values()) > _AGREED:
             await self._wait(HEARTBEAT)
 
     async def _all(
@@ -223,8 +223,8 @@ class PlateSelfMeasurement:
 
     async def _wait(self, seconds: float) -> None:
         """Wait [s], feeding the watchdogs."""
-        end = clock.now() + seconds
-        while (left := end - clock.now()) > 0:
+        end = threads.now() + seconds
+        while (left := end - threads.now()) > 0:
             await asyncio.sleep(min(HEARTBEAT, left))
             await self._player.group.beat()
 

@@ -25,7 +25,7 @@ from model.errors import InputError
 from model.finger.perception import STRONG_DB_SL
 from model.rig.key_types import Identifier
 from model.structure.plate import Plate
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
 

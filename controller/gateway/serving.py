@@ -17,7 +17,7 @@ from controller.gateway.app import Gateway
 from controller.gateway.connections import CLIENT_TIMEOUT, ConnectionAcceptor
 from controller.gateway.settings import Settings
 from model.errors import InputError
-from registry.garbage_collection import no_long_collections
+from registry.threads import no_long_collections
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from model.errors import InputError
-from registry.regular_file import regular_file
+from registry.files import regular_file
 
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{22,128}")  # valid in a URL and in a WebSocket subprotocol
 _HOST_NAME = re.compile(r"[a-z0-9._-]{1,253}")

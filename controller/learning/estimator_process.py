@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
 from controller.process.child import child_command, ended
 from model.identification.settled import SettledPattern
-from registry import clock
-from registry.pauses import Backoff
+from registry import threads
 from registry.plugins import failure_text
+from registry.threads import Backoff
 
 MAX_WAITING = 16
 """Patterns that wait for the estimator; newer ones are dropped."""
@@ -85,7 +85,7 @@ class EstimatorProcess:
         timeouts, failures = self._timeouts, 0
         backoff = Backoff(first=1.0, maximum=60.0)
         while True:
-            started_at, self._has_estimated = clock.now(), False
+            started_at, self._has_estimated = threads.now(), False
             try:
                 reason = await self._run_one()
             except OSError as error:
@@ -95,7 +95,7 @@ class EstimatorProcess:
             self._failed(reason, self._is_over)
             if self._is_over:
                 return
-            await asyncio.sleep(backoff.pause(ran_for=clock.now() - started_at))
+            await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
     async def _run_one(self) -> str:
         """Run one process to its end; why it ended."""
@@ -122,7 +122,7 @@ class EstimatorProcess:
     async def _serve(self, process: asyncio.subprocess.Process) -> str:
         """Hand over what waits, one after the other; why that ended."""
         request: Request = self._start
-        chores_at = clock.now() + _CHORES
+        chores_at = threads.now() + _CHORES
         while True:
             is_pattern = isinstance(request, SettledPattern)
             limit = self._timeouts.estimate if is_pattern else self._timeouts.start
@@ -145,10 +145,10 @@ class EstimatorProcess:
             self._has_estimated = self._has_estimated or is_pattern
             request = None
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(0.0, chores_at - clock.now())):
+                async with asyncio.timeout(max(0.0, chores_at - threads.now())):
                     request = await self._waiting.get()
             if request is None:
-                chores_at = clock.now() + _CHORES
+                chores_at = threads.now() + _CHORES
 
 
 async def _exchange(process: asyncio.subprocess.Process, request: bytes) -> bytes | None:

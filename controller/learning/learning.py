@@ -31,7 +31,7 @@ from model.answer.timing import Timing
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 from registry.plugins import failure_text
 
 CAUTIOUS_AFTER = 60.0
@@ -237,7 +237,7 @@ class Learning:
         self._count(readings=1, discarded=0 if is_taken else 1)
 
     def _take(self, estimate: Estimate) -> None:
-        self.estimated_at = clock.now()
+        self.estimated_at = threads.now()
         self._is_held = estimate.is_held
         if self._readings is not None:
             self._end_outage()
@@ -246,7 +246,7 @@ class Learning:
             self._count(alarms=1)
         if estimate.answers is not None:
             self._correct(estimate.answers, is_cautious=bool(estimate.change))
-            self._estimated(clock.now() - estimate.time)
+            self._estimated(threads.now() - estimate.time)
         if estimate.change:
             if estimate.explanation or self.status.state != "changed":
                 self._say("changed", estimate.change, _CHANGED_REMEDY)

@@ -23,7 +23,7 @@ from drivers.host.sensors import Reading, finish_reading, start_reading
 from model.identification.forward import RestingFinger
 from model.identification.settled import SettledPattern
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 
 WINDOW = 0.2  # s; of a reading, as in an identification
 READINGS = 4  # of one pattern, at most, where others are disturbed
@@ -75,7 +75,7 @@ class SettledReadings:
         """Follow the contacts; where they load the plate otherwise it settles anew."""
         self._contacts = contacts
         if not _are_same(contacts, self._settled_contacts):
-            self._wait_for(clock.now())
+            self._wait_for(threads.now())
 
     def ended(self) -> None:
         """Read no more of what played."""
@@ -109,7 +109,7 @@ class SettledReadings:
 
     async def _changes_by(self, moment: float) -> bool:
         """Wait for a change until a moment [s]; whether there was one."""
-        timeout = None if math.isinf(moment) else max(0.0, moment - clock.now())
+        timeout = None if math.isinf(moment) else max(0.0, moment - threads.now())
         try:
             async with asyncio.timeout(timeout):
                 await self._change.wait()
@@ -173,7 +173,7 @@ class SettledReadings:
             name: await start_reading(each, [frequency], window)
             for name, each in amplifiers.items()
         }
-        end = clock.now() + max(each.left for each in started.values())
+        end = threads.now() + max(each.left for each in started.values())
         if await self._changes_by(end + _MARGIN):
             return started, end
         found = {

@@ -17,7 +17,7 @@ from typing import Any
 from controller.operation.states import ENERGISED, DaemonState, Operation
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from registry import clock
+from registry import threads
 
 DUMP_PATTERN = "era-fault-*.jsonl"
 """File names of dumps of faults and losses; those of stops have `stop` for `fault`."""
@@ -72,7 +72,7 @@ class FaultDumps:
     ) -> None:
         """Record a message of an amplifier or line; a stop depends on no record."""
         try:
-            where = {"time_s": clock.now(), "link": names.get(address, line)}
+            where = {"time_s": threads.now(), "link": names.get(address, line)}
             self.records.append({**where, "way": way, "message": message, "content": content})
         except Exception:
             _logger.exception("recorder failed")
@@ -101,7 +101,7 @@ class FaultDumps:
 
         Unless one of that kind was written within the last second.
         """
-        now, folder, kind = clock.now(), self._folder, "fault"
+        now, folder, kind = threads.now(), self._folder, "fault"
         change = {"time_s": now, "state": f"{old.state} -> {new.state}", "cause": new.cause}
         self._transitions.append(change)
         if new.state is DaemonState.QUICK_STOP_ACTIVE and old.state in ENERGISED:

@@ -26,8 +26,8 @@ from drivers.host.group import GroupState
 from drivers.protocol.records import Values
 from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
 from model.errors import InputError
-from registry import clock
-from registry.pauses import pauses
+from registry import threads
+from registry.threads import pauses
 
 STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
 _RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
@@ -173,7 +173,7 @@ class Supervisor(Operator):
             if await self._reopen():
                 break
             await self._pause(pause)
-        while self.assume_energised(clock.now()) and not self._closing.is_set():
+        while self.assume_energised(threads.now()) and not self._closing.is_set():
             await self._pause(_RECHECK)
             await self.controller.group.statuses()  # what was loud may be silent by now
         if self.controller.group.is_open:  # none was lost again

@@ -35,7 +35,7 @@ from drivers.errors import (
     WrongAmplifier,
 )
 from drivers.host.feeding import Stopped
-from registry import clock
+from registry import threads
 from registry.plugins import failure_text
 
 _EPOCHS = 2**31  # of which a daemon begins at one by chance: exact as numbers of JSON
@@ -103,7 +103,7 @@ class Operator:
 
     def renew(self, lease: Lease) -> Lease:
         """Renew the lease of who armed, which must not have ended."""
-        renewed = lease.renewed(clock.now())
+        renewed = lease.renewed(threads.now())
         self.operation = replace(self.operation, lease=renewed)
         return renewed
 
@@ -124,7 +124,7 @@ class Operator:
 
     def tick(self) -> None:
         """End the lease if it has expired, else look again when it will have."""
-        operation, now = self.operation, clock.now()
+        operation, now = self.operation, threads.now()
         if operation.is_lease_over(now):
             self.post(LEASE_OVER)
         elif operation.lease is not None:
@@ -140,7 +140,7 @@ class Operator:
 
     def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
         """Apply one transition; return its actions."""
-        before, now = self.operation, clock.now()
+        before, now = self.operation, threads.now()
         try:
             self.operation, actions = step(before, event, now)
         except Exception as error:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from model.ensemble.delays import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 
 MARGIN = 1.25
 """By how much more is counted than is known."""
@@ -57,7 +57,7 @@ class CountedClocks:
             self.errors = errors
             self._note(before)
         for name in [*self._held_since]:  # mostly none
-            if clock.now() - self._held_since[name] >= SETTLED:
+            if threads.now() - self._held_since[name] >= SETTLED:
                 self._say_held(name)
         return table.with_clocks(self._counted)
 
@@ -88,7 +88,7 @@ class CountedClocks:
             was_alone = before.get(name, 0.0) > MAX_HELD
             if error <= MAX_HELD:
                 if was_alone:
-                    self._held_since[name] = clock.now()
+                    self._held_since[name] = threads.now()
             elif not was_alone:
                 self._held_since.pop(name, None)
                 if not self._losses[name]:

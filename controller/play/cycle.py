@@ -27,7 +27,7 @@ from drivers.protocol.timing import HEARTBEAT
 from model.answer.answer import Limits
 from model.counting import counted
 from model.structure.plate import Plate
-from registry import clock
+from registry import threads
 
 # s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
 IDLE_INTERVAL = 0.5
@@ -92,7 +92,7 @@ class Cycle:
 
     async def step(self) -> None:
         """Run the loop once: plan, send what changes, then the heartbeat if it is due."""
-        planner, now = self.planner, clock.now()
+        planner, now = self.planner, threads.now()
         self._expire(now)
         self._wake.clear()
         if planner is None:
@@ -109,13 +109,13 @@ class Cycle:
                 # Not after a set that was given up: the next cycle silences it first.
                 if self._is_heartbeat_due(planner):
                     # From its beginning: the watchdog has run since its request was sent.
-                    due = self._heartbeat_due = clock.now() + HEARTBEAT
+                    due = self._heartbeat_due = threads.now() + HEARTBEAT
                     try:
                         await self.group.beat()
                     finally:
                         if self._heartbeat_due == due:  # none replies again since
                             rest = HEARTBEAT / 2  # on a slow wire
-                            self._heartbeat_due = max(due, clock.now() + rest)
+                            self._heartbeat_due = max(due, threads.now() + rest)
         except (Preempted, LinkDegraded):
             pass  # what plays is unknown, and planned anew
         except LinkError as error:
@@ -134,7 +134,7 @@ class Cycle:
         try:
             outcome = await self._play(planner, plan)
             if isinstance(outcome, CommandRefused):
-                plan = planner.refused(plan, outcome, now=clock.now())
+                plan = planner.refused(plan, outcome, now=threads.now())
                 outcome = await self._play(planner, plan)
         finally:
             self._plan = None
@@ -161,7 +161,7 @@ class Cycle:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
             played = await self.group.apply(
                 sets.by_amplifier,
-                (lambda: self._wake.is_set() and clock.now() < sets.preempted_until)
+                (lambda: self._wake.is_set() and threads.now() < sets.preempted_until)
                 if sets.endings
                 else None,
             )
@@ -173,7 +173,7 @@ class Cycle:
                 return error
             planner.not_played(plan)
             raise
-        planner.confirm(sets, played, now=clock.now())
+        planner.confirm(sets, played, now=threads.now())
         return played.starts_at
 
     def count_too_late(self, clicks: int) -> None:
@@ -190,7 +190,7 @@ class Cycle:
 
     def feed_at_once(self) -> None:
         """Feed the watchdogs at once."""
-        self._heartbeat_due = clock.now()
+        self._heartbeat_due = threads.now()
         self._wake.set()
 
     def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
@@ -223,7 +223,7 @@ class Cycle:
         """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
         for source in self.tracker.sources_of(prefix):
             try:
-                self.deliver(TouchFrame(source, clock.now(), ()))
+                self.deliver(TouchFrame(source, threads.now(), ()))
             except Exception:
                 _logger.exception("loop: fingers of %s not lifted", source)
 
@@ -237,7 +237,7 @@ class Cycle:
         """Whether to feed the watchdogs now; pending silence has priority."""
         if not self.group.is_armed or planner.is_silence_pending:
             return False
-        return clock.now() >= min(self._heartbeat_due, self.group.members.lost_from)
+        return threads.now() >= min(self._heartbeat_due, self.group.members.lost_from)
 
     def _follow(self, change: Change) -> None:
         """Act on a change of contacts, also while amplifiers are being awaited."""
@@ -261,12 +261,12 @@ class Cycle:
             self._expiry.cancel()
             self._expiry = None
         if due < math.inf:
-            pause = max(0.0, due - clock.now())
+            pause = max(0.0, due - threads.now())
             self._expiry = asyncio.get_running_loop().call_later(pause, self._time_out)
 
     def _time_out(self) -> None:
         self._expiry = None
-        self._expire(clock.now())
+        self._expire(threads.now())
         self._schedule_expiry()
 
     def _expire(self, now: float) -> None:
@@ -276,7 +276,7 @@ class Cycle:
 
     def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
         """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
-        now = clock.now()
+        now = threads.now()
         if plan.selection.contents and plan.sets.silence is None:
             playing, timing = planner.layers.contents, planner.timing
             applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=timing)
@@ -289,7 +289,7 @@ class Cycle:
         """Wait for a change, a heartbeat, or the expiry of an intent."""
         if self._wake.is_set():
             return
-        now = clock.now()
+        now = threads.now()
         until = now + IDLE_INTERVAL
         if self.planner is not None:
             until = min(until, self.planner.due)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import IO
 
 from model.errors import InputError
-from registry import posix
+from registry import files
 
 _STAGED = "~"  # appended to the socket's name until it listens
 _MAX_PATH = 107 - len(_STAGED)  # bytes in sockaddr_un
@@ -43,7 +43,7 @@ class SocketLock:
         except OSError as error:
             raise InputError(f"{error.filename}: {error.strerror}; {_REMEDY}") from error
         try:
-            posix.lock(self._lock)
+            files.lock(self._lock)
         except BlockingIOError:
             self._lock.seek(0)
             owner = self._lock.read(20).strip()

@@ -32,8 +32,8 @@ from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.config.document import read_document
 from model.errors import InputError
 from model.rig.sections import RigSection
+from registry.files import regular_file
 from registry.plugins import plugins_of
-from registry.regular_file import regular_file
 
 MAX_FILE_SIZE = 1 << 20  # bytes; of a larger file only the end is included
 MAX_DUMPS = 5

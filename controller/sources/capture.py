@@ -17,7 +17,7 @@ from pathlib import Path
 from controller.sources.datagrams import MAX_DATAGRAM
 from drivers.errors import LinkError, system_message
 from model.errors import InputError
-from registry.regular_file import read_regular
+from registry.files import read_regular
 
 HEADER = "# era-haptics TUIO capture 1"
 _LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)

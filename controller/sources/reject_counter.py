@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 
-from registry import clock
+from registry import threads
 
 LOG_INTERVAL = 1.0  # s
 
@@ -17,7 +17,7 @@ class RejectCounter:
         self,
         logger: logging.Logger,
         *,
-        clock: Callable[[], float] = clock.now,
+        clock: Callable[[], float] = threads.now,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.examples: dict[str, str] = {}

@@ -18,7 +18,7 @@ from controller.sources.osc import Argument, OscError, osc_messages, read_messag
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame
 from controller.sources.udp_source import UdpSource
-from registry import clock
+from registry import threads
 
 ADDRESS = "/tuio/2Dcur"
 
@@ -315,7 +315,7 @@ class TuioSource(UdpSource):
     @property
     def problem(self) -> str | None:
         """Why no cursors come although the port is bound, and what to do."""
-        if not self._reader.is_mute(since=self.opened, now=clock.now()):
+        if not self._reader.is_mute(since=self.opened, now=threads.now()):
             return None
         others = ", ".join(sorted(self._reader.others))
         return (

@@ -11,7 +11,7 @@ from controller.sources.contacts import CONTACT_TIMEOUT, MAX_CONTACT_TIMEOUT
 from controller.sources.datagrams import MAX_DATAGRAM, Datagram, Peer, listen
 from controller.sources.touch import TouchFrame, TouchSource, number_option
 from model.errors import InputError
-from registry import clock
+from registry import threads
 
 DEFAULT_HOST = "127.0.0.1"
 _PORT = re.compile(r"[0-9]{1,5}")
@@ -89,7 +89,7 @@ class UdpSource(TouchSource):
                 f"({error.strerror}); stop the program that uses it, or choose another port or "
                 "address of this machine"
             ) from error
-        self.opened = clock.now()
+        self.opened = threads.now()
         try:
             await asyncio.get_running_loop().create_future()
         finally:

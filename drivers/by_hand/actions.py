@@ -36,7 +36,7 @@ from drivers.protocol.table import (
 )
 from drivers.protocol.timing import BOOT_TIME, STOP_RAMP, check_watchdog
 from drivers.urls import with_address
-from registry import clock
+from registry import threads
 
 _TAKING_ADDRESS = 0.1  # s; until an amplifier replies at its new address
 _STOP_TIMEOUT = 2.0  # s
@@ -150,16 +150,16 @@ async def stop(url: str) -> dict[str, Any]:
     except LinkError as error:
         cause = f"{error}; {_UNKNOWN}"
     stopped = Stopped(not cause, math.inf, cause)  # another host may feed it
-    return {"url": url, **stopped.rows(clock.now()), **rows}
+    return {"url": url, **stopped.rows(threads.now()), **rows}
 
 
 async def _stop(amplifier: Amplifier) -> str:
     """Stop an amplifier at once, then until that is confirmed; returns why it is not."""
-    cause, until = "", clock.now() + BOOT_TIME
+    cause, until = "", threads.now() + BOOT_TIME
     identifying: asyncio.Future[Any] | None = None
     while identifying is None or not identifying.done():  # for long where a board may restart
         with contextlib.suppress(DriverError):
-            if clock.now() < until:
+            if threads.now() < until:
                 values = {"ramp": amplifier.wire_ramp(STOP_RAMP)}
                 await amplifier.request("Stop", values, Priority.STOP)
         identifying = identifying or asyncio.ensure_future(amplifier.identify())
@@ -238,7 +238,7 @@ async def drive(
         ramp = min(_RAMP, QUANTITIES["ramp"].from_wire(amplifier.capabilities["ramp_max"]))
         layer = Layer(0, (Tone(channel, frequency, level),), ramp, duration)
         try:
-            amplifier.ledger.admit([layer], clock.now(), delay=0.0)
+            amplifier.ledger.admit([layer], threads.now(), delay=0.0)
         except CommandRefused as refused:
             raise CommandError(str(refused)) from refused  # bad input, not a refusal
         lowest = QUANTITIES["watchdog"].from_wire(amplifier.capabilities["watchdog_min"])

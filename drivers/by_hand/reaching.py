@@ -28,7 +28,7 @@ from drivers.protocol.table import (
     name_of,
 )
 from drivers.protocol.timing import shortest_watchdog
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 
 
@@ -126,8 +126,8 @@ async def identified(url: str, *, serial_number: str | None = None) -> AsyncIter
 
 async def keep_alive(amplifier: Amplifier, duration: float, interval: float) -> None:
     """Feed the watchdog for a time, at an interval [s]."""
-    end = clock.now() + duration
-    while (left := end - clock.now()) > 0:
+    end = threads.now() + duration
+    while (left := end - threads.now()) > 0:
         await asyncio.sleep(min(interval, left))
         await amplifier.ping()
 

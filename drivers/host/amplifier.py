@@ -27,7 +27,7 @@ from drivers.protocol.table import (
 )
 from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
 from drivers.wires.wire import reply_words
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 
 WATCHDOG = 0.25  # s; five heartbeats of 50 ms
@@ -66,7 +66,7 @@ class _Stop:
         """Return the values of the request, which goes out now."""
         if not self.is_sent:
             self.is_sent = True
-            self.ends = clock.now() + self.timeout
+            self.ends = threads.now() + self.timeout
             if self.limit is not None:
                 self.limit.reschedule(self.ends)
         return [{"ramp": self.ramp}]
@@ -157,7 +157,7 @@ class Amplifier(Dialogue):
         It is identified anew: it may have lost its supply, and come back with other limits. What
         silences it from this call on comes first, also before this is awaited.
         """
-        self.arming = self.silences, clock.now() + _ARM_WITHIN
+        self.arming = self.silences, threads.now() + _ARM_WITHIN
         return self._arm(session, watchdog)
 
     async def _arm(self, session: int, watchdog: float) -> Values:
@@ -224,9 +224,9 @@ class Amplifier(Dialogue):
         Raises CommandRefused if it is not silent soon after the ramp, or still armed.
         """
         status = await self.request("Disarm", {"ramp": self.wire_ramp(ramp)}, Priority.SILENCE)
-        end = clock.now() + ramp + CONFIRM_TIMEOUT
+        end = threads.now() + ramp + CONFIRM_TIMEOUT
         while status["state"] in _ENERGISED or not self.is_silent(status):
-            if clock.now() > end or status["state"] == ENABLED:
+            if threads.now() > end or status["state"] == ENABLED:
                 raise CommandRefused(f"amplifier {self.name} is not silent after a disarm")
             await asyncio.sleep(_INTERVAL)
             status = await self.read_status(Priority.SILENCE)
@@ -277,7 +277,7 @@ class Amplifier(Dialogue):
             # On a line that others share each has three exchanges: a stop and two statuses.
             timeout += ATTEMPTS * members * self.exchange_time("GetStatus")
             timeout += _RAMP.from_wire(wire_ramp)
-            ends = clock.now() + timeout * (members + 1)  # on a line that others keep busy
+            ends = threads.now() + timeout * (members + 1)  # on a line that others keep busy
             self._stop = stop = _Stop(wire_ramp, timeout, ends)
             stop.result = asyncio.ensure_future(self._confirm_stop(stop))
             with contextlib.suppress(Exception):  # then it is requested in `_confirm_stop`
@@ -303,7 +303,7 @@ class Amplifier(Dialogue):
                         status = await (requested or self._request_stop(stop))
                         while _is_stopping(status, stop.latch):
                             if self.is_silent(status):
-                                self.known = Stopped(True, clock.now())
+                                self.known = Stopped(True, threads.now())
                                 return self.known
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)
@@ -332,9 +332,9 @@ class Amplifier(Dialogue):
 
     async def _listen_for_another_host(self, status: Values) -> None:
         """Wait for a watchdog that rises unasked; raises LinkError."""
-        end = clock.now() + LISTENING
+        end = threads.now() + LISTENING
         left = status["watchdog_left"]
-        while clock.now() < end and status["state"] == ENABLED:
+        while threads.now() < end and status["state"] == ENABLED:
             await asyncio.sleep(LISTENING / 10)
             status = await self.read_status()
             self.check_other_host()

@@ -30,7 +30,7 @@ from drivers.playing.contents import Layer
 from drivers.protocol.records import Values
 from drivers.protocol.table import ENABLED, QUANTITIES
 from drivers.protocol.timing import STOP_RAMP, check_watchdog
-from registry import clock
+from registry import threads
 
 _T = TypeVar("_T")
 _SESSION, _TOKEN = QUANTITIES["session"], QUANTITIES["token"]
@@ -218,7 +218,7 @@ class Group:
         What was not sent is not sent any more; a request on the wire is waited for at most 8 ms.
         """
         if self._limit is not None and not self._limit.expired():
-            self._limit.reschedule(clock.now())
+            self._limit.reschedule(threads.now())
 
     async def _exchange(self, exchange: Callable[[], Awaitable[_T | DriverError]]) -> _T:
         """Run an exchange of the control loop; any unexplained failure stops all amplifiers.
@@ -333,7 +333,7 @@ class Group:
 
         A failure stops all amplifiers and is logged. The lines are left to their owner.
         """
-        is_armed, now = self.is_armed, clock.now()
+        is_armed, now = self.is_armed, threads.now()
         self._leave_armed()
         self.state = GroupState.CLOSED
         # Of one that does not reply by then a stop is all that is left.

@@ -27,7 +27,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from drivers.protocol.table import LATCHED, STATES, name_of
 from drivers.protocol.timing import STOP_RAMP
-from registry import clock
+from registry import threads
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
@@ -95,7 +95,7 @@ class JointSets:
         is_silent = all(map(is_silence, layers.values()))
         priority = Priority.SILENCE if is_silent else Priority.SET
         is_now = is_silent or len(layers) == 1
-        began = clock.now()
+        began = threads.now()
         staging = partial(
             Amplifier.stage, token=token, now=is_now, priority=priority, is_preempted=is_preempted
         )
@@ -178,7 +178,7 @@ class JointSets:
         for each in staged:
             each.starts = -math.inf if moment is None else moment
         if moment is None:
-            words = dict.fromkeys(staged, word_passed_by_all(clock.now(), [*staged]))
+            words = dict.fromkeys(staged, word_passed_by_all(threads.now(), [*staged]))
         else:
             words = words_of(moment, [*staged])
         requests: dict[Amplifier, Awaitable[Values]] = {}
@@ -213,7 +213,7 @@ class JointSets:
 
 async def _freed(lines: Sequence[Line], *, until: float) -> None:
     """Wait until a commit can be sent on all lines at once, or for a time [s]."""
-    while clock.now() < until and (
+    while threads.now() < until and (
         busy := [line.current.result for line in lines if line.current is not None]
     ):
         await asyncio.wait(busy)
@@ -245,7 +245,7 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
     """
     if amplifier.committed != token and status["state"] not in LATCHED:
         amplifier.starts = -math.inf
-        status = await amplifier.commit(token, word_passed_by_all(clock.now(), [amplifier]))
+        status = await amplifier.commit(token, word_passed_by_all(threads.now(), [amplifier]))
     if amplifier.committed != token or status["state"] in LATCHED:
         raise CommandRefused(
             f"amplifier {amplifier.name}: token must be {token} while armed, got "

@@ -15,7 +15,7 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.protocol.records import Values
-from registry import clock
+from registry import threads
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
@@ -113,7 +113,7 @@ class Members:
             try:
                 return await request()
             except LinkTimeout:
-                if is_lost(amplifier) or clock.now() > self.gives_up_at:
+                if is_lost(amplifier) or threads.now() > self.gives_up_at:
                     raise
                 await asyncio.sleep(_REPEAT_INTERVAL)
 
@@ -180,4 +180,4 @@ def is_lost(amplifier: Amplifier) -> bool:
     """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
     if amplifier.silence_cause is None or amplifier.line.loss is not None:
         return amplifier.line.loss is not None
-    return clock.now() >= amplifier.feeding.lost_from
+    return threads.now() >= amplifier.feeding.lost_from

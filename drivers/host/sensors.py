@@ -23,7 +23,7 @@ from drivers.protocol.table import (
     name_of,
     sensor_reading,
 )
-from registry import clock
+from registry import threads
 
 _MARGIN = 0.002  # s; of the amplifier's clock
 _MAX_OVERDUE = 2.0  # s; after the end of the window: an emulator stands still meanwhile
@@ -136,9 +136,9 @@ async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
     end in time or lacks sensors.
     """
     found = started
-    end = clock.now() + started.left + _MAX_OVERDUE
+    end = threads.now() + started.left + _MAX_OVERDUE
     while found.state == "RUNNING":
-        if clock.now() > end:
+        if threads.now() > end:
             raise FrameError(
                 f"reading {started.number} must be complete after its window, got {found.state} "
                 f"{_MAX_OVERDUE:g} s later; {_VIOLATION}"

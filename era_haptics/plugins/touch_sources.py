@@ -9,7 +9,7 @@ from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
 from controller.sources.udp_source import UdpSource
 from model.errors import InputError
-from registry.clock import now
+from registry.threads import now
 
 __all__ = [
     "Change",

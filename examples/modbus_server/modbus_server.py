@@ -32,7 +32,7 @@ from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.wires.modbus.frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 
 UNIT, BAUD = 1, 115_200
@@ -93,7 +93,7 @@ class Unit:
         """Return the result of a message and the words of its reply."""
         try:
             name, values = read_request(message.number, words)
-            done = self.amplifier.handle(name, values, clock.now())
+            done = self.amplifier.handle(name, values, threads.now())
         except Refusal as refusal:
             if is_earlier_part(message.number, words):
                 return 0, []
@@ -182,7 +182,7 @@ async def serve(kind: str, port: str, parity: str = "E") -> None:
     url = f"modbus+rtu://{port}?baud={BAUD}#{UNIT}"
     print(f"modbus+tcp://127.0.0.1:{port}/{UNIT}" if kind == "tcp" else url, flush=True)
     while True:
-        unit.amplifier.tick(clock.now())
+        unit.amplifier.tick(threads.now())
         await asyncio.sleep(STEP)
 
 

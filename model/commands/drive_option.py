@@ -8,7 +8,7 @@ from model.arguments import expect_between
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.vibration.excitation import Excitation, Tone
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"
 _FORM = re.compile(

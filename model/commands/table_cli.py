@@ -207,7 +207,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
     """
     from model.answer.as_json import query_batch
     from model.table.file import load_table
-    from registry.regular_file import regular_file
+    from registry.files import regular_file
 
     table = load_table(table_file)
     has_failed = False

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import yaml
 
 from model.errors import InputError
-from registry.regular_file import read_regular
+from registry.files import read_regular
 
 MAX_SIZE = 1 << 20  # bytes
 MAX_PROBLEMS = 50

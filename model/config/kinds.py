@@ -11,7 +11,7 @@ from typing import Any
 
 from model.config.document import Document
 from model.errors import InputError
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 DEFAULT_KIND = "rig"
 

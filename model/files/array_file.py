@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arguments import shown
-from registry.regular_file import open_regular
+from registry.files import open_regular
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 

@@ -20,7 +20,7 @@ from model.arguments import MAX_VALUE
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.uff import read_bytes, text_of
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _MAX_NAMED = 3  # unknown columns in an error
 _POINT = re.compile(r'[;\t"\n][-+]?\d+\.\d+(?:[eE][-+]?\d+)?[;\t"\n]')  # a number with one

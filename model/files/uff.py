@@ -19,7 +19,7 @@ from model.arguments import MAX_VALUE
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
-from registry.regular_file import read_regular
+from registry.files import read_regular
 
 TIME_RESPONSE, FREQUENCY_RESPONSE = 1, 4  # function types
 DISPLACEMENT, ACCELERATION, TIME, FREQUENCY = 8, 12, 17, 18  # data types

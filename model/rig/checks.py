@@ -23,7 +23,7 @@ from model.rig.sections import (
 )
 from model.spectral.mesh import SpectralMesh
 from model.structure.plate import Plate
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 
 class Way(NamedTuple):

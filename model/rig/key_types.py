@@ -13,7 +13,7 @@ from model.config.units import FREQUENCY, LENGTH
 from model.finger.perception import THRESHOLDS
 from model.structure.attachments import Gain
 from model.structure.plate import Plate
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 
 def _identifier(text: str) -> str:

@@ -22,7 +22,7 @@ from model.structure.attachments import Fingertip, PointLoad, feet_of
 from model.structure.feet_and_frames import FEET_DEVIATE
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _REPLACED = "model.rig.from_keys:replaced"
 """By name: it makes rigs, and so needs this file."""

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_last
-from registry import clock
+from registry import threads
 from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
 from sim.faults.fault_window import Faults, FaultWindow
@@ -40,7 +40,7 @@ class AmplifierDevice:
     @property
     def is_answering(self) -> bool:
         """Whether it replies at all: neither hung nor without supply."""
-        now = clock.now()
+        now = threads.now()
         return not (self.faults.now("hang", now) or self.faults.now("reboot", now))
 
     @property
@@ -91,7 +91,7 @@ class AmplifierDevice:
 
     def inject_fault(self, window: FaultWindow) -> None:
         """Add a fault that begins now, whatever its `at`."""
-        now = clock.now()
+        now = threads.now()
         window = window.model_copy(update={"at": now - self.faults.begin})
         self.faults.windows = (*self.faults.windows, window)
         self._schedule(window)
@@ -99,7 +99,7 @@ class AmplifierDevice:
     def recover(self) -> None:
         """End all active faults, and cancel the scheduled ones."""
         self.close()
-        over = clock.now() - self.faults.begin
+        over = threads.now() - self.faults.begin
         active = [window for window in self.faults.windows if window.at <= over < window.end]
         self.faults.windows = ()
         for window in active:
@@ -113,7 +113,7 @@ class AmplifierDevice:
 
     def _schedule(self, window: FaultWindow) -> None:
         """Schedule the start, middle and end of a fault window."""
-        begin = self.faults.begin + window.at - clock.now()
+        begin = self.faults.begin + window.at - threads.now()
         edges: dict[_Edge, float] = {
             "begin": begin,
             "half": begin + window.lasts / 2,
@@ -128,7 +128,7 @@ class AmplifierDevice:
 
     def _handle_edge(self, window: FaultWindow, edge: "_Edge") -> None:
         """Apply an edge (begin, half, end) of a fault window."""
-        now = clock.now()
+        now = threads.now()
         self._bench.advance(now)
         match window.fault, edge:
             case "unplug", "begin":

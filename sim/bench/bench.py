@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad, Source, check_loads, footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
-from registry import clock
+from registry import threads
 from sim.amplifier.clock import AmplifierClock, StraightClock
 from sim.amplifier.contract import Amplifier
 from sim.bench.sensing import REACH, Probe, Sensing
@@ -429,5 +429,5 @@ def _channel_count(rig: Rig, amplifier: str) -> int:
 async def keep_time(bench: Bench) -> None:
     """Advance the bench with time.monotonic(), one clock for all processes, until cancelled."""
     while True:
-        bench.advance(clock.now())
+        bench.advance(threads.now())
         await asyncio.sleep(_TICK)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import LinkError
-from registry import clock
+from registry import threads
 from sim.control.context import SimulationContext
 from sim.control.operations import carry_out
 
@@ -62,7 +62,7 @@ async def _serve_client(context: SimulationContext, connection: socket.socket) -
         while data := await loop.sock_recv(connection, LINE_MAX):
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                response = await carry_out(context, line, now=clock.now())
+                response = await carry_out(context, line, now=threads.now())
                 await loop.sock_sendall(connection, await asyncio.to_thread(_encode, response))
             if len(rest) > LINE_MAX:  # the next line cannot be found
                 error = {"error": f"line must be at most {LINE_MAX} bytes"}

@@ -8,7 +8,7 @@ from functools import cache
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 _AUDIO = b"32 bit float mono audio"
 IS_INPUT, IS_OUTPUT = 1, 2

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from model.rig.rig import Rig
-from registry import clock
-from registry.garbage_collection import no_long_collections
+from registry import threads
+from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control.context import SimulationContext
@@ -81,10 +81,10 @@ async def run_simulation(
     if simulation.until_eof:
         # In a thread, since not every kind of standard input can be polled.
         threading.Thread(target=_await_eof, args=(loop, ended), daemon=True).start()
-    bench = await asyncio.to_thread(_make_bench, simulation, now=clock.now())
+    bench = await asyncio.to_thread(_make_bench, simulation, now=threads.now())
     if ended.is_set():
         return None
-    bench.place_fingers(simulation.fingers, now=clock.now())
+    bench.place_fingers(simulation.fingers, now=threads.now())
     context = SimulationContext(bench, step=loop.step if isinstance(loop, SteppedLoop) else None)
     context.accelerometers.place(simulation.sensors)
     if simulation.record is not None:
@@ -142,7 +142,7 @@ async def _open_devices(
             context.bench,
             name,
             address=simulation.wires[name].address or number,
-            faults=simulation.faults.of(name, begin=clock.now()),
+            faults=simulation.faults.of(name, begin=threads.now()),
         )
         for number, name in enumerate(context.bench.amplifiers, start=1)
     ]

@@ -24,7 +24,7 @@ from model.files.uff import (
     Universal,
     write_universal,
 )
-from registry.regular_file import regular_file
+from registry.files import regular_file
 from sim.plant.fingers import fit_tones
 
 

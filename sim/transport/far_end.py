@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Self, TypeAlias, cast
 
 from drivers.errors import LinkError
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import Faults
@@ -77,7 +77,7 @@ class Served:
             self._timer.cancel()
 
     def _tick(self) -> None:
-        self._end.tick(clock.now())
+        self._end.tick(threads.now())
         self.schedule()
 
 

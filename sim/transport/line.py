@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 
-from registry import clock
+from registry import threads
 from sim.faults.fault_window import Faults, Toward
 from sim.transport.line_kinds import LineDelays
 
@@ -46,7 +46,7 @@ class Line:
 
         The same time for several lines makes what they carry arrive at one time.
         """
-        now = clock.now() if now is None else now
+        now = threads.now() if now is None else now
         arriving = self._faults.pass_on(
             frame, toward=self._toward, time=now, finds_damage=self._finds_damage
         )
@@ -76,7 +76,7 @@ class Line:
     def _deliver_later(self, delay: float, data: bytes) -> None:
         def arrive() -> None:
             self._in_flight.discard(timer)
-            self._deliver(data, clock.now())
+            self._deliver(data, threads.now())
 
         timer = asyncio.get_running_loop().call_later(delay, arrive)
         self._in_flight.add(timer)

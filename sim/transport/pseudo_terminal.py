@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from registry import posix
+from registry import files
 
 TERMINAL_SCHEMES = ("serial", "modbus+rtu", "can+slcan")
 
@@ -84,7 +84,7 @@ def _lock(link: Path) -> Iterator[None]:
         raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
     with file:
         try:
-            posix.lock(file)
+            files.lock(file)
         except BlockingIOError:
             raise InputError(
                 f"--link {link}: in use by another amplifier; choose another path"

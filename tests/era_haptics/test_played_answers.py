@@ -7,7 +7,7 @@ import pytest
 
 import era_haptics as era
 from model.table.build import build_table
-from registry import clock
+from registry import threads
 from rig_on_wire import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from virtual_loop import in_virtual_time
 
@@ -82,13 +82,13 @@ async def test_amplifiers_play_an_answer_as_the_plate_does(answer: era.Answer) -
         hosted.bench.place_fingers(
             {name: each.at for name, each in fingers.items()},
             loads={name: each.load for name, each in fingers.items()},
-            now=clock.now(),
+            now=threads.now(),
         )
         await hosted.group.arm()
         await hosted.group.apply(era.commands_for(RIG, answer))
-        await hosted.beat_until(clock.now() + 4)
-        hosted.bench.advance(clock.now())
-        records = hosted.bench.fingers.felt(clock.now() - 0.5, clock.now())
+        await hosted.beat_until(threads.now() + 4)
+        hosted.bench.advance(threads.now())
+        records = hosted.bench.fingers.felt(threads.now() - 0.5, threads.now())
     for number, record in enumerate(played.records):
         here, there = (
             np.sqrt((each.accelerations[-5000:] ** 2).mean(axis=0))

@@ -22,7 +22,7 @@ from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import FAULTS, STATES
 from model.arrays import FloatArray
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 
 RANGES = {"FREQ": (1e-6, 30e6), "VOLT": (0.002, 20.0), "VOLT:OFFS": (-10.0, 10.0)}
@@ -90,7 +90,7 @@ class Generator:
         elif header == "*CLS":
             self.errors.clear()
         elif header == "SOUR1:PHAS:SYNC":
-            self.outputs[0].origin = self.outputs[1].origin = clock.now()
+            self.outputs[0].origin = self.outputs[1].origin = threads.now()
         elif found := re.fullmatch(r"(?:SOUR|OUTP)([12]):?(.*)", header):
             return self._set(self.outputs[int(found[1]) - 1], found[2], argument)
         else:
@@ -111,7 +111,7 @@ class Generator:
         value = min(max(value, low), high)
         if what == "FREQ" and value != output.frequency:
             # The phase accumulator goes on: where it stands is not known.
-            output.origin = clock.now() - 0.123 / value
+            output.origin = threads.now() - 0.123 / value
         if what in NUMBERS:
             setattr(output, NUMBERS[what], value)
         return what in NUMBERS

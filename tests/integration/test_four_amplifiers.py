@@ -29,7 +29,7 @@ from model.fem.mesh import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.vibration.excitation import Tone
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from set_table import SetTable, make_rig
@@ -197,9 +197,9 @@ async def test_command_reaches_it(wire: str, action: Callable[[str], Awaitable[A
     async with far_side(WIRES[wire], RIG) as far:
         assert far.machine is not None
         far.machine.boots = 5.0
-        began = clock.now()
+        began = threads.now()
         found = await action(far.url)
-        assert clock.now() - began < 7.0
+        assert threads.now() - began < 7.0
         assert found.get("silence", "confirmed_silent") == "confirmed_silent"
 
 
@@ -209,8 +209,8 @@ async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float)
     """That of a board that restarts, or three attempts of 0.5 s; the error names the remedy."""
     async with far_side(WIRES[wire], RIG) as far:
         far.device.inject_fault(FaultWindow(fault="hang"))
-        began = clock.now()
+        began = threads.now()
         with pytest.raises(LinkTimeout) as told:
             await actions.identify(far.url)
-        assert clock.now() - began == pytest.approx(told_after, abs=0.6)
+        assert threads.now() - began == pytest.approx(told_after, abs=0.6)
         assert ("restarts" in str(told.value)) is (wire == "serial")

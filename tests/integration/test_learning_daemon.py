@@ -26,7 +26,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 from rig_on_wire import FarSide
 from virtual_loop import VirtualLoop
 
@@ -90,7 +90,7 @@ class LearningBench:
     def change(self, **stiffness: float) -> None:
         """Multiply the stiffness of mounts, by ERA."""
         plate = replace(self.far.bench.imperfections.plate, stiffness=stiffness)
-        self.far.bench.change_plate(plate, now=clock.now())
+        self.far.bench.change_plate(plate, now=threads.now())
 
     def places(self) -> list[Place]:
         """Two or three fingers at random."""
@@ -106,20 +106,20 @@ class LearningBench:
     async def touch(self, *places: Place, seconds: float = 1.2) -> float | None:
         """Fingers rest on the plate; contrast felt by the last one [dB], None if nothing plays."""
         named = {f"finger {number}": place for number, place in enumerate(places)}
-        self.far.bench.place_fingers(named, now=clock.now())
-        end = clock.now() + seconds
-        while clock.now() < end:
+        self.far.bench.place_fingers(named, now=threads.now())
+        end = threads.now() + seconds
+        while threads.now() < end:
             await self.era.touch(list(places))
             await asyncio.sleep(0.05)
         is_playing = any(self.far.summary().levels)
-        self.far.bench.advance(clock.now())
-        felt = self.far.bench.felt(clock.now() - _FELT, clock.now())
+        self.far.bench.advance(threads.now())
+        felt = self.far.bench.felt(threads.now() - _FELT, threads.now())
         *quiet, target = [
             FingerVibration(np.array(f.frequencies), f.amplitude, f.peak, f.weights)
             for f in (felt[name] for name in named)
         ]
         await self.era.touch([])
-        self.far.bench.place_fingers({}, now=clock.now())
+        self.far.bench.place_fingers({}, now=threads.now())
         await asyncio.sleep(0.3)
         return steady_contrast_db(target, quiet) if is_playing else None
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 
 
 @pytest.mark.parametrize(

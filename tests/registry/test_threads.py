@@ -9,9 +9,7 @@ from itertools import islice
 
 import pytest
 
-from registry.garbage_collection import no_long_collections, without_collections
-from registry.pauses import Backoff, pauses
-from registry.threads import in_thread
+from registry.threads import Backoff, in_thread, no_long_collections, pauses, without_collections
 
 
 async def test_result_at_the_moment_of_cancellation_is_undone() -> None:

@@ -15,7 +15,7 @@ from drivers.protocol.table import FAULTS
 from drivers.wires.serial_line.host import SerialWire
 from model.rig.file import example_rig_path
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import LIMITS, layer, make_bench
 from sim.bench.amplifier_device import AmplifierDevice
@@ -45,7 +45,7 @@ async def test_unplugged_line_is_lost_and_opens_again_once_plugged_in(coarse_rig
     with pytest.raises(LinkError, match="unplugged"):
         line_to(device)
     await asyncio.sleep(1.01)
-    bench.advance(clock.now())
+    bench.advance(threads.now())
     assert not any(bench.amplifiers["main"].summary(bench.time).levels)
     again = await opened_group(line_to(device))
     assert (await again.amplifiers["main"].read_status())["fault"] == FAULTS["WATCHDOG"]
@@ -110,7 +110,7 @@ async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> Non
     await group.arm()
     played = layer((0, 110.0, 0.5), ramp=0.0)
     applied = await group.apply({name: [played] for name in names})
-    await asyncio.sleep(applied.starts_at + 0.005 - clock.now())  # by clocks that are just armed
+    await asyncio.sleep(applied.starts_at + 0.005 - threads.now())  # by clocks that are just armed
     reader, writer = await asyncio.open_unix_connection(control)
     writer.write(b'{"op": "state"}\n{"op": "inject_fault", "fault": "arc", "amplifier": "side"}\n')
     state = json.loads(await reader.readline())["amplifiers"]

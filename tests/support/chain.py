@@ -23,7 +23,7 @@ from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
 from plate_judge import STEP, WATCHDOG, PlateJudge
 from plate_witness import OperatorCommand
-from registry import clock
+from registry import threads
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.contract import Amplifier
@@ -95,11 +95,11 @@ class Chain:
     async def _turn(self, step: Callable[[], Awaitable[None]]) -> None:
         """Turn the control loop once, unless it stalls."""
         if not self.turning.is_set():
-            self.witness.set_stalled(clock.now())
+            self.witness.set_stalled(threads.now())
             try:
                 await self.turning.wait()
             finally:
-                self.witness.set_stalled(clock.now(), False)
+                self.witness.set_stalled(threads.now(), False)
         await step()
 
     @property
@@ -177,7 +177,7 @@ class Chain:
         breaks: the only rules of the witness that are broken, spaces between, or "plate" if none
         is but the plate may play.
         """
-        found = self.witness.finish(clock.now())
+        found = self.witness.finish(threads.now())
         assert {one.invariant for one in found} == {*(breaks or "").split()} - {"plate"}, [
             *map(str, found[:1])
         ]
@@ -199,7 +199,7 @@ class Chain:
 
     def report(self, *, ago: float = 0.0) -> None:
         """Report where the fingers are, or were some time ago [s]."""
-        now, plate = clock.now(), self.far.bench.rig.plate
+        now, plate = threads.now(), self.far.bench.rig.plate
         if self.is_felt:
             self.far.bench.place_fingers({str(id): at for id, at in self.at.items()}, now=now)
         touches = tuple(
@@ -236,8 +236,8 @@ class Chain:
         """
         if down:
             self.at = {id: (x, y) for id, x, y in down}
-        begin = clock.now()
-        while (since := clock.now() - begin) < seconds - 1e-9:
+        begin = threads.now()
+        while (since := threads.now() - begin) < seconds - 1e-9:
             way(since)
             self.report()
             await asyncio.sleep(_REPORT)
@@ -353,8 +353,8 @@ class FarEnd:
 
     def status(self) -> Values:
         """What it would report now."""
-        self.device.tick(clock.now())
-        return self.amplifier.status(clock.now())
+        self.device.tick(threads.now())
+        return self.amplifier.status(threads.now())
 
     def sent(self) -> list[Sent]:
         """All sets that were committed, and silences, in order."""

@@ -22,7 +22,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
 from model.vibration.excitation import Tone
-from registry import clock
+from registry import threads
 from set_chain import FINGER, OTHER
 from sim.faults.fault_window import FaultKind
 from virtual_loop import run_virtual
@@ -111,9 +111,9 @@ class Taken:
 
     async def takes(self, least: float, most: float, step: Step) -> None:
         """Require that a step takes so many seconds."""
-        began = clock.now()
+        began = threads.now()
         await self.take(step)
-        assert least <= clock.now() - began <= most
+        assert least <= threads.now() - began <= most
 
 
 @dataclass
@@ -264,7 +264,7 @@ class Acted(Taken, Chain):
 
         def lie(name: str, values: Values) -> Values | None:
             if name in names:
-                return {**self.far_end.obey(name, values, clock.now()), **changed}
+                return {**self.far_end.obey(name, values, threads.now()), **changed}
             return None
 
         self.far_end.lie(lie)
@@ -275,11 +275,11 @@ class Acted(Taken, Chain):
 
     def freezes(self, seconds: float) -> None:
         """Let the amplifier ignore Clear, and report what it reports now, for so long."""
-        until = clock.now() + seconds
+        until = threads.now() + seconds
         status = self.far_end.status()
         self.far_end.lie(
             lambda name, values: (
-                status if clock.now() < until and name in ("Clear", "GetStatus") else None
+                status if threads.now() < until and name in ("Clear", "GetStatus") else None
             )
         )
 
@@ -290,7 +290,7 @@ class Acted(Taken, Chain):
         def report(name: str, _: Values) -> None:
             for listener in self.far_end.device.listeners:
                 if name == when:
-                    listener(values, clock.now())
+                    listener(values, threads.now())
 
         self.far_end.lie(report)
 

@@ -30,7 +30,7 @@ from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from plate_judge import PlateJudge
-from registry import clock
+from registry import threads
 from rig_files import write_rig
 from rig_on_wire import WIRES, FarSide, far_side
 from small_table import small_table
@@ -204,17 +204,17 @@ async def holding(
 
 async def until(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
     """Wait until a condition holds; fail after `patience` [s]."""
-    end = clock.now() + patience
+    end = threads.now() + patience
     while not holds():
-        assert clock.now() < end, "condition not met in time"
+        assert threads.now() < end, "condition not met in time"
         await asyncio.sleep(0.005)
 
 
 async def until_state(client: AsyncClient, *states: str) -> str:
     """Wait until the daemon is in one of these states; return it."""
-    end = clock.now() + PATIENCE
+    end = threads.now() + PATIENCE
     while (state := (await client.status()).state) not in states:
-        assert clock.now() < end, f"daemon stays in {state}: {(await client.status()).cause}"
+        assert threads.now() < end, f"daemon stays in {state}: {(await client.status()).cause}"
         await asyncio.sleep(0.01)
     return state
 

@@ -22,7 +22,7 @@ from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from registry import clock
+from registry import threads
 from sim.amplifier.readings import AmplifierSummary
 from sim.far_ends.opening import Wire
 from sim.plant.accelerometer import Accelerometer
@@ -161,7 +161,7 @@ def play_stream(
             ]
             await chain.close()
             summaries = [chain.far.summary(name) for name in chain.far.devices]
-            return Played(heard, summaries, chain.witness.finish(clock.now()))
+            return Played(heard, summaries, chain.witness.finish(threads.now()))
 
     return run_virtual(run(), rng=random.Random(1))
 
@@ -183,15 +183,15 @@ class Streamed(Chain):
         """Deliver a stream at its pace; return the times of its changes [s]."""
         times = []
         for (begin, fingers), (end, _) in pairwise([(0.0, {}), *stream.changes]):
-            times.append(clock.now())
+            times.append(threads.now())
             self._touch(stream, fingers)
             await self.hold(end - begin)
-        return [*times[1:], clock.now()]
+        return [*times[1:], threads.now()]
 
     def hear(self, situation: Situation, begin: float, end: float) -> Heard:
         """Read what was felt in a situation between two times [s]."""
         bench = self.far.bench
-        bench.advance(clock.now())
+        bench.advance(threads.now())
         heard = Heard(situation, begin, end)
         if situation.target is None:
             return replace(heard, fading=self._sensors.read(begin, end))
@@ -224,7 +224,7 @@ class Streamed(Chain):
         """Rest fingers on places; at the others they only feel."""
         self.at = {id: stream.places[name] for id, name in fingers.items()}
         observers = stream.places.keys() - {*fingers.values()}
-        self.far.bench.place_fingers(stream.places, now=clock.now(), observers=observers)
+        self.far.bench.place_fingers(stream.places, now=threads.now(), observers=observers)
 
 
 def _pattern(applied: PlayReport) -> Mapping[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers.errors import LinkError
 from drivers.ports.port import PORT_OPENER
-from registry import clock
+from registry import threads
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop
 
@@ -195,7 +195,7 @@ class MemoryPort:
     def write(self, data: bytes) -> None:
         if self._is_closed or self._is_hung_up:
             raise LinkError(f"serial line {self._terminal.port} was lost")
-        if clock.now() < self.hears_from:
+        if threads.now() < self.hears_from:
             return
         self._machine.deliver(self._terminal.port, "amplifier", data, self._terminal.inward)
 

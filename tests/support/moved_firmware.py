@@ -22,7 +22,7 @@ from drivers.wires.serial_line.frames import (
     unpack_words,
 )
 from model.arrays import FloatArray
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
@@ -90,7 +90,7 @@ class FirmwareEnd:
 
     def __init__(self, kind: str, folder: Path, send: Callable[[bytes], None]) -> None:
         self._firmware = MovedFirmware(folder)
-        self._began = clock.now()
+        self._began = threads.now()
         self._line, self._send = LINES[kind], send
         self._reader = TextReader(SLCAN)
         self._firmware.receive(CAN, b"O\r")

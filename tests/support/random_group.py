@@ -15,7 +15,7 @@ from drivers.host.jobs import Priority
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import STATES
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire
@@ -132,9 +132,9 @@ class RandomGroup(Chain):
             await asyncio.sleep(0.6)
             self.turning.set()
         elif chosen < 0.96:
-            self.far.bench.advance(clock.now())
+            self.far.bench.advance(threads.now())
             amplifier = self.rng.choice(self.far_ends).amplifier
-            amplifier.trip(self.rng.choice(("ARC", "CHANNEL")), clock.now(), channel=1)
+            amplifier.trip(self.rng.choice(("ARC", "CHANNEL")), threads.now(), channel=1)
         else:
             status = await host.read_status()
             if self.group.is_armed and status["state"] != STATES["OPERATION_ENABLED"]:

@@ -15,7 +15,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from memory_machine import MemoryMachine, live_in_memory
 from model.rig.rig import Channel, Rig
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import AmplifierSummary
@@ -56,7 +56,7 @@ class FarSide:
 
     def summary(self, name: str = "") -> AmplifierSummary:
         """State, token and levels of an amplifier now; of the first without a name."""
-        self.bench.advance(clock.now())
+        self.bench.advance(threads.now())
         found = self.bench.amplifiers[name or self.device.name]
         return found.summary(self.bench.time)
 
@@ -108,10 +108,10 @@ def make_bench(
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
 ) -> tuple[Bench, dict[str, AmplifierDevice]]:
     """A bench, and a device for each amplifier at addresses 1, 2, ..., without faults as yet."""
-    bench = Bench(rig, now=clock.now(), imperfections=imperfections)
+    bench = Bench(rig, now=threads.now(), imperfections=imperfections)
     return bench, {
         name: AmplifierDevice(
-            bench, name, address=number, faults=Faults(begin=clock.now(), seed=seed)
+            bench, name, address=number, faults=Faults(begin=threads.now(), seed=seed)
         )
         for number, name in enumerate(bench.amplifiers, start=1)
     }
@@ -183,7 +183,7 @@ class HostedRig(FarSide):
 
     async def beat_until(self, time: float) -> None:
         """Feed the watchdogs of those that reply until a time [s]."""
-        while (left := time - clock.now()) > 0:
+        while (left := time - threads.now()) > 0:
             await asyncio.sleep(min(left, 0.1))
             with contextlib.suppress(LinkDegraded):
                 await self.group.beat()

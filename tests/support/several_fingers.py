@@ -33,7 +33,7 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig
-from registry import clock
+from registry import threads
 from rig_on_wire import after_each
 from sim.far_ends.opening import Wire
 from virtual_loop import run_virtual
@@ -123,7 +123,7 @@ class Fingers(Chain):
     def play(self, effect: str, id: int = 1) -> None:
         """Play an effect at a finger, as a client does."""
         (contact,) = [each for each in self.applied[-1].contacts if each.key.id == id]
-        self.player.play(effect, contact, clock.now(), level_db_sl=None)
+        self.player.play(effect, contact, threads.now(), level_db_sl=None)
         self.controller.cycle.request_update()
 
     def refuse(self, why: str, is_refused: Callable[[Sequence[Layer]], bool]) -> list[float]:
@@ -134,7 +134,7 @@ class Fingers(Chain):
         def refuse(asked: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
             if not is_refused(asked["main"]):
                 return check(asked)
-            refused.append(clock.now())
+            refused.append(threads.now())
             return CommandRefused(why)
 
         layers.check = refuse
@@ -322,7 +322,7 @@ class _Starts(Chain):
         """Press once; records end where the finger moves."""
         self.starts.clear()
         self.applied.clear()
-        felt, touched = list[Felt](), clock.now()
+        felt, touched = list[Felt](), threads.now()
 
         def move(since: float) -> None:
             if self.at.get(id) not in (None, way(since)):
@@ -336,7 +336,7 @@ class _Starts(Chain):
 
     def _harvest(self, finger: str, touched: float) -> list[Felt]:
         """What the finger has felt at its last position."""
-        now, bench, felt = clock.now(), self.far.bench, list[Felt]()
+        now, bench, felt = threads.now(), self.far.bench, list[Felt]()
         bench.advance(now)
         for start in self.starts:
             applied = min(self.applied, key=lambda each: abs(each.time - start))

@@ -19,7 +19,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.judge.watching.config import TimeLimits
 from plate_witness import PlateTimes
-from registry import clock
+from registry import threads
 from rig_on_wire import after_each
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -366,7 +366,7 @@ class Soak(Chain):
         if len(self.loop._scheduled) > _TIMERS_MAX:
             self.plate_judge.violate(f"{len(self.loop._scheduled)} timers wait")
         self.plate_judge.check()
-        self.plate_judge.violations += map(str, self.witness.finish(clock.now()))
+        self.plate_judge.violations += map(str, self.witness.finish(threads.now()))
         self.counts["frames seen by the witness"] = self.witness.frames
 
 

@@ -11,7 +11,7 @@ from controller.operation.links import Supervisor
 from controller.operation.states import DaemonEvent, DaemonState, Lease, Trigger
 from courses import Acted, Planted, Step
 from drivers.errors import LinkError
-from registry import clock
+from registry import threads
 from set_chain import set_chain
 
 
@@ -42,7 +42,7 @@ class Watched(Acted):
     @property
     def is_alive(self) -> bool:
         """Whether it never was without a sign of life for more than 0.6 s."""
-        moments = [*self.alive, clock.now()]
+        moments = [*self.alive, threads.now()]
         return max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
 
     @property
@@ -102,7 +102,7 @@ class Watched(Acted):
 
     def energised_in(self, seconds: float, expected: bool) -> None:
         """Require that amplifiers are taken for energised, or not, in some seconds."""
-        now = clock.now()
+        now = threads.now()
         assert self.supervisor.assume_energised(now + seconds) is expected
 
 
@@ -129,13 +129,13 @@ async def watched(
     supervisor = Supervisor(
         state_changed=[lambda old, new: heard("states", new.state)],
         link_changed=lambda event, lost, message: heard("links", event),
-        alive=lambda: heard("alive", clock.now()),
+        alive=lambda: heard("alive", threads.now()),
     )
     options = {"connected": supervisor.connected, "observe": supervisor.observe, **options}
     async with set_chain(*amplifiers, of=Watched, **options) as daemon:
         daemon.supervisor, supervisor.controller = supervisor, daemon.controller
         loop = daemon.controller.cycle.observers
-        loop.cycle_completed.append(lambda: heard("cycles", clock.now()))
+        loop.cycle_completed.append(lambda: heard("cycles", threads.now()))
         loop.refused.append(lambda reason: heard("refused", reason))
         if refuses:
             daemon.refuse("GetCaps")

@@ -29,7 +29,7 @@ from examples.make_touches import tuio_datagram
 from model.rig.file import load_rig
 from model.table.build import build_table
 from own_calls import ROOT, Recorder, Way
-from registry import clock
+from registry import threads
 from stop_path import stop_path
 from virtual_loop import VirtualLoop, run_virtual
 
@@ -62,7 +62,7 @@ async def _touched(folder: Path) -> Way:
 
             def datagram(*fingers: Touch) -> tuple[bytes, tuple[str, int], float]:
                 nonlocal frames
-                frames, now = frames + 1, clock.now()
+                frames, now = frames + 1, threads.now()
                 frame = TouchFrame("panel@here", now, fingers)
                 return tuio_datagram(frame, frames), ("127.0.0.1", 4000), now
 

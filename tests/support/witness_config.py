@@ -14,7 +14,7 @@ from drivers.judge.watching.config import (
     WitnessConfig,
 )
 from plate_witness import OperatorCommand, PlateTimes, PlateWitness
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 from sim.faults.fault_window import FaultWindow
 from sim.witness_relay import parse_endpoint
@@ -78,7 +78,7 @@ class LoopWitness(PlateWitness):
     def seen(self, link: str, toward: str, data: bytes) -> None:
         """Hear bytes, unless no host has the link open."""
         if self._is_open:
-            self.record_bytes(link, toward, clock.now(), data)  # type: ignore[arg-type]
+            self.record_bytes(link, toward, threads.now(), data)  # type: ignore[arg-type]
 
     def follow(self, controller: Controller) -> None:
         """Hear of each command, opening and closing of a control loop."""
@@ -89,19 +89,19 @@ class LoopWitness(PlateWitness):
 
     def commanded(self, command: OperatorCommand) -> None:
         """An operator's command is about to be carried out."""
-        self.operator_command(clock.now(), command)
+        self.operator_command(threads.now(), command)
 
     def opens(self) -> None:
         """A host is about to open all wires."""
         self._is_open = True
         for link in self.wires:
-            self.opened(link, clock.now())
+            self.opened(link, threads.now())
 
     def closes(self) -> None:
         """The host has closed all, or died."""
         self._is_open = False
         for link in self.wires:
-            self.closed(link, clock.now())
+            self.closed(link, threads.now())
 
     async def _released(self, release: Callable[[], Awaitable[None]]) -> None:
         try:
@@ -120,7 +120,7 @@ class LoopWitness(PlateWitness):
         """One more fault is active on all wires, or by -1 one less."""
         self._active_faults += change
         for link in self.wires:
-            self.faults(clock.now(), link, are_on=self._active_faults > 0)
+            self.faults(threads.now(), link, are_on=self._active_faults > 0)
 
 
 def tell_first(owner: Any, method: str, tell: Callable[..., object]) -> None:

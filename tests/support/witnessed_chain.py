@@ -20,7 +20,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.judge.watching.capture import Violation
 from model.vibration.excitation import Excitation, Tone
 from plate_witness import OperatorCommand
-from registry import clock
+from registry import threads
 from registry.limits import GuardLimits
 from set_table import STROKE, SetTable, make_rig
 from sim.far_ends.opening import Wire
@@ -73,7 +73,7 @@ class Scene(Chain):
 
     def touch_beside(self) -> None:
         """Deliver a touch beside the plate."""
-        self.deliver(TouchFrame("panel", clock.now(), (Touch(9, 1.3, 0.5),)))
+        self.deliver(TouchFrame("panel", threads.now(), (Touch(9, 1.3, 0.5),)))
 
     async def touch(self, *fingers: int, answerable: bool = True, rest: float = 0.0) -> None:
         """Replace the fingers on the plate, which the source repeats, then sleep for `rest` [s]."""
@@ -103,8 +103,8 @@ class Scene(Chain):
 
     def trip(self) -> None:
         """Trip the first amplifier by an arc."""
-        self.far.bench.advance(clock.now())
-        self.far.amplifier.trip("ARC", clock.now())
+        self.far.bench.advance(threads.now())
+        self.far.amplifier.trip("ARC", threads.now())
 
     async def fall_silent(self) -> None:
         """Stop the source with fingers down: after its lease of 150 ms they count as lifted."""
@@ -147,7 +147,7 @@ class Scene(Chain):
         """Lift what is down, disarm and close all."""
         if self._holding is not None:
             self._holding.cancel()
-        self.witness.contacts(clock.now(), ())
+        self.witness.contacts(threads.now(), ())
         await self.tried(super().close())
 
     async def tried(self, work: Awaitable[Any]) -> None:
@@ -175,14 +175,14 @@ def play(
         judged = {"channels": 3, "level": 0.5, "slew": 100}
         options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
         async with Scene.on(Wire(wire), rig, table, **options) as scene:
-            scene.witness.contacts(clock.now(), ())
+            scene.witness.contacts(threads.now(), ())
             await scene.tried(scene.open())
             if not scene.errors:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(_LONGEST):
                         await scene.tried(steps(scene))
             await scene.close()
-            return scene, scene.witness.finish(clock.now())
+            return scene, scene.witness.finish(threads.now())
 
     return run_virtual(run(), rng=random.Random(1))
 

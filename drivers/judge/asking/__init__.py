@@ -29,7 +29,7 @@ from drivers.judge.asking.client import Client, Late, Violation
 from drivers.judge.asking.subject import LEVEL
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.known import address_of
-from registry import clock
+from registry import threads
 
 __all__ = [
     "CHECKS",
@@ -110,8 +110,8 @@ async def opened(url: str) -> AsyncIterator[Client]:
     port = await address.open_port(client.received, client.lost)
     client.transmit = port.write
     try:
-        boots_until = clock.now() + address.boot_time
-        while clock.now() < boots_until:  # what a board says while it starts is no reply
+        boots_until = threads.now() + address.boot_time
+        while threads.now() < boots_until:  # what a board says while it starts is no reply
             with suppress(Violation, Late):
                 await client.hello()
                 break

@@ -35,7 +35,7 @@ from drivers.wires.can_bus.frames import (
     segments,
     unpack_frames,
 )
-from registry import clock
+from registry import threads
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]
 _OF_NODES = {*map(cob_id, ("emergency", "heartbeat", "sdo_answer")), REPLY}
@@ -61,7 +61,7 @@ class CanClient(Client):
 
     def hear(self, data: bytes) -> bytes:
         """Take messages from packed frames, and note other nodes."""
-        now, own = clock.now(), b""
+        now, own = threads.now(), b""
         for frame in unpack_frames(data):
             node = frame.id & NODE_MAX
             if node != self.address:
@@ -108,7 +108,7 @@ class CanClient(Client):
 
     async def exchange(self, number: int, words: Sequence[int]) -> Answer:
         """Send a message and await its reply."""
-        sequence, sent = self.next_number(), clock.now()
+        sequence, sent = self.next_number(), threads.now()
         self.put(REQUEST + self.address, *segments(sequence, number, words))
         heard = await self.replied(lambda each: each.number == sequence, message_name(number))
         if heard.type == NAK:
@@ -175,14 +175,14 @@ async def numbers(subject: Subject) -> None:
 
     async def expect_replies(count: int, what: str, *data: bytes, since: float = math.inf) -> None:
         heard = await client.send(client.packed(data))
-        require_in_time(clock.now() - since <= _LIFE, "frames were too far apart")
+        require_in_time(threads.now() - since <= _LIFE, "frames were too far apart")
         expect_equal(len(heard), count, f"replies to {what}")
 
     async def follow(number: int, *others: tuple[int, int]) -> None:
         """Require a reply to a number, then to those that follow it."""
         accepted = math.inf
         for each, count in ((number, 1), *others):
-            sent = clock.now()
+            sent = threads.now()
             ping = segments(each, _PING, [subject.session, 0])
             what = f"number {each} after {number}"
             await expect_replies(count, what, *ping, since=min(accepted, sent))
@@ -191,7 +191,7 @@ async def numbers(subject: Subject) -> None:
     for number, order in ((200, -1), (220, 1)):
         part, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
         await asyncio.sleep(_FORGOTTEN)
-        sent = clock.now()
+        sent = threads.now()
         frames = segments(number, _SET, words)[::order]
         await expect_replies(1, "frames in another order", *frames)
         subject.played(part, sent)

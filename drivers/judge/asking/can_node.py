@@ -28,7 +28,7 @@ from drivers.protocol.table import (
     name_of,
 )
 from drivers.wires.can_bus.canopen import CANOPEN, cob_id
-from registry import clock
+from registry import threads
 
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127
 _EMERGENCY = struct.Struct("<HBBB3x")
@@ -98,7 +98,7 @@ async def network_management(subject: Subject) -> None:
 
     async def stopped_by(command: str, to: int | None, started_as: int | None) -> None:
         await write_object(client, _HEARTBEAT, _OTHER.to_bytes(2, "little"))
-        sent = clock.now()
+        sent = threads.now()
         await client.command(command, to=to)
         subject.shown.carry_out("Stop", {"ramp": 0}, {}, subject.since(sent))
         data = client.request(MESSAGES["GetStatus"].number, [])
@@ -158,9 +158,9 @@ async def heartbeats(subject: Subject) -> None:
         await write_object(client, _HEARTBEAT, struct.pack("<H", interval))
         await asyncio.sleep(0.06)
         client.frames.clear()
-        began = clock.now()
+        began = threads.now()
         await asyncio.sleep(0.3)
-        took, beats = clock.now() - began, b"".join(client.data_of("heartbeat"))
+        took, beats = threads.now() - began, b"".join(client.data_of("heartbeat"))
         count = 1000 * took / interval if interval else 0
         slack, what = 0.15 * count + (interval > 0), f"heartbeats of {interval} ms in {took:.3g} s"
         expect_within(len(beats), count - slack, count + slack, what)
@@ -195,8 +195,8 @@ async def _fails_unheard(subject: Subject) -> None:
     client = can_client(subject)
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     client.frames.clear()
-    due = clock.now() + subject.shown.watchdog + _BEYOND
-    while clock.now() < due:
+    due = threads.now() + subject.shown.watchdog + _BEYOND
+    while threads.now() < due:
         await asyncio.sleep(_POLL)
         if client.data_of("emergency"):
             break

@@ -27,7 +27,7 @@ from drivers.protocol.achieved import FLAGS
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, unpack_layers
 from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
-from registry import clock
+from registry import threads
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
@@ -218,10 +218,10 @@ async def run_checks(
     that is lost, CommandError for a level below a step.
     """
     results: list[CheckResult] = []
-    began = clock.now()
+    began = threads.now()
     why_none = next((each.reason for each in before if each.result is Result.NOT_RUN), "")
     for number, check in checks:
-        if (took := clock.now() - began) > _MAX_TIME:
+        if (took := threads.now() - began) > _MAX_TIME:
             why_none = why_none or f"the time of the run is used up: {took:.0f} s"
         kinds = [type(each.finding) for each in (*before, *results)] if check.drives else []
         if why := next((_BARS[each] for each in kinds if each in _BARS), why_none):
@@ -234,10 +234,10 @@ async def run_checks(
 
 
 async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, str]:
-    began = clock.now()
+    began = threads.now()
     with client.watching():
         while True:
-            since = clock.now()
+            since = threads.now()
             finding, why = await _attempt(check, client, level)
             is_late = isinstance(finding, Late)
             if not is_late or why or not client.was_late(since):
@@ -257,7 +257,7 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
         _RESULTS.get(type(finding), Result.FAILED),
         reason,
         finding,
-        seconds=clock.now() - began,
+        seconds=threads.now() - began,
         attempts=client.attempts + (not is_late),
     )
     return result, why and f"{check.name} failed"
@@ -312,7 +312,7 @@ async def _left(
     check: Check, client: Client, subject: Subject | None, level: float
 ) -> Finding | None:
     """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
-    due = clock.now() + _RETRIED
+    due = threads.now() + _RETRIED
     while subject is None or check.drives:
         try:
             with suppress(Unusable):  # it is silent, but cannot be judged
@@ -322,7 +322,7 @@ async def _left(
                     await (greeted(client) if check.greets else identified(client, level))
             break
         except (Violation, Late) as found:
-            if clock.now() > due:
+            if threads.now() > due:
                 return found
     return None
 

@@ -18,7 +18,7 @@ from drivers.errors import LinkError
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import NAK_RECORD, NAMES, REACTION
 from drivers.wires.wire import read_nak
-from registry import clock
+from registry import threads
 
 
 class Finding(Exception):
@@ -316,7 +316,7 @@ class Client(ABC):
         if self.slow_reply:
             return False
         self.attempts = min(self.attempts + 1, _MAX_ATTEMPTS)
-        self.wasted += clock.now() - since
+        self.wasted += threads.now() - since
         return self.attempts < _MAX_ATTEMPTS and not self.is_used_up
 
     @contextmanager
@@ -325,9 +325,9 @@ class Client(ABC):
 
         async def look() -> None:
             while True:
-                due = clock.now() + _LOOK
+                due = threads.now() + _LOOK
                 await asyncio.sleep(_LOOK)
-                self.lag = max(self.lag, late := clock.now() - due)
+                self.lag = max(self.lag, late := threads.now() - due)
                 self.lateness = max(self.lateness, late)
 
         self.attempts, self.mute, self.lag = 0, 0, 0.0
@@ -373,7 +373,7 @@ class Client(ABC):
     async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:
         """Return the first message that is meant, None if it does not come in time [s]."""
         self.came = b""
-        loop, due = asyncio.get_running_loop(), clock.now() + timeout
+        loop, due = asyncio.get_running_loop(), threads.now() + timeout
         timer = loop.call_at(due, self._news.set)
         try:
             while True:
@@ -383,7 +383,7 @@ class Client(ABC):
                         return message
                 if self.loss is not None:
                     raise LinkError(self.loss)
-                if clock.now() >= due:
+                if threads.now() >= due:
                     return None
                 self._news.clear()
                 await self._news.wait()
@@ -395,7 +395,7 @@ class Client(ABC):
 
         An amplifier whose replies are late in a row, or time and again, is slow by itself.
         """
-        before, self.lag, began = self.lag, 0.0, clock.now()
+        before, self.lag, began = self.lag, 0.0, threads.now()
         found = await self.next(is_meant, self.timeout)
         is_in_time = self.lag <= (_BUSY if self.mute < _FEW else _STALLED)
         self.lag = max(self.lag, before)

@@ -10,7 +10,7 @@ from drivers.judge.asking.subject import RATE, Subject
 from drivers.judge.outputs import DRIFT
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME
 from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
-from registry import clock
+from registry import threads
 
 _PLACE = "protocol.md#the-clock"
 _LOWEST, _HIGHEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
@@ -83,8 +83,8 @@ async def clock_rate(subject: Subject) -> None:
     timed = subject.one(valid_for=round(1000 * lasting), ramp=subject.ramp)
 
     async def read(duration: float = duration) -> None:
-        end = clock.now() + duration
-        while clock.now() < end:  # a Commit feeds, and leaves the rate as it is
+        end = threads.now() + duration
+        while threads.now() < end:  # a Commit feeds, and leaves the rate as it is
             again = send("Commit", token=subject.token)
             await subject.run([again if subject.is_hungry else send("GetStatus")])
             await asyncio.sleep(_APART / 2)

@@ -46,7 +46,7 @@ from drivers.wires.modbus.frames import (
     unpack_identity,
     write_pdu,
 )
-from registry import clock
+from registry import threads
 
 READ_HOLDING = 3
 """The other function that reads."""
@@ -77,7 +77,7 @@ class ModbusClient(Client):
                 self.has_gateway, self.timeout = True, GATEWAY_TIMEOUT
                 continue
             kind, frame = (adu.pdu or b"\0")[0], (adu.unit, adu.pdu or adu.raw)
-            self.take(Heard(clock.now(), adu.transaction, kind, (), frame))
+            self.take(Heard(threads.now(), adu.transaction, kind, (), frame))
             self._others |= set() if is_own else {adu.unit}
         return data
 
@@ -94,7 +94,7 @@ class ModbusClient(Client):
 
     async def transact(self, pdu: bytes) -> tuple[bytes, When]:
         """Send a PDU and await its response; returns that and when it was carried out."""
-        data, sent = self.adu(pdu), clock.now()
+        data, sent = self.adu(pdu), threads.now()
         self._reader.end()
         number = 0 if self.is_rtu else self.number
         self.write(data)
@@ -136,10 +136,10 @@ class ModbusClient(Client):
             if response[0] & EXCEPTION:
                 code = EXCEPTIONS.get(response[1], f"exception {response[1]}")
                 return Answer(code, None, (), when)
-        sent = clock.now()
+        sent = threads.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
         shown, result, *reply = await self.read(BOX * number + REPLY, count)
-        when = when or When(sent, clock.now())
+        when = when or When(sent, threads.now())
         if tag is not None:
             expect_equal(shown, tag, f"tag of the reply to {message_name(number)}")
         if result:
@@ -333,10 +333,12 @@ async def pieces(subject: Subject) -> None:
     both = [frame(), frame()]
     cases += [(b"", 0.0, b"".join(both), both)] * (not client.is_rtu)
     for first, wait, second, frames in cases:
-        began = clock.now()
+        began = threads.now()
         client.write(first)
         await asyncio.sleep(wait)
-        require_in_time(not wait < limit < clock.now() - began, "the rest of a frame came too late")
+        require_in_time(
+            not wait < limit < threads.now() - began, "the rest of a frame came too late"
+        )
         heard = await client.send(second)
         what = f"responses after {len(first)} bytes and a pause of {1e3 * wait:g} ms"
         numbers = [0 if client.is_rtu else int.from_bytes(each[:2]) for each in frames]

@@ -39,7 +39,7 @@ from drivers.protocol.table import (
     has_flag,
     name_of,
 )
-from registry import clock
+from registry import threads
 
 _UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors
 _TRIES, _AT_ONCE = 20, 4
@@ -278,7 +278,7 @@ async def broadcasts(subject: Subject) -> None:
         await subject.request("GetStatus")
 
     async def obey(name: str, *before: bytes, **values: object) -> None:
-        message, sent = MESSAGES[name], clock.now()
+        message, sent = MESSAGES[name], threads.now()
         values = subject.filled(values)
         words = message.request.pack(values)
         data = client.request(message.number, words, to=0)
@@ -309,7 +309,7 @@ async def mark(subject: Subject) -> None:
         await client.look_around()
     await subject.run([subject.arm, send("Mark"), send("Mark"), 0.1])
     if client.has_broadcasts and not client.neighbours:
-        sent = clock.now()
+        sent = threads.now()
         client.write(client.request(MESSAGES["Mark"].number, (), to=0))
         await asyncio.sleep(_MARKED)
         when = subject.dating.interval(When(sent, sent + REACTION + client.transit))

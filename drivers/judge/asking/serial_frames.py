@@ -34,7 +34,7 @@ from drivers.wires.serial_line.frames import (
     unpack_identity,
     unpack_words,
 )
-from registry import clock
+from registry import threads
 
 _SEQUENCES = 1 << 16
 _SEQUENCE_AT, _CRC_SIZE = 3, 4
@@ -59,7 +59,7 @@ class SerialClient(Client):
                 self.invalid.append(frame.payload)
                 continue
             words = () if is_text else unpack_words(frame.payload)
-            heard = Heard(clock.now(), frame.sequence, frame.kind, words, frame)
+            heard = Heard(threads.now(), frame.sequence, frame.kind, words, frame)
             self.take(heard, is_event=frame.kind == EVENT)
             self._others |= {frame.address} - {self.address}
         return data
@@ -89,7 +89,7 @@ class SerialClient(Client):
         self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION
     ) -> Answer:
         """Send a message, with bytes behind its words, under a version; await its reply."""
-        sent = clock.now()
+        sent = threads.now()
         heard = await self._replied(number, pack_words(words) + behind, version)
         answer = Answer("", None, heard.words, When(sent, heard.at))
         if heard.type == NAK | REPLY:
@@ -189,7 +189,7 @@ async def doubled_frames(subject: Subject) -> None:
     made = [subject.words_of(each) for each in sets]
     frames = [subject.client.request(_SET, words) for _, words in made]
     for (part, _), data in zip(made, frames, strict=True):
-        began = clock.now()
+        began = threads.now()
         await subject.client.reply_to(data)
         subject.played(part, began)
     for at, pause in ((0, 0.0), (1, 0.25), (1, 0.0)):

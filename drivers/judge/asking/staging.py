@@ -9,7 +9,7 @@ from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
 from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
-from registry import clock
+from registry import threads
 
 _PLACE = "protocol.md#sets"
 _OLD = "BAD_TOKEN"
@@ -112,12 +112,12 @@ async def _starts(subject: Subject, duration: float, *, shift: int = 0) -> None:
     await subject.request("Ping", rate=_FASTEST if duration > _LONG else 0)
     one = subject.one()
     await subject.run([stage(one)])
-    at, began = await subject.commit_in(duration), clock.now()
+    at, began = await subject.commit_in(duration), threads.now()
     await subject.request("Ping", rate=_SLOWEST if duration > _LONG else 0)
     await subject.run([play(one, token=1), send("Commit", token=1)])
     is_ahead = 0 < duration <= MAX_AHEAD
-    await subject.pause(max(duration * is_ahead - _AROUND - clock.now() + began, 0.0))
-    while clock.now() < began + duration * is_ahead + _AROUND:
+    await subject.pause(max(duration * is_ahead - _AROUND - threads.now() + began, 0.0))
+    while threads.now() < began + duration * is_ahead + _AROUND:
         shown = await subject.status()
         since = ahead(shown["clock"], at * HIGH_STEPS)
         if is_ahead and abs(since) > _NEAR:

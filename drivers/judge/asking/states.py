@@ -12,7 +12,7 @@ from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.sets import token_after
 from drivers.protocol.table import FAULTS, NO_CHANNEL, QUANTITIES
-from registry import clock
+from registry import threads
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"
 _WRONG = "WRONG_STATE"
@@ -338,7 +338,7 @@ async def trips_amid_other_requests(subject: Subject) -> None:
     )
     last = subject.shown.fed[0] + 0.7 * subject.shown.watchdog - subject.exchange_time
     for row in cycle(others):
-        if clock.now() > last:
+        if threads.now() > last:
             break
         await subject.run([row])
     await subject.settle()

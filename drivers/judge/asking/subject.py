@@ -42,7 +42,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
 from drivers.wires.wire import reply_words
-from registry import clock
+from registry import threads
 
 LEVEL = 0.2
 """Level of driven channels unless another is given: perceptible, and far from any limit."""
@@ -82,7 +82,7 @@ class Subject(Material):
         self._moment = 0  # of the Commit that named one last, a high word of its clock
         self._parts: list[tuple[float, Values, int]] = []  # without a reply, when sent, words
         client.quiet = REPLY_TIMEOUT
-        self.heard_at = clock.now()
+        self.heard_at = threads.now()
         channels, layers = can["channels"], can["layers"]
         client.reply_words = {
             each.number: reply_words(name, channels, layers) for name, each in MESSAGES.items()
@@ -165,14 +165,14 @@ class Subject(Material):
             head = message.request.places["index"]  # session and token
             is_part = self.sent_set and [*self.sent_set[-1][:head]] == [*raw[:head]]
             self.sent_set = [*(self.sent_set if is_part else ()), raw]
-        client, sent = self.client, clock.now()
+        client, sent = self.client, threads.now()
         if not has_reply:
             self._parts.append((sent, values, len(raw)))
             await client.part(message.number, raw)
-            return Answer("", None, (), When(sent, clock.now()))
+            return Answer("", None, (), When(sent, threads.now()))
         answer = await client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
-        took = clock.now() - sent
+        took = threads.now() - sent
         client.quiet = min(client.quiet, QUIET + took)
         before = self._parts_came(answer.when.latest)
         if "index" in values and answer.code and self.expected is not None:
@@ -323,7 +323,7 @@ class Subject(Material):
         """Share of the watchdog time that has passed."""
         if self.is_starving or self.expected is None or self.expected.state != ENABLED:
             return 0.0
-        return (clock.now() - self.expected.fed[0]) / self.expected.watchdog
+        return (threads.now() - self.expected.fed[0]) / self.expected.watchdog
 
     @property
     def is_hungry(self) -> bool:
@@ -334,7 +334,7 @@ class Subject(Material):
         """Feed it where that is due, so that it was fed a while ago, and is not due soon."""
         if self._since_fed > _MAX_UNFED:
             await self.ping()
-        await asyncio.sleep(max(self.shown.fed[1] + _UNFED - clock.now(), 0.0))
+        await asyncio.sleep(max(self.shown.fed[1] + _UNFED - threads.now(), 0.0))
 
     async def starve(self) -> None:
         """From now on the watchdog may expire."""
@@ -382,7 +382,7 @@ class Subject(Material):
 
     def since(self, sent: float) -> When:
         """Return what is between a time of this machine and now, by the amplifier's clock."""
-        return self.dating.interval(When(sent, clock.now()))
+        return self.dating.interval(When(sent, threads.now()))
 
     def played(self, part: Values, sent: float) -> None:
         """Note that a set of one part was carried out that was sent at a time."""
@@ -498,22 +498,22 @@ class Subject(Material):
 
     async def pause(self, duration: float) -> None:
         """Wait for a time [s], feeding the watchdog."""
-        end = clock.now() + duration
-        while (left := end - clock.now()) > 0:
+        end = threads.now() + duration
+        while (left := end - threads.now()) > 0:
             if self.is_hungry:
                 await self.ping()
                 continue
             is_fed = self.is_starving or self.shown.state != ENABLED
             await asyncio.sleep(left if is_fed else min(left, self.shown.watchdog / 8))
         self.heard_at = end
-        require_in_time(clock.now() <= end + _OVERSLEPT, "a pause took too long")
+        require_in_time(threads.now() <= end + _OVERSLEPT, "a pause took too long")
 
     async def settle(self, reply: Answer | None = None) -> Answer:
         """Read statuses behind a reply until it is silent and in a state that lasts."""
-        due, reply = clock.now() + _SETTLED, reply or await self.status()
+        due, reply = threads.now() + _SETTLED, reply or await self.status()
         while any(reply["levels"]) or reply["state"] in (*_MOVING, ENABLED):
             seen = f"{name_of(STATES, reply['state'])}, levels {reply['levels']}"
-            expect(clock.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
+            expect(threads.now() < due, "silence", expected=f"within {_SETTLED:g} s", seen=seen)
             await asyncio.sleep(_POLL)
             reply = await self.status()
         return reply
@@ -527,10 +527,10 @@ class Subject(Material):
         end = self.shown.outputs.settled_at(began[1]) + _SETTLING
         end = end if duration is None else began[0] + duration
         few = min(2 * self.exchange_time, 2.0)  # of a slow line
-        end = max(end, clock.now() + min(few, 2 * self.read_time))
+        end = max(end, threads.now() + min(few, 2 * self.read_time))
         time, seen = end - self.heard_at, 0
         pause = max(time / (2 * _SAMPLES) - min(self.exchange_time, 1.0), 0.0)
-        while clock.now() < end + max(few, _SETTLING) * (seen < 2):
+        while threads.now() < end + max(few, _SETTLING) * (seen < 2):
             reply = await self.status()
             width = reply.when.latest - reply.when.earliest + began[1] - began[0]
             is_narrow = width <= _NARROW + 2 * max(self.exchange_time, self.client.transit)
@@ -542,7 +542,7 @@ class Subject(Material):
     async def in_time(self, case: Callable[[], Awaitable[object]]) -> None:
         """Try a case, each time from rest, until this machine was in time."""
         while True:
-            began = clock.now()
+            began = threads.now()
             if not self.is_at_rest:
                 await self.rest()
             try:

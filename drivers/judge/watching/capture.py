@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 from drivers.errors import CommandError
-from registry.regular_file import regular_file
+from registry.files import regular_file
 
 Direction: TypeAlias = Literal["amplifier", "host"]
 """Direction of transfer: toward the amplifier or the host."""

@@ -33,7 +33,7 @@ from drivers.wires.can_bus.text import (
     TextFormat,
     TextReader,
 )
-from registry import clock
+from registry import threads
 
 _BITRATES = 10_000, 1_000_000
 _NODE = "node must be given as #{}"
@@ -155,7 +155,7 @@ class TextPort(PortAbove):
     def write(self, data: bytes) -> None:
         """Send frames; raises LinkError."""
         text = b"".join(map(self._encode, unpack_frames(data)))
-        if clock.now() - self._heard_at > _SILENCE:
+        if threads.now() - self._heard_at > _SILENCE:
             text = self._hello + text
         self.below.write(self._cut_off + text if self.below.is_blocked else text)
 
@@ -169,7 +169,7 @@ class TextPort(PortAbove):
     def received(self, data: bytes) -> None:
         """Take text of the adapter."""
         if frames := pack_frames(self._reader.feed(data)):
-            self._heard_at = clock.now()
+            self._heard_at = threads.now()
             self._on_data(frames)
         if data.endswith(_BELL) or not data.isascii():
             self._on_data(pack_frames([CanFrame(ERROR_ID, data[-BLOCK:])]))

@@ -46,7 +46,7 @@ from drivers.wires.wire import (
     read_event,
     read_nak,
 )
-from registry import clock
+from registry import threads
 
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames sent last, which an adapter may echo
 _READ_VERSIONS = bytes((0x40, 0x00, 0x20, 5, 0, 0, 0, 0))  # upload of 2000:5, CiA 301 7.2.4.3.5
@@ -145,7 +145,7 @@ class CanWire(Wire):
             )
 
     def _from_amplifier(self, node: int, data: bytes) -> list[Arrival]:
-        now = clock.now()
+        now = threads.now()
         if data[:1] == b"\0":
             events = self._events.setdefault(node, Assembler(self.counters, is_numbered=False))
             event = events.add(data, now)

@@ -15,7 +15,7 @@ from model.config.document import read_document
 from model.config.editing import edited_text
 from model.files.array_file import whole_or_nothing
 from model.rig.file import load_rig
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, tone
 from sim.desk.measuring.sound_card import SoundCard, open_card

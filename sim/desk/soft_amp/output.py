@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from registry.suggestions import did_you_mean
+from registry.plugins import did_you_mean
 from sim.desk.libjack import (
     IS_INPUT,
     IS_OUTPUT,

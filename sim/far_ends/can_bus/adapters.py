@@ -9,7 +9,7 @@ import re
 
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
-from registry import clock
+from registry import threads
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send
 
@@ -120,5 +120,5 @@ class SocketcandClient(FarEnd):
                 self._send(b"< error unknown command >")
 
     def _hear(self, frame: CanFrame) -> None:
-        stamp = f"{clock.now():.6f}"  # only differences are meaningful
+        stamp = f"{threads.now():.6f}"  # only differences are meaningful
         self._send(f"< frame {frame.id:03X} {stamp} {frame.data.hex().upper()} >".encode())

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames, unpack_frames
-from registry import clock
+from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 from sim.transport.far_end import Served
@@ -51,7 +51,7 @@ class CanBus:
             self._deliver(frame, sender)
 
         bits = 8 * (_OVERHEAD + len(frame.data))
-        self._free_from = max(clock.now(), self._free_from) + bits / self._bitrate
+        self._free_from = max(threads.now(), self._free_from) + bits / self._bitrate
         timer = asyncio.get_running_loop().call_at(self._free_from, arrive)
         self._in_flight.add(timer)
 
@@ -87,7 +87,7 @@ class BusNodes:
             served.close()
 
     def _hear(self, frame: CanFrame) -> None:
-        now = clock.now()
+        now = threads.now()
         for line, _ in self._nodes:
             line.inward.send(pack_frames([frame]), now)
 
@@ -101,7 +101,7 @@ class BusNodes:
                 line.outward.send(pack_frames([frame]))
 
         def boot() -> None:
-            end.start(clock.now())
+            end.start(threads.now())
             served.schedule()
 
         line = TwoWayLine(

@@ -18,7 +18,7 @@ from controller.api.admission import MAX_CONNECTIONS, Acceptor, Admission
 from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
 from controller.api.schema import MAX_RATE, Message
 from controller.api.topics import ContactsEvent, Hub, LogEvent
-from registry.garbage_collection import no_long_collections
+from registry.threads import no_long_collections
 from served_api import ServedApi, Wire, feed, request, serving
 
 

@@ -26,7 +26,7 @@ from daemon_bench import (
 )
 from daemon_process import Journal, energised, silent_from
 from drivers.host.amplifier import WATCHDOG
-from registry import clock
+from registry import threads
 from rig_files import TWO_AMPLIFIERS
 from several_fingers import answers_take
 from sim.faults.fault_window import FaultWindow
@@ -44,20 +44,20 @@ async def test_daemon_ignores_jumps_of_wall_clock(
     real = time.time
     async with ready_daemon(tmp_path) as (bench, era):
         await era.arm("test", lease_s=3)
-        armed = clock.now()
+        armed = threads.now()
         async with holding(era, far=bench.far):
             for jump in JUMPS:
                 monkeypatch.setattr(time, "time", lambda jump=jump: real() + jump)
                 status = await era.status()
                 assert status.unix_time_s == pytest.approx(real() + jump, abs=60)
-                renewed = clock.now()
-                await until(lambda renewed=renewed: clock.now() > renewed + 0.3)
+                renewed = threads.now()
+                await until(lambda renewed=renewed: threads.now() > renewed + 0.3)
                 assert any(bench.far.summary().levels)
             status = await era.status()
             assert not status.rejected_touches
-            assert status.lease_left_s == pytest.approx(armed + 3 - clock.now(), abs=0.01)
+            assert status.lease_left_s == pytest.approx(armed + 3 - threads.now(), abs=0.01)
             await until_state(era, READY)
-            assert clock.now() - armed == pytest.approx(3, abs=0.1)
+            assert threads.now() - armed == pytest.approx(3, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -77,10 +77,10 @@ async def test_daemon_ramps_down_reads_back_and_disarms_when_terminated(
         await until_state(era, READY)
         await era.arm("test", lease_s=60)
         async with holding(era, far=far):
-            begin = clock.now()
+            begin = threads.now()
             os.kill(os.getpid(), number)
             await until(bench.running.done)
-        assert clock.now() - begin < 1
+        assert threads.now() - begin < 1
         for name in far.devices:
             requests = [entry for entry in journal.since(begin) if entry.amplifier == name]
             end = next(entry for entry in requests if entry.name == "Disarm")
@@ -100,10 +100,10 @@ async def test_daemon_ends_when_terminated_over_dead_link(tmp_path: Path) -> Non
         assert await until_state(era, ENABLED)
         async with holding(era, far=bench.far):
             bench.far.device.inject_fault(FaultWindow(fault="hang"))
-            begin = clock.now()
+            begin = threads.now()
             bench.daemon.shut_down("end of the test")
             await until(bench.running.done)
-        assert clock.now() - begin < 1
+        assert threads.now() - begin < 1
         await until(lambda: not energised(bench.far))
         assert silent_from(bench.far) - journal.last_fed("main") <= WATCHDOG + 0.005 + 1e-9
 
@@ -162,12 +162,12 @@ async def test_a_daemon_goes_on_while_answers_hang(
             await era.arm("test", lease_s=60)
             await until(lambda: asked)
             assert await said(era) == {BEING_CHOSEN}
-            begin = clock.now()
-            await until(lambda: clock.now() > begin + 1.1)
+            begin = threads.now()
+            await until(lambda: threads.now() > begin + 1.1)
             assert await said(era) == {GIVEN_UP}
-            begin = clock.now()
+            begin = threads.now()
             await era.stop()
-            assert clock.now() - begin < 0.05
+            assert threads.now() - begin < 0.05
             assert await said(era) == {"stopped: clear (era clear), then arm again"}
             layout.write_text(_LAYOUT % "click", "utf-8")
             os.kill(os.getpid(), signal.SIGHUP)
@@ -186,7 +186,7 @@ async def test_a_daemon_goes_on_while_answers_hang(
         await until(lambda: bench.daemon._layouts.player.layout.regions[1].on_press == "buzz")
         async with holding(era, LEFT, RIGHT):
             await until(lambda: len(asked) == 2)
-            begin = clock.now()
+            begin = threads.now()
             os.kill(os.getpid(), signal.SIGTERM)
             await until(bench.running.done)
-            assert clock.now() - begin < 1
+            assert threads.now() - begin < 1

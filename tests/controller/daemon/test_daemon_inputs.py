@@ -25,7 +25,7 @@ from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
-from registry import clock
+from registry import threads
 from tuio_messages import bundle, free_port, message, panel
 from virtual_loop import in_virtual_time
 from witness_config import tell_first
@@ -42,7 +42,7 @@ async def test_touches_of_clients_are_delivered_in_places_of_the_sensor(tmp_path
         touched, second = frames
         assert (touched.source, touched.origin) == ("api:1:me", "api:1")
         assert (second.source, second.origin) == ("api:2:me", "api:2")
-        assert touched.time <= clock.now()
+        assert touched.time <= threads.now()
         assert [(each.x, each.y) for each in touched.touches] == [
             pytest.approx(place) for place in ((0.25, 0.5), (0.75, 0.75))
         ]
@@ -287,7 +287,7 @@ async def test_touch_that_came_and_went_during_a_pause_plays_nothing(tmp_path: P
     async with ready_daemon(tmp_path) as (bench, era):
         journal = Journal(bench.far)
         await era.arm("me", lease_s=60)
-        begin = clock.now()
+        begin = threads.now()
         for ago, touches in ((0.12, (Touch(1, 0.4, 0.5),)), (0.06, ())):
             bench.daemon._controller.cycle.deliver(TouchFrame("brief", begin - ago, touches))
         await journal.hear(10)
@@ -301,7 +301,7 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
     async with ready_daemon(tmp_path, panel(port)) as (bench, era):
         journal = Journal(bench.far)
         await era.arm("me", lease_s=60)
-        begin = clock.now()
+        begin = threads.now()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for number in range(count + 1):
                 touches = tuple(
@@ -313,7 +313,7 @@ async def test_few_of_a_flood_of_touches_become_sets(tmp_path: Path) -> None:
                 await asyncio.sleep(1e-4)
         assert journal.raising_since(begin)
         await until(lambda: not any(bench.far.summary().levels))
-        silent = clock.now()
+        silent = threads.now()
         await journal.hear(5)
         assert not journal.raising_since(silent)
         assert len(journal.raising_since(begin)) < count / 4

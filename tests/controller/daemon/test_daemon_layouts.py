@@ -10,7 +10,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.cli.main import BAD_INPUT, run
 from daemon_bench import holding, next_event, ready_daemon, until
 from gateway_bench import real_daemon
-from registry import clock
+from registry import threads
 from virtual_loop import in_virtual_time
 
 LAYOUTS = "layouts: {home: home.yaml, climate: climate.yaml}\n"
@@ -50,26 +50,26 @@ async def test_next_finger_feels_the_chosen_layout_and_a_tick_goes_on(tmp_path: 
         assert (await next_event(era, "layout")).data["name"] == "home"
         async with holding(era, EAST):
             await until(lambda: felt() == ["tick"])
-            began = clock.now()
+            began = threads.now()
             with pytest.raises(RpcError, match="did you mean climate") as caught:
                 await era.layout("climat")
             assert caught.value.code is ErrorCode.INVALID_PARAMS
             assert (await era.layout("home")).layout == "home"
             assert (await era.layout("climate")).layout == "climate"
-            assert clock.now() - began < 0.01
+            assert threads.now() - began < 0.01
             await until(lambda: felt() == ["low"])
-            assert clock.now() - began == pytest.approx(TICK, abs=0.02)
+            assert threads.now() - began == pytest.approx(TICK, abs=0.02)
             assert (await next_event(era, "layout")).data["name"] == "climate"
             assert (await era.status()).layout == "climate"
         await era.touch([])
         for name, effect in (("home", "hum"), ("climate", "low")):
             await until(lambda: not any(bench.far.summary().levels))
             await era.layout(name)
-            replied = clock.now()
+            replied = threads.now()
             async with holding(era, WEST):
                 await until(lambda effect=effect: felt() == [effect])
                 assert any(bench.far.summary().levels)
-                assert clock.now() - replied < 0.01
+                assert threads.now() - replied < 0.01
             await era.touch([])
 
 

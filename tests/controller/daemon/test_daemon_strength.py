@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
-from registry import clock
+from registry import threads
 from virtual_loop import in_virtual_time
 
 PLACES = {"left": (0.03, 0.11), "right": (0.216, 0.0572)}
@@ -56,15 +56,15 @@ async def seats(folder: Path, more: str = "") -> AsyncIterator[tuple[DaemonBench
         bench,
         era,
     ):
-        bench.far.bench.place_fingers(PLACES, now=clock.now())
+        bench.far.bench.place_fingers(PLACES, now=threads.now())
         await era.arm("test", lease_s=60)
         yield bench, era
 
 
 async def hold(seconds: float, *touching: tuple[AsyncClient, str, str]) -> None:
     """Let clients report a finger each for a time [s]: their sources, and where."""
-    end = clock.now() + seconds
-    while clock.now() < end:
+    end = threads.now() + seconds
+    while threads.now() < end:
         for era, source, place in touching:
             await era.touch([PLACES[place]], source=source)
         await asyncio.sleep(0.02)
@@ -96,10 +96,10 @@ async def test_gain_of_a_source_is_felt_at_its_finger_alone_along_a_fade(tmp_pat
         ]
         settled_at = planner.layers.contents[sent].settled_at
         for gain, first, last in ((-6.0, 1.0, LOWER), (0.0, LOWER, 1.0)):
-            set_at = clock.now()
+            set_at = threads.now()
             await era.strength(name="left", gain_db=gain)
             await hold(0.02, *both)
-            led = np.arange(clock.now(), set_at + 0.2, STEP)
+            led = np.arange(threads.now(), set_at + 0.2, STEP)
             moving = [
                 np.array([abs(tone.transition.at(time)) for time in led])
                 for channel in bench.far.amplifier.outputs

@@ -28,7 +28,7 @@ from controller.sources import udp_source
 from daemon_bench import ENABLED, DaemonBench, daemon_table, holding, ready_daemon
 from memory_machine import MemoryMachine
 from model.answer.timing import Timing
-from registry import clock
+from registry import threads
 from sim.transport.far_end import FarEnd
 from tuio_messages import frame
 from virtual_loop import VirtualLoop, in_virtual_time
@@ -147,7 +147,7 @@ async def touched(folder: Path) -> AsyncIterator[tuple[DaemonBench, AsyncClient,
                 yield (
                     bench,
                     era,
-                    lambda sent: received[0](sent, ("127.0.0.1", 4000), clock.now()),
+                    lambda sent: received[0](sent, ("127.0.0.1", 4000), threads.now()),
                 )
 
 

@@ -29,7 +29,7 @@ from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger.perception import detection_threshold
 from model.rig.file import example_rig_path
-from registry import clock
+from registry import threads
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time
 
@@ -147,7 +147,7 @@ FAULT = "amplifier d: state must be OPERATION_ENABLED, got FAULT with fault WATC
 
 def contact(number: int) -> Contact:
     """A contact that is down from now on."""
-    return Contact(ContactKey("test", number), 0.1, 0.1, clock.now())
+    return Contact(ContactKey("test", number), 0.1, 0.1, threads.now())
 
 
 async def nothing(*_: object) -> dict[str, FingerVibration]:
@@ -175,7 +175,7 @@ async def test_rows_after_a_fault_name_it_until_the_plate_is_armed_again() -> No
         (changed,), (silence,) = loop.contacts_changed, loop.silenced
         changed((near,), Change(down=(near,)))
         reason = "too close to an edge"
-        silenced = SilenceReport((near,), (not_served(near, reason),), reason, None, clock.now())
+        silenced = SilenceReport((near,), (not_served(near, reason),), reason, None, threads.now())
         silence(silenced)
         changed((), Change(up=(near,)))
         changed((down,), Change(down=(down,)))
@@ -199,7 +199,7 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
 
     Its onset is measured beside a quiet finger, if it lasts as long as that.
     """
-    monkeypatch.setattr(clock, "now", asyncio.get_running_loop().time)
+    monkeypatch.setattr(threads, "now", asyncio.get_running_loop().time)
     windows: list[tuple[float, float]] = []
 
     async def vibration(since: float, until: float) -> dict[str, FingerVibration]:
@@ -207,14 +207,14 @@ async def test_pattern_is_measured_while_no_finger_moves(monkeypatch: pytest.Mon
         return {}
 
     async with recorder_of([], vibration) as recorder:
-        start, loop = clock.now(), Observers()
+        start, loop = threads.now(), Observers()
         recorder.observe(loop)
         (changed,), (applied_now,) = loop.contacts_changed, loop.pattern_applied
         finger = contact(1)
         changed((finger,), Change(down=(finger,)))
         for quiet in ((), (contact(2),), (contact(2),)):
             applied = SimpleNamespace(
-                time=clock.now(),
+                time=threads.now(),
                 targets=(Prediction(finger, 20.0),),
                 layer=SimpleNamespace(ramp=0.04),
                 quiet=quiet,

@@ -14,7 +14,7 @@ from drivers.errors import CommandRefused
 from drivers.host.feeding import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
-from registry import clock
+from registry import threads
 from virtual_loop import in_virtual_time
 from watched_supervisor import Watched, watched
 
@@ -188,7 +188,7 @@ async def test_amplifier_that_plays_another_set_after_a_stall_is_stopped() -> No
             token=token_after(daemon.far_end.status()["token"]),
             now=True,
         )
-        daemon.far_end.obey("Set", part, clock.now())
+        daemon.far_end.obey("Set", part, threads.now())
         await asyncio.sleep(0.2)
         assert daemon.state is DaemonState.FAULT
         assert daemon.far_end.requests("Stop")

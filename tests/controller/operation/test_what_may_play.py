@@ -10,7 +10,7 @@ from controller.daemon.messages import amplifier_statuses
 from courses import Step
 from drivers.errors import DriverError
 from long_form import shortly
-from registry import clock
+from registry import threads
 from virtual_loop import in_virtual_time, run_virtual
 from watched_supervisor import Watched, watched
 
@@ -38,7 +38,7 @@ def said_by_status(daemon: Watched) -> Mapping[str, Mapping[str, object]]:
         what_may_play=supervisor.what_may_play,
         clock_errors=controller.group.clock_errors,
     )
-    now = clock.now()
+    now = threads.now()
     said = {name: supervisor.what_may_play(name).rows(now) for name in controller.urls}
     for each in shown:
         assert (each.silence is None) == (each.state is not None and not each.degraded)
@@ -74,7 +74,7 @@ def test_stop_and_status_agree_and_say_enough(wire: str, seed: int) -> None:
                 if rng.random() < 0.5:
                     continue
                 stopped = await daemon.supervisor.stop("a test")
-                now = clock.now()
+                now = threads.now()
                 words = {name: each.rows(now) for name, each in stopped.items()}
                 known = said_by_status(daemon)
                 for name, said in words.items():
@@ -127,10 +127,10 @@ async def test_stop_says_what_is_known(state: str) -> None:
         for step in steps:
             with suppress(DriverError):
                 await daemon.take(step)
-        began = clock.now()
+        began = threads.now()
         (stopped,) = (await daemon.supervisor.stop("a test")).values()
-        assert clock.now() - began < (0.65 if "lost" in state else 0.33)
-        said = stopped.rows(clock.now())
+        assert threads.now() - began < (0.65 if "lost" in state else 0.33)
+        said = stopped.rows(threads.now())
         assert (said["silence"], said["may_play_for_s"]) == (silence, left)
         (known,) = said_by_status(daemon).values()
         assert silence == SILENT or known["silence"] == silence
@@ -151,8 +151,8 @@ async def test_end_does_not_wait_for_a_mute_amplifier(amid: Step) -> None:
         await daemon.take(MUTE)
         await daemon.begins(amid)
         await daemon.waits(0.1)
-        began = clock.now()
+        began = threads.now()
         await daemon.supervisor.close("the end")
-        assert clock.now() - began < 0.9
+        assert threads.now() - began < 0.9
         await daemon.ends_anyhow(amid)
         daemon.recovers()

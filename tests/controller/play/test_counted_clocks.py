@@ -10,7 +10,7 @@ from controller.play.counted_clocks import CountedClocks
 from model.ensemble.delays import EXACT_CLOCKS
 from model.rig.rig import Channel
 from paper_table import smooth_rig, smooth_table
-from registry import clock
+from registry import threads
 
 RIG = smooth_rig()
 HALVES = replace(
@@ -53,7 +53,7 @@ def test_clocks_that_come_and_go_are_told_once_with_how_often(
     Answers follow each change at once.
     """
     seconds, now = [0.0], {"a": 4e-6, "b": 4e-6}
-    monkeypatch.setattr(clock, "now", lambda: seconds[0])
+    monkeypatch.setattr(threads, "now", lambda: seconds[0])
     clocks, table = CountedClocks(HALVES, lambda: now), smooth_table()
     with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
         table = clocks.counted_by(table)

@@ -28,7 +28,7 @@ from controller.process.service_manager import ServiceManager
 from drivers.wires.wire import Reply
 from full_disk import full_disk
 from gateway_bench import wait_for
-from registry import clock
+from registry import threads
 from set_chain import set_chain
 from virtual_loop import in_virtual_time
 
@@ -291,7 +291,7 @@ async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
 def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time [s] that the dumps see."""
     times = [0.0]
-    monkeypatch.setattr(clock, "now", lambda: times[0])
+    monkeypatch.setattr(threads, "now", lambda: times[0])
     return times
 
 

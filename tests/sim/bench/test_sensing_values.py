@@ -14,7 +14,7 @@ from drivers.protocol.table import READING_STATES
 from model.fem.plate import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart
-from registry import clock
+from registry import threads
 from rig_on_wire import WIRES, layer, on_two_amplifiers, rig_on_wire
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer
@@ -64,7 +64,7 @@ async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) ->
         await rig.group.arm()
         tones = [layer((0, 110.0, 1.0)), layer((3, 210.0, 0.5), number=1)]
         await rig.group.apply({"main": tones})
-        await rig.beat_until(clock.now() + 4.0)
+        await rig.beat_until(threads.now() + 4.0)
         main = rig.group.amplifiers["main"]
         sensors = await read_sensors(main)
         found = await measure_tones(main, frequencies, 0.2)

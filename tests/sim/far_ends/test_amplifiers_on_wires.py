@@ -13,7 +13,7 @@ from drivers.urls import ADDRESS
 from drivers.wires.serial_line.frames import Frame, encode_frame
 from model.errors import InputError
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 from rig_on_wire import (
     SHARED_WIRES,
     WIRES,
@@ -141,7 +141,7 @@ async def delays_of_requests(port: str, rig: Rig) -> list[float]:
         sent = []
         for _ in range(200):
             await asyncio.sleep(0.0207)
-            sent.append(clock.now())
+            sent.append(threads.now())
             open_port.write(READ_STATUS)
         await asyncio.sleep(0.02)
     return sorted(after - before for after, before in zip(arrived, sent, strict=True))
@@ -241,11 +241,11 @@ def test_fault_silences_and_its_amplifier_is_found_again(
         async with rig_on_wire(coarse_rig, wire) as rig:
             await rig.group.arm()
             await rig.group.apply({"main": [layer((0, 110.0, 1.0))]})
-            await rig.beat_until(clock.now() + 0.2)
+            await rig.beat_until(threads.now() + 0.2)
             assert rig.levels("main")[0] == 1.0
             rig.devices["main"].inject_fault(FaultWindow(fault=kind, lasts=1.0))
             with pytest.raises((CommandRefused, LinkError)):
-                await rig.beat_until(clock.now() + 2.0)
+                await rig.beat_until(threads.now() + 2.0)
             assert not rig.group.is_armed
             await asyncio.sleep(0.3)
             assert not any(rig.levels("main"))
@@ -275,7 +275,7 @@ async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
         played = [layer((0, 110.0, 0.5))]
         await rig.group.apply({"east": played, "west": played})
         rig.devices["east"].inject_fault(FaultWindow(fault="hang"))
-        begin = clock.now()
+        begin = threads.now()
         stopping = asyncio.create_task(rig.group.stop())
         await asyncio.sleep(0.05)
         assert not any(rig.levels("west"))
@@ -283,7 +283,7 @@ async def test_hung_amplifier_of_a_line_leaves_the_other_to_be_stopped(
         stopped = await stopping
         assert stopped["west"].is_confirmed
         assert not stopped["east"].is_confirmed
-        await asyncio.sleep(begin + 0.3 - clock.now())
+        await asyncio.sleep(begin + 0.3 - threads.now())
         assert not any(rig.levels("east"))
         assert stopped["east"].may_play_until > begin
 
@@ -297,8 +297,8 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
     """
     async with rig_on_wire(coarse_rig, Wire(kind, speed=9600), watchdog=2.0) as rig:
         main = rig.group.amplifiers["main"]
-        begin = clock.now()
+        begin = threads.now()
         await main.read_status()
         words = STATUS.words + 4 + 8  # levels, tokens
         least = 2 * words * bits / 9600
-        assert least < clock.now() - begin < 2 * least + 0.02
+        assert least < threads.now() - begin < 2 * least + 0.02

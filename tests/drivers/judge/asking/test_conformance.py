@@ -34,7 +34,7 @@ from drivers.wires.serial_line.frames import FrameReader, encode_frame
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from long_form import shortly
 from model.rig.rig import Rig
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
 from sim.bench.bench import Bench, keep_time
@@ -84,7 +84,7 @@ def test_amplifier_with_the_whole_table_passes_loud() -> None:
 @in_virtual_time
 async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
     """Those at the feet of a rig's actuators, which read what plays."""
-    bench = Bench(coarse_rig, now=clock.now())
+    bench = Bench(coarse_rig, now=threads.now())
     (far,) = bench.amplifiers.values()
     assert isinstance(far, Amplifier)
     running = asyncio.ensure_future(keep_time(bench))
@@ -475,7 +475,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     far, near = pty.openpty()
     loop = asyncio.get_running_loop()
     end = SerialAmplifiers({1: plain()}, lambda data: _written(far, data))
-    loop.add_reader(far, lambda: end.receive(os.read(far, 4096), clock.now()))
+    loop.add_reader(far, lambda: end.receive(os.read(far, 4096), threads.now()))
     url = f"serial://{os.ttyname(near)}"
     with tracing(tmp_path / "trace"):
         report = await judge(url, drives=False)

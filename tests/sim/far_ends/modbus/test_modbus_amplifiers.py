@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager, closing
 import pytest
 
 from foreign_masters import MASTERS, drive
-from registry import clock
+from registry import threads
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
@@ -21,14 +21,14 @@ async def served(line: str) -> AsyncIterator[str]:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
         while data := await reader.read(4096):
-            end.receive(data, clock.now())
+            end.receive(data, threads.now())
         writer.close()
 
     if line == "tcp":
         async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
             yield f"modbus+tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}/1"
         return
-    terminal = make_terminal(lambda data: end.receive(data, clock.now()))
+    terminal = make_terminal(lambda data: end.receive(data, threads.now()))
     end = ModbusAmplifiers(amplifiers, terminal.write, is_rtu=True)
     with closing(terminal):
         terminal.listen()

@@ -1,10 +1,15 @@
-"""Opening and reading files that a user names: only regular ones, bounded, without waiting."""
+"""Opening and reading files that a user names: only regular ones, bounded, without waiting.
+
+What only POSIX systems have: locks on files, and a sentence where its modules are missing.
+
+Wires, daemon, clients and gateway need it; the plate, its tables, answers and designs do not.
+"""
 
 import errno
 import os
 import stat
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any, BinaryIO
 
 
 def regular_file(name: str, flags: int) -> int:
@@ -44,3 +49,23 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 
 def _too_long(path: Path, max_bytes: int) -> OSError:
     return OSError(errno.EFBIG, f"must be up to {max_bytes >> 20} MiB long", str(path))
+
+
+_MODULES = frozenset(("fcntl", "pwd", "resource", "termios", "tty"))
+
+
+def lock(file: IO[Any]) -> None:
+    """Lock an open file, until it is closed or its process ends, however it ends.
+
+    Raises BlockingIOError if it is locked already, OSError if its file system does not lock.
+    """
+    import fcntl
+
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def posix_needed(error: BaseException) -> str | None:
+    """What to do about a missing module of POSIX systems; None for every other error."""
+    if not isinstance(error, ModuleNotFoundError) or error.name not in _MODULES:
+        return None
+    return f"wires, daemon and clients need Linux or macOS (no module {error.name} here); use WSL"

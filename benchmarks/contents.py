@@ -167,10 +167,10 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     """Print what a search that takes its time finds beyond the answers."""
     import numpy as np
 
+    from model import drive_modes as coherent
     from model.answer.search import Contents, Stream
     from model.answer.search_in_c import choose_tones
     from model.answer.search_in_numpy import choose_by_numpy
-    from model.drive_modes import coherent
 
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
@@ -265,7 +265,7 @@ def _print_distorted(
     from model.answer.fingers import Finger, Stimulus
     from model.answer.plan import answer
     from model.answer.search import APART_HZ
-    from model.vibration.excitation import base_amplitudes
+    from model.vibration import base_amplitudes
 
     above, near = [], []
     strokes = np.array([era.full_level for era in table.eras])

@@ -13,8 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from model.arrays import ComplexArray, FloatArray
-from model.fem.mesh import Mesh
-from model.fem.plate import PlateMatrices, assemble, factorise
+from model.fem import Mesh, PlateMatrices, assemble, factorise
 from model.spectral.direct import Responder, direct_spectral_acceleration
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator

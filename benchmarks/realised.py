@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from model.answer.fingers import Placement
     from model.arrays import FloatArray
     from model.rig.rig import Rig
-    from model.vibration.excitation import Excitation
+    from model.vibration import Excitation
 
 PAGE = Path(__file__).parents[1] / "docs" / "measured" / "contrast-benchmark.md"
 QUIET = (1, 2, 3)
@@ -120,13 +120,12 @@ def realised(
     """Felt contrast [dB] and level [dB SL] on plates (d,), drawn by the number of the set."""
     import numpy as np
 
-    from model.finger.fingertip import DiscRule, fingertips_on
-    from model.finger.perception import decibels, detection_threshold
+    from model.finger import DiscRule, decibels, detection_threshold, fingertips_on
     from model.spectral.direct import direct_spectral_acceleration
     from model.spectral.mesh import SpectralMesh
     from model.structure.attachments import fingertip_loads
     from model.study.exact_plates import draw_plates
-    from model.vibration.excitation import base_amplitudes
+    from model.vibration import base_amplitudes
 
     plate, eras = rig.plate, rig.eras
     around = np.exp(0.25j * np.pi * np.arange(8))

@@ -153,9 +153,9 @@ def _score(
     import numpy as np
 
     from benchmarks.realised import realised
-    from model.finger.perception import decibels
+    from model.finger import decibels
     from model.study.exact_plates import draw_plates, felt_on
-    from model.vibration.excitation import Tone
+    from model.vibration import Tone
 
     question = _placement(rig, quiet, number)
     excitation = {era: Tone(*tone) for era, tone in tones.items()}

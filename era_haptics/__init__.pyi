@@ -41,7 +41,7 @@ from model.design.run import Assessment as Assessment
 from model.design.run import Design as Design
 from model.design.run import RankedLayout as RankedLayout
 from model.errors import InputError as InputError
-from model.finger.grid import Grid as Grid
+from model.finger import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes
 from model.rig.file import example_rig_path as example_rig_path
 from model.rig.file import load_rig as load_rig
@@ -54,8 +54,8 @@ from model.study.contrast_map import ContrastMap as ContrastMap
 from model.table.file import load_table as load_table
 from model.table.file import save_table as save_table
 from model.table.table import LocalizationTable as LocalizationTable
-from model.vibration.excitation import Tone as Tone
-from model.vibration.maps import PlateMap as PlateMap
+from model.vibration import PlateMap as PlateMap
+from model.vibration import Tone as Tone
 from registry.limits import GuardLimits as GuardLimits
 from sim.plant.excited_plate import FeltFinger as FeltFinger
 from sim.plant.excited_plate import Playback as Playback

@@ -5,8 +5,7 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.playing.contents import Layer as AmplifierLayer
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Played, layers_of
-from model.arguments import shown
-from model.errors import InputError
+from model.errors import InputError, shown
 from model.rig.rig import Rig
 
 

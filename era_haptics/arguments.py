@@ -7,9 +7,8 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from model.answer.fingers import Finger
-from model.arguments import expect, expect_number, is_whole, shown
 from model.arrays import FloatArray, Point
-from model.errors import InputError
+from model.errors import InputError, expect, expect_number, is_whole, shown
 from model.rig.rig import Rig
 
 Positions: TypeAlias = Sequence[float] | Sequence[Sequence[float]]

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from era_haptics.arguments import expect_rig
-from model.arguments import expect_path
 from model.calibration.calibrate import calibrate as fit
 from model.calibration.calibration_result import Calibration
 from model.calibration.responses import responses_of
 from model.calibration.responses_file import read_measured
 from model.diagnosis.consistency import check_consistency
-from model.progress import Progress, check_progress, unseen
+from model.errors import expect_path
+from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig
 
 

@@ -9,10 +9,9 @@ from typing import TypeAlias
 
 from era_haptics.arguments import MAX_LEVEL
 from model.answer.answer import Answer, Layer
-from model.arguments import expect_number, shown
-from model.errors import InputError
+from model.errors import InputError, expect_number, shown
 from model.rig.rig import Rig
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from era_haptics.drive import Played, layers_of
 from era_haptics.solved_plate import SolvedPlate
 from model.answer.answer import Answer
-from model.arguments import expect, is_whole, shown
 from model.arrays import FloatArray
-from model.errors import InputError
+from model.errors import InputError, expect, is_whole, shown
 from model.figures.contents_picture import contents_figure
 from model.figures.drawing import map_figure
 from model.figures.table_pictures import contrast_map_figure, layer_figure

@@ -21,9 +21,8 @@ from era_haptics.arguments import (
 from era_haptics.drive import Played, layers_of
 from model.answer.answer import Answer
 from model.answer.fingers import Placement, Stimulus, check_on_plate, together
-from model.arguments import expect_number, is_whole, shown
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
+from model.errors import InputError, expect_number, is_whole, shown
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import (
     ReducedPlate,
@@ -34,8 +33,7 @@ from model.reduction.reduced_plate import (
 from model.rig.rig import Rig
 from model.structure.attachments import check_loads, footprints_of
 from model.table.table import default_drive_frequencies
-from model.vibration.excitation import Tone
-from model.vibration.maps import PlateMap, plate_map
+from model.vibration import PlateMap, Tone, plate_map
 from sim.plant.excited_plate import Playback, play, play_signals
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
 

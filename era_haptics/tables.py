@@ -18,12 +18,10 @@ from model.answer.measures import measures as _measures
 from model.answer.plan import answer as _answer
 from model.answer.search import APART_HZ
 from model.answer.timing import Timing
-from model.arguments import expect, expect_number, shown
 from model.arrays import FloatArray
-from model.errors import InputError
-from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL
-from model.progress import Progress, check_progress, unseen
+from model.errors import InputError, expect, expect_number, shown
+from model.finger import STRONG_DB_SL, Grid
+from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig
 from model.study.contrast_map import ContrastMap, map_contrast
 from model.table.build import cached_table

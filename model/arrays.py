@@ -1,6 +1,14 @@
-"""Array types of signatures, the points of a lattice, and how near points are."""
+"""Array types of signatures, the points of a lattice, and how near points are.
 
-from typing import Any, TypeAlias
+Choices among scores that rounding cannot turn.
+
+Scores that are equal in theory, as of two places that mirror each other, differ by rounding, which
+is another one on another processor. So scores within a small distance of the best count as equal to
+it, and the first of them is chosen.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,3 +38,69 @@ def nullable(values: ArrayLike | None) -> Any:
     """Numbers for JSON, an array as lists: None in place of what is not finite or not there."""
     found = np.asarray(values, dtype=float)
     return np.where(np.isfinite(found), found, np.array(None)).tolist()
+
+
+_Item = TypeVar("_Item")
+
+NEARLY = 1e-5
+"""Distance from the best, relative to it, within which scores count as equal."""
+
+
+def best_of(scores: ArrayLike) -> int:
+    """Index of the first of the highest scores (n,)."""
+    return int(best_along(scores, axis=0))
+
+
+def best_along(scores: ArrayLike, axis: int) -> IntArray:
+    """Index of the first of the highest scores along an axis."""
+    values = np.asarray(scores)
+    return np.asarray(_are_near(values, values.max(axis=axis, keepdims=True)).argmax(axis=axis))
+
+
+def best_first(scores: ArrayLike) -> IntArray:
+    """Order of scores (n,), the highest first; of those nearly equal the first one first.
+
+    Each of a run of nearly equal scores is near its neighbours, not always near all others.
+    """
+    values = np.asarray(scores)
+    order = np.argsort(-values, kind="stable")
+    ordered = values[order]
+    run = np.concatenate([[0], np.cumsum(~_are_near(ordered[1:], ordered[:-1]))])[: len(order)]
+    return np.asarray(order[np.lexsort((order, run))])
+
+
+def _are_near(values: NDArray[Any], better: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether values are nearly as high as better ones; infinite ones are equal to themselves."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((values == better) | (values >= better - NEARLY * np.abs(better)))
+
+
+def best_few(scores: ArrayLike, count: int) -> IntArray:
+    """The first of `best_first`, up to count, without an order of the rest."""
+    values = np.asarray(scores)
+    if len(values) <= count:
+        return best_first(values)
+    least = np.partition(values, -count)[-count]
+    among = np.flatnonzero(values >= least - 2 * NEARLY * np.abs(least))
+    return np.asarray(among[best_first(values[among])[:count]])
+
+
+def best_rows(scores: ArrayLike, count: int) -> IntArray:
+    """Indices (count, ...) along the first axis of the highest scores, the highest first."""
+    left = np.array(scores)
+    found = []
+    for _ in range(count):
+        best = best_along(left, axis=0)[None]
+        np.put_along_axis(left, best, -np.inf, axis=0)
+        found.append(best)
+    return np.concatenate(found)
+
+
+def best_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> _Item:
+    """The first of the items with the highest scores."""
+    return items[best_of([score(each) for each in items])]
+
+
+def ranked_by(items: Sequence[_Item], score: Callable[[_Item], float]) -> list[_Item]:
+    """Items in the order of `best_first`."""
+    return [items[each] for each in best_first([score(each) for each in items])]

@@ -1,4 +1,7 @@
-"""Formatting of quantities and shares."""
+"""Formatting of quantities and shares.
+
+Numbers with their nouns: `1 cell`, `2 cells`.
+"""
 
 import math
 
@@ -31,3 +34,8 @@ def with_error(value: float, error: float, unit: str = "", *, sign: str = "") ->
 def percent(share: float) -> str:
     """Format a share as `12 %`; below a tenth with two digits, `1.2 %`."""
     return f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+
+
+def counted(number: int, thing: str, *, plural: str | None = None) -> str:
+    """Format a number with its noun; plural: where it is not the noun with an s."""
+    return f"{number} {thing if number == 1 else plural or f'{thing}s'}"

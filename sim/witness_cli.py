@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from model.counting import counted
 from model.errors import InputError
+from model.quantities import counted
 from registry.files import regular_file
 
 if TYPE_CHECKING:

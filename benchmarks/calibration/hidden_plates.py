@@ -26,8 +26,7 @@ from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses_csv
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.variable_projection import project_gains, row_rms
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import PlateMatrices, assemble
+from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import Era, PointLoad

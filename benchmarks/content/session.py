@@ -22,7 +22,7 @@ from controller.effects.region import Region
 from controller.play.intent import CLICK
 from model.answer.timing import Timing
 from model.config.shapes import Circle
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections

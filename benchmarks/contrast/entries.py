@@ -36,7 +36,7 @@ from model.rig.uncertainty import Uncertainty
 from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 
 FREQUENCIES_IN_HINDSIGHT = 4
 

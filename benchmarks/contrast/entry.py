@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from benchmarks.contrast.data_set import VERSION, DataSet, data_set
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from registry.wording import first_problem
 
 MAX_BYTES = 16 << 20

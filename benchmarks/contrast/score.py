@@ -14,15 +14,15 @@ import numpy as np
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
 from model.answer.answer import Layer
 from model.answer.fingers import Stimulus, together
-from model.finger.perception import decibels
-from model.progress import Progress, unseen
+from model.finger import decibels
+from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 from sim.plant.excited_plate import play
 from sim.plant.imperfections import draw_imperfections
 

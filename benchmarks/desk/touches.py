@@ -15,7 +15,7 @@ from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from sim.desk.measuring.sound_card import open_card
 
 _START = 180.0  # s; on a busy machine

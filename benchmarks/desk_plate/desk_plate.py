@@ -12,7 +12,7 @@ from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
 from model.calibration.sensor_file import WiredSensor, are_places
 from model.errors import InputError
-from model.finger.fingertip import fingertips_on
+from model.finger import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
 from sim.desk.measuring.desk import Desk
 

@@ -26,7 +26,7 @@ from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Mounted
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
-from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger import fingertip_points, fingertip_weights
 from model.identification.forward import RestingFinger, Sensor
 from model.identification.identify import identify
 from model.identification.in_service import LivePlate, PatternReport, PlateEstimate

@@ -11,7 +11,7 @@ from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD, Hidden
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger import fingertip_points, fingertip_weights
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
 from model.identification.measurement import Measurement

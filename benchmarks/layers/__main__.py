@@ -15,7 +15,7 @@ from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 
 PANEL = load_rig(RIG.parent / "glass_panel.yaml")
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)

@@ -164,8 +164,8 @@ def _felt_on(
     import numpy as np
 
     from model.answer.over_duration import DriveEnvelope, RingingUnderFingers
-    from model.finger.fingertip import fingertip_points, fingertip_weights
-    from model.vibration.excitation import Tone, base_amplitudes
+    from model.finger import fingertip_points, fingertip_weights
+    from model.vibration import Tone, base_amplitudes
 
     contents, power = answer.contents, 0.0
     steady = RingingUnderFingers(

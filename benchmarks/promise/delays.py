@@ -28,7 +28,7 @@ from model.answer.fingers import Finger, Placement, Stimulus
 from model.answer.plan import answer
 from model.arrays import FloatArray, Point
 from model.ensemble.delays import ClockErrors
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger import FINGERTIP_RADIUS
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.table import read_fingertips
 from registry import threads

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.playing.playback import Voice
 from model.arrays import FloatArray
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.rig.rig import Rig
 from sim.amplifier.clock import StraightClock
 from sim.bench.bench import Bench

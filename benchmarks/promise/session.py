@@ -34,7 +34,7 @@ from controller.play.intent import HapticIntent, Target
 from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.observer import PlayReport
 from model.answer.timing import Timing
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.opening import Wire
 from sim.plant.imperfections import draw_imperfections

@@ -19,8 +19,7 @@ from benchmarks.transients.cases import (
 from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import ComplexArray
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import contrast_db
+from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -31,7 +30,7 @@ from model.transients.knots import steady_states
 from model.transients.measures import ENDING_WINDOW, Transients
 from model.transients.shaping import Shaper
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation, base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 
 T = TypeVar("T")
 Columns = dict[str, list[float]]

@@ -7,13 +7,18 @@ import numpy as np
 
 from benchmarks.setting import random_contacts
 from model.arrays import ComplexArray
-from model.finger.fingertip import FINGERTIP_RADIUS, fingertip_points
-from model.finger.perception import STRONG_DB_SL, contrast_db, detection_threshold
+from model.finger import (
+    FINGERTIP_RADIUS,
+    STRONG_DB_SL,
+    contrast_db,
+    detection_threshold,
+    fingertip_points,
+)
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.transients.base_motion import Envelopes
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 
 FREQUENCIES = np.linspace(40, 500, 27)
 WANTED = 1.0  # m/s²

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from benchmarks.transients.cases import Case
 from model.answer.over_duration import ONSET_RAMP
 from model.arrays import FloatArray
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import contrast_db
+from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.measures import SAMPLE_RATE, Transients

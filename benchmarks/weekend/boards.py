@@ -207,7 +207,7 @@ def contrast(plate: "SolvedPlate", answer: Any) -> float:
     """Felt contrast [dB] of an answer in the steady state of a plate under its fingers."""
     import numpy as np
 
-    from model.finger.fingertip import fingertips_on
+    from model.finger import fingertips_on
 
     fingers, size = [each.finger.at for each in answer.fingers], plate.rig.plate
     points, weights = fingertips_on(np.array(fingers), length=size.length, width=size.width)
@@ -225,7 +225,7 @@ def sensed(
     """Felt contrast [dB]; response: of a frequency, (e, k p) [m/s²] under k fingertips."""
     import numpy as np
 
-    from model.finger.perception import detection_threshold
+    from model.finger import detection_threshold
 
     names = [each.name for each in rig.eras]
     squares: FloatArray = np.zeros(weights.size)
@@ -242,7 +242,7 @@ def felt_contrast(felt: "FloatArray", weights: "FloatArray") -> float:
     """Contrast [dB] of what is felt (k, p), relative to the threshold, the target first."""
     import numpy as np
 
-    from model.finger.perception import decibels
+    from model.finger import decibels
 
     return float(decibels(felt[0] @ np.reshape(weights, felt.shape)[0] / felt[1:].max()))
 
@@ -251,7 +251,7 @@ def levels(plate: "SolvedPlate", frequencies: Sequence[float]) -> dict[float, fl
     """Least level [dB SL] over the board but its edges, under a finger, all exciters in phase."""
     import numpy as np
 
-    from model.finger.perception import decibels, detection_threshold
+    from model.finger import decibels, detection_threshold
 
     rig = plate.rig
     x, y = (

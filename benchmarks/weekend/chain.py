@@ -36,7 +36,7 @@ from model.calibration.responses_file import write_responses
 from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
-from model.finger.fingertip import fingertips_on
+from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.page import write_parts
 from benchmarks.weekend.boards import BOARDS, PAGE
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 
 AIR, DISTANCE, REFERENCE = 1.2, 1.0, 20e-6  # kg/m³, m, Pa
 LEVELS, FREQUENCIES = (20, 40), np.arange(100.0, 251.0, 10.0)  # dB SL, Hz

@@ -18,8 +18,7 @@ from controller.api.jsonrpc import ErrorCode, RpcError, read_error
 from controller.api.registered import METHODS
 from controller.api.schema import API_VERSION, Message, TouchPoint
 from drivers.errors import LinkError
-from model.arguments import shown
-from model.errors import InputError
+from model.errors import InputError, shown
 from registry.wording import first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second

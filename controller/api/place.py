@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from controller.api.client_protocol import Unreachable
-from model.arguments import expect_path
+from model.errors import expect_path
 
 SYSTEM_SOCKET = Path("/run/era-haptics/daemon.sock")
 """The socket of the system service."""

@@ -22,16 +22,14 @@ from controller.content.rendition import (
 from model.answer.answer import Answer
 from model.answer.fingers import Finger, Stimulus, check_level
 from model.answer.plan import answer
-from model.arrays import FloatArray
-from model.choice import best_of
+from model.arrays import FloatArray, best_of
 from model.drive_modes import DRIVE_MODES
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, over_threshold
+from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.quantities import percent
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.from_rest import from_rest
-from model.vibration.excitation import base_amplitudes
+from model.vibration import base_amplitudes
 
 TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010
 """What is within so many dB of what is expected is kept; that counts within so many dB of

@@ -13,7 +13,7 @@ from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.effects.region import ON_RELEASE, Region
 from controller.play.intent import Target, band_problem
-from model.progress import Progress, unseen
+from model.processes import Progress, unseen
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 

@@ -20,10 +20,9 @@ from controller.play.joint_answer import fingers_of, selection_of
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import MIN_CONTRAST_DB, Answer
 from model.answer.plan import answer
-from model.arrays import FloatArray
-from model.choice import best_of
-from model.counting import counted
-from model.progress import Progress, unseen
+from model.arrays import FloatArray, best_of
+from model.processes import Progress, unseen
+from model.quantities import counted
 from model.table.table import LocalizationTable
 
 MAX_PAIRS, MAX_TRIPLES = 150, 150

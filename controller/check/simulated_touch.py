@@ -13,18 +13,16 @@ from controller.play.joint_answer import answered
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.exposure import exposures
-from model.arrays import FloatArray
-from model.choice import NEARLY
+from model.arrays import NEARLY, FloatArray
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, over_threshold
+from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Bases, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import base_amplitudes
+from model.vibration import base_amplitudes
 
 Position = tuple[float, float]
 

@@ -10,9 +10,8 @@ import typer
 from controller.cli.play import pattern_of
 from model.commands.options import JsonOption, QuietOption, print_report
 from model.config.points import parse_point
-from model.counting import counted
 from model.errors import InputError
-from model.quantities import percent
+from model.quantities import counted, percent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,8 +14,8 @@ from model.commands.options import (
     print_report,
     seed_of_plate,
 )
-from model.counting import counted
 from model.errors import InputError
+from model.quantities import counted
 
 if TYPE_CHECKING:
     from controller.demo.touch_row import TouchRow

@@ -309,7 +309,7 @@ def _urls_of(rig: "Rig", texts: Sequence[str]) -> dict[str, str]:
 
 def measured_line(rig: "Rig", measured: "MeasuredPlate") -> str:
     """What was measured, in one line."""
-    from model.counting import counted
+    from model.quantities import counted
 
     measurement = measured.measurement
     low, high = measurement.frequencies[0], measurement.frequencies[-1]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from model.commands.options import JsonOption, print_report
-from model.counting import counted
+from model.quantities import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

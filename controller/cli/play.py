@@ -99,8 +99,7 @@ def _simulate(
 
     from controller.check.content_check import play_content
     from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
-    from model.finger.fingertip import fingertip_weights
-    from model.finger.perception import STRONG_DB_SL
+    from model.finger import STRONG_DB_SL, fingertip_weights
     from model.table.file import load_table
 
     check_ending(output, ".wav", what="a sound")

@@ -14,8 +14,8 @@ from controller.cli.identify import (
     rig_of_file,
 )
 from model.commands.options import JsonOption, print_report
-from model.counting import counted
 from model.errors import InputError
+from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.calibration.responses import Responses

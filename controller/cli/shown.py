@@ -8,7 +8,7 @@ from controller.api.methods import StatusResult
 from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
 from drivers.protocol.table import READINGS
-from model.counting import counted
+from model.quantities import counted
 
 
 def show_event(event: Notification, *, ahead: float) -> str:

@@ -20,7 +20,7 @@ from controller.content.json_file import ContentSection, Entries, read_json, unk
 from controller.content.mixing import Segment, mixed
 from controller.content.pattern import Curve, Pattern, Transient
 from model.config.sections import Validation
-from model.counting import counted
+from model.quantities import counted
 
 _EVENT = {
     "HapticIntensity": (0.0, 1.0, 1.0),

@@ -21,7 +21,7 @@ from controller.content.wav import course_of
 from model.arrays import FloatArray
 from model.config.document import KeyPath
 from model.config.sections import Validation
-from model.counting import counted
+from model.quantities import counted
 
 _VIBRATION = ("Other", "Acceleration", "Vibration", "Vibrotactile", "Vibrotactile Texture")
 _RATE = 2000  # Hz, at which a curve is sampled

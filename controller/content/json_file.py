@@ -13,7 +13,7 @@ from pydantic import ConfigDict, GetCoreSchemaHandler
 from controller.content.format import MAX_POINTS, refusal
 from model.config.document import Document, KeyPath, decoded, key_name
 from model.config.sections import Section
-from model.counting import counted
+from model.quantities import counted
 
 _MAX_SIZE = 2 << 20  # bytes
 _MAX_LEVELS = 20

@@ -14,9 +14,8 @@ from controller.content.pattern import Pattern, Transient, along
 from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
 from model.answer.course import Course
 from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
-from model.arrays import FloatArray
-from model.choice import best_of
-from model.finger.perception import decibels
+from model.arrays import FloatArray, best_of
+from model.finger import decibels
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.swings import CLICKS_APART
 

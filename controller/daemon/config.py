@@ -29,7 +29,7 @@ from model.config.document import ConfigError, Document, read_document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Validation
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 from model.identification.learned_file import was_learned
 from model.rig.file import rig_of
 from model.rig.kind import clock_costs, gain_notes, whole_url

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, Strict
 from model.config.sections import Quantity, Section
 from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 from model.rig.key_types import Identifier
 
 MAX_LAYOUTS = 64

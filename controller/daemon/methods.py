@@ -64,7 +64,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.host.feeding import Stopped
 from model.compiled.kernels import why_slow
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 from model.table.table import LocalizationTable
 from registry import threads
 from registry.plugins import did_you_mean

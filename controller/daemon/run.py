@@ -22,8 +22,8 @@ from drivers.errors import DriverError
 from drivers.trace import tracing
 from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
-from model.counting import counted
 from model.errors import InputError
+from model.quantities import counted
 from model.table.build import cached_table
 from model.table.file import load_table
 from model.table.table import LocalizationTable

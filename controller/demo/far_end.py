@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from controller.demo.touch_row import FingerVibration, Position
 from controller.process.child import ended
 from drivers.errors import LinkError
-from model.finger.perception import DEFAULT_THRESHOLD
+from model.finger import DEFAULT_THRESHOLD
 from registry.wording import first_problem
 
 WATCHDOG = 2.0

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from controller.demo.touch_row import TouchRow
 from model.answer.answer import Sensation
 from model.answer.fingers import Finger
-from model.choice import ranked_by
+from model.arrays import ranked_by
 from model.figures import save_figure
 from model.figures.contents_picture import contents_figure
 from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels

@@ -8,7 +8,7 @@ import numpy as np
 
 from model.answer.answer import Layer
 from model.arrays import FloatArray
-from model.finger.perception import (
+from model.finger import (
     DEFAULT_THRESHOLD,
     contrast_db,
     mean_level_db_sl,

@@ -16,15 +16,14 @@ from drivers.host.reports import CLOCK_SETTLING
 from drivers.host.sensors import Reading, measure_tones
 from drivers.opening import Lines
 from drivers.protocol.timing import HEARTBEAT
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.calibration.responses import Responses
-from model.choice import best_first, best_of
 from model.ensemble.delays import MAX_HELD
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
-from model.progress import Progress, unseen
+from model.processes import Progress, unseen
 from model.rig.rig import Rig
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from registry import threads
 
 LEVEL = 0.1

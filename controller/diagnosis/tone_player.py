@@ -15,7 +15,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.protocol.table import QUANTITIES
 from model.rig.rig import Rig
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 RAMP = 0.05  # s; long enough not to excite the plate at onset or end
 _LEVEL_TOLERANCE = 0.02  # relative; more than any amplifier rounds

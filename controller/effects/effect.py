@@ -16,7 +16,7 @@ from model.answer.fingers import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
 from model.arrays import FloatArray
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY, LEVEL
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"
 """The level `as strong as the neighbours allow`."""

@@ -17,7 +17,7 @@ from controller.play.intent import MAX_DB_SL, Pulse
 from controller.sources.contacts import Contact
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 
 _FREQUENCIES = tuple(float(each) for each in range(40, 501, 10))  # Hz; until a table is known
 

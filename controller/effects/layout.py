@@ -11,7 +11,7 @@ from controller.effects.kinds import BUILT_IN
 from controller.effects.region import USES, Region
 from controller.play.intent import Band, band_problem
 from model.arrays import FloatArray
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 
 BUZZ = "buzz"
 """Name of the effect that plays without a layout."""

@@ -22,7 +22,7 @@ from model.config.sections import Quantity, Section, Validation
 from model.config.shapes import ShapedSection
 from model.config.units import LEVEL
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 from model.rig.key_types import Identifier
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean

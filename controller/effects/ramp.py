@@ -16,7 +16,7 @@ from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
 from model.config.sections import Quantity
 from model.config.units import TIME
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 
 RAMP_STEP_DB = 2.0
 """Step between levels of a ramp [dB], below the just noticeable difference."""

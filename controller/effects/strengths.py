@@ -10,9 +10,8 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from controller.effects.gains import GainDb, SourceName
-from model.arguments import shown
 from model.config.document import read_bytes
-from model.errors import InputError
+from model.errors import InputError, shown
 from model.files.array_file import whole_or_nothing
 
 MAX_NAMES = 64

@@ -19,7 +19,7 @@ from controller.api.jsonrpc import request_line
 from controller.api.link import DaemonLink
 from controller.api.schema import PlayedTone
 from model.arrays import ComplexArray, lattice
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import parse_rig
 from model.rig.rig import Rig

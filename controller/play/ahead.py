@@ -18,8 +18,7 @@ from model.answer.answer import HELD_BACK, MIXED, OWN, Answer, Sensation, verdic
 from model.answer.fingers import MUST, Finger
 from model.answer.over_duration import ONSET_RAMP
 from model.arrays import Point
-from model.finger import MAX_CONTACTS
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS
 from model.structure.attachments import MIN_LOAD
 from model.structure.plate import Plate
 

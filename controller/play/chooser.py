@@ -25,7 +25,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer
 from model.answer.search import APART_HZ
 from model.answer.strength import scaled
-from model.choice import NEARLY
+from model.arrays import NEARLY
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text

@@ -12,8 +12,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
 from model.answer.course import Course
 from model.answer.fingers import Placement
-from model.finger.fingertip import fingertip_points
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold, fingertip_points
 from model.table.table import LocalizationTable
 
 Targets = tuple[tuple[Contact, Target], ...]

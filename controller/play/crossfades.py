@@ -21,10 +21,10 @@ from model.answer.answer import SAME_LEVEL, Answer
 from model.answer.plan import worst_of
 from model.answer.promised import with_tones
 from model.answer.search import APART_HZ
-from model.choice import NEARLY
+from model.arrays import NEARLY
 from model.drive_modes import UNRESTRICTED
 from model.table.table import LocalizationTable
-from model.vibration.excitation import base_amplitudes
+from model.vibration import base_amplitudes
 
 WORTH, WORTH_OF_WEIGHTS = 2.0, 0.5
 """How much more [dB] the worst finger must be promised for other frequencies, or weights alone."""

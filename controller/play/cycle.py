@@ -25,7 +25,7 @@ from drivers.errors import (
 from drivers.host.group import Group
 from drivers.protocol.timing import HEARTBEAT
 from model.answer.answer import Limits
-from model.counting import counted
+from model.quantities import counted
 from model.structure.plate import Plate
 from registry import threads
 

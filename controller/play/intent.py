@@ -13,9 +13,8 @@ import numpy as np
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.course import Course
 from model.answer.fingers import SHAPED_FROM
-from model.arrays import FloatArray
-from model.choice import best_of
-from model.finger.perception import STRONG_DB_SL
+from model.arrays import FloatArray, best_of
+from model.finger import STRONG_DB_SL
 
 _MIN_WAIT = 0.001  # s
 

@@ -31,7 +31,7 @@ from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulu
 from model.answer.plan import answer
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation, base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2

@@ -19,6 +19,7 @@ from controller.play.pieces import Piece
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
+from model import vibration as physics
 from model.answer import answer
 from model.answer.fingers import Placement
 from model.answer.over_duration import FADE_RAMP
@@ -26,7 +27,6 @@ from model.answer.timing import Timing
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope, Envelopes
-from model.vibration import excitation as physics
 
 Drive = Mapping[str, Tone]
 """What ERAs play, by name, without silent ones."""

@@ -16,15 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.figures.paper import SWEEP, PaperFigure, pair_map, paper_figures, with_stiffness
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig
 from model.rig.layouts import diagonal_pair
 from model.rig.rig import Rig
 from model.structure.plate import Plate
-from model.vibration.excitation import NULL_SHARE, G, find_nulls
-from model.vibration.natural_modes import natural_modes
+from model.vibration import NULL_SHARE, G, find_nulls, natural_modes
 
 RIG = Path(__file__).parents[1] / "paper_plate.yaml"
 

@@ -15,12 +15,12 @@ from model.answer.search import Contents, Tones
 from model.arrays import Float32Array, FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
-from model.finger.perception import decibels
+from model.finger import decibels
 from model.structure.attachments import Source
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes
 from model.transients.swings import Swing
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
 """Promised contrast from which a vibration is served, and from which it is a finger's own."""

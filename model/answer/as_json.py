@@ -18,7 +18,7 @@ from model.answer.search import APART_HZ
 from model.answer.timing import Timing
 from model.arrays import Point, nullable
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL, highest_measured
+from model.finger import STRONG_DB_SL, highest_measured
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes
 from registry.wording import first_problem

@@ -8,13 +8,10 @@ from numbers import Real
 import numpy as np
 
 from model.answer.course import Course
-from model.arguments import expect_number, shown
 from model.arrays import Point
 from model.config.points import in_metres
-from model.errors import InputError
-from model.finger import MAX_CONTACTS
-from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.perception import STRONG_DB_SL
+from model.errors import InputError, expect_number, shown
+from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS, STRONG_DB_SL
 from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 

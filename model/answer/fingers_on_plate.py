@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, IntArray, Point
-from model.drive_modes.forms import Forms
+from model.drive_modes import Forms
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import Drawing, over_fingertips
 from model.ensemble.touched_by_kernel import touch

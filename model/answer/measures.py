@@ -9,8 +9,7 @@ from model.answer.answer import IMPERCEPTIBLE_DB_SL, QUIET, Answer, Layer
 from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import FloatArray, lattice
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, is_beyond
+from model.finger import decibels, fingertip_points, fingertip_weights, is_beyond
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 

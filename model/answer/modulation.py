@@ -16,9 +16,8 @@ from model.answer.answer import MIN_CONTRAST_DB, SAME_LEVEL, Answer
 from model.answer.promised import share_stroke, with_tones
 from model.answer.search import APART_HZ, Stream, Tones
 from model.answer.search_in_c import choose_tones
-from model.arrays import FloatArray
-from model.choice import NEARLY, best_of
-from model.finger.perception import decibels
+from model.arrays import NEARLY, FloatArray, best_of
+from model.finger import decibels
 from model.table.table import LocalizationTable
 
 _SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands

@@ -20,8 +20,8 @@ from model.answer.course import SILENCE, STRONGEST, Course
 from model.answer.fingers import SHAPED_FROM
 from model.answer.search import Contents
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
-from model.drive_modes.forms import Drive, Forms
-from model.finger.perception import detection_threshold
+from model.drive_modes import Drive, Forms
+from model.finger import detection_threshold
 from model.structure.attachments import fingertip_loads
 from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import rise

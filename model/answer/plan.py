@@ -38,11 +38,10 @@ from model.answer.strength import (
     scaled,
     with_gains,
 )
-from model.arrays import Point
-from model.choice import NEARLY, best_by
+from model.arrays import NEARLY, Point, best_by
 from model.drive_modes import UNRESTRICTED, checked_mode
 from model.errors import InputError
-from model.finger.perception import FELT_DB_SL, STRONG_DB_SL, decibels
+from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_SEPARATE = 5

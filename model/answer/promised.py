@@ -11,10 +11,9 @@ from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.over_duration import RingingUnderFingers, on_drawn_plates, shaped_gain
 from model.answer.search import PROMISED_PERCENTILE, Contents, Tones
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import NEARLY
+from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray
 from model.ensemble.draws import PROMISED_DRAWS, percentile
-from model.finger.perception import decibels
+from model.finger import decibels
 from model.table.table import LocalizationTable
 
 MIN_RAISED_CONTRAST_DB = 6.0

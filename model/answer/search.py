@@ -24,11 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.answer.course import Course
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, Point
-from model.choice import NEARLY
+from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
 from model.drive_modes import UNRESTRICTED
 from model.structure.attachments import Source
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 
 PROMISED_PERCENTILE = 9
 """Percentile of the draws that is promised.

@@ -7,6 +7,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from model import drive_modes
 from model.answer.fingers_on_plate import CENTRE_AND_RIM, MAX_FINGERS_BY_POINT, MAX_VARIANCE_FINE
 from model.answer.search import (
     KEPT,
@@ -30,8 +31,7 @@ from model.compiled.structures import (
     TouchedPlates,
     WeightSearch,
 )
-from model.drive_modes import UNRESTRICTED, coherent
-from model.drive_modes.forms import LEVEL_MARGIN
+from model.drive_modes import LEVEL_MARGIN, UNRESTRICTED
 from model.ensemble.draws import JUDGING_DRAWS, PERCENTILE, PROMISED_DRAWS
 from model.ensemble.touched_by_kernel import draws_structure, plates_structure
 from model.ensemble.touched_plate import RIDGE
@@ -134,11 +134,11 @@ def _kept_of(table: LocalizationTable) -> _Kept:
     rules = Rules(
         *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
         *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.frequency > 0),
-        *(variance, RIDGE, LEVEL_MARGIN, coherent.NEARLY_HIGHEST, REACHED),
+        *(variance, RIDGE, LEVEL_MARGIN, drive_modes.NEARLY_HIGHEST, REACHED),
         *(PERCENTILE, PROMISED_PERCENTILE),
-        *(coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS),
-        *(_method(coherent.ONE_FINGER), _method(coherent.SEVERAL)),
-        (WeightSearch * 3)(*map(_method, coherent.WITHIN_STROKE)),
+        *(drive_modes.TARGET_STARTS, drive_modes.ALIGNMENTS, drive_modes.REALIGNMENTS),
+        *(_method(drive_modes.ONE_FINGER), _method(drive_modes.SEVERAL)),
+        (WeightSearch * 3)(*map(_method, drive_modes.WITHIN_STROKE)),
         1 + max(groups, default=0),
         len(table.threshold_sets),
     )
@@ -159,8 +159,8 @@ def _kept_of(table: LocalizationTable) -> _Kept:
     return plates_structure(table.on_eras), given_raster(table), rules, {}
 
 
-def _method(of: coherent.LawsonMethod) -> WeightSearch:
+def _method(of: drive_modes.LawsonMethod) -> WeightSearch:
     return WeightSearch(
         *(of.steps, of.is_limited, of.variance, of.gain),
-        *(coherent.LEVEL_RESERVE, coherent.MAX_GROWTH, coherent.MAX_MULTIPLIER),
+        *(drive_modes.LEVEL_RESERVE, drive_modes.MAX_GROWTH, drive_modes.MAX_MULTIPLIER),
     )

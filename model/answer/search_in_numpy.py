@@ -15,19 +15,28 @@ from model.answer.fingers_on_plate import (
 from model.answer.over_duration import RingingUnderFingers, on_drawn_plates
 from model.answer.promised import promised
 from model.answer.search import KEPT, MISSING, PRUNING_STEP, REACHED, Contents, Stream, Tones
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import best_few, best_first, best_of
-from model.drive_modes import UNRESTRICTED
-from model.drive_modes.coherent import (
+from model.arrays import (
+    Complex64Array,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    best_few,
+    best_first,
+    best_of,
+)
+from model.drive_modes import (
     NEARLY_HIGHEST,
+    UNRESTRICTED,
+    Drive,
+    Forms,
+    find_switched,
+    max_sensation_switched,
     search,
     search_all,
     search_to_level,
 )
-from model.drive_modes.forms import Drive, Forms
-from model.drive_modes.switched import find_switched, max_sensation_switched
 from model.ensemble.draws import JUDGING_DRAWS, percentile
-from model.finger.perception import decibels
+from model.finger import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
 MAX_BY_POINT = 8

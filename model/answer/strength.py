@@ -8,7 +8,7 @@ import numpy as np
 from model.answer.answer import IMPERCEPTIBLE_DB_SL, Answer, Limits, amplitudes_of
 from model.answer.promised import share_stroke, with_tones
 from model.arrays import FloatArray
-from model.finger.perception import decibels
+from model.finger import decibels
 from model.table.table import LocalizationTable
 
 _SILENT_DB = -60.0  # a gain by which a content is not felt

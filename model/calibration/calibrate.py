@@ -10,7 +10,7 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_of
 from model.calibration.calibration_result import (
     MAX_FIT_ERROR,
     MAX_OUTLIERS,
@@ -36,11 +36,10 @@ from model.calibration.responses import (
 )
 from model.calibration.sensed_plate import sensed_plate
 from model.calibration.variable_projection import responses_of, row_rms
-from model.choice import best_of
 from model.errors import InputError
 from model.identification.held_out import SHARE, relative_rms
 from model.identification.parameters import KINDS
-from model.progress import Progress, unseen
+from model.processes import Progress, unseen
 from model.quantities import in_display_unit
 from model.rig.rig import Rig
 

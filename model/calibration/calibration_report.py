@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from model.calibration.calibration_result import Calibration, FittedParameter
-from model.counting import counted
 from model.identification.fit_report import quality_rows, value_rows
-from model.quantities import in_display_unit, percent, with_error
+from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig
 
 

@@ -7,8 +7,8 @@ import typer
 
 from model.commands.fitted_rig_cli import check_rig_output, finish, write_fitted_rig
 from model.commands.options import JsonOption, MeshOption, RigArgument, Stopwatch, progress_bar
-from model.counting import counted
 from model.files.replacing import check_picture
+from model.quantities import counted
 
 _NO_FIT = (
     "the fit must predict the measurement within 25 %; no rig is written. Check that it is this "

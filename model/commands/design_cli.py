@@ -19,9 +19,9 @@ from model.commands.options import (
     progress_bar,
 )
 from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
-from model.counting import counted
 from model.errors import InputError
 from model.finger import MAX_CONTENTS
+from model.quantities import counted
 
 design_app = typer.Typer()
 

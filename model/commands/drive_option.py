@@ -4,10 +4,9 @@ import math
 import re
 from collections.abc import Sequence
 
-from model.arguments import expect_between
-from model.errors import InputError
+from model.errors import InputError, expect_between
 from model.rig.rig import Rig
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from registry.plugins import did_you_mean
 
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"

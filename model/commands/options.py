@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from model.errors import InputError
-from model.progress import Progress
+from model.processes import Progress
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]

@@ -50,7 +50,7 @@ def modes(
     The plate is undamped; rigid modes of a free plate are left out.
     """
     from model.rig.file import load_rig
-    from model.vibration.natural_modes import natural_modes
+    from model.vibration import natural_modes
 
     rig = load_rig(rig_file, mesh=mesh)
     with Stopwatch() as timed:
@@ -106,8 +106,8 @@ def plate_map(
     from model.commands.drive_option import beyond_limits, parse_drives
     from model.rig.file import load_rig
     from model.structure.support import support_problem
-    from model.vibration.excitation import G
-    from model.vibration.maps import plate_map as solve
+    from model.vibration import G
+    from model.vibration import plate_map as solve
 
     inches = figure_size(size)
     if output is not None:
@@ -127,7 +127,7 @@ def plate_map(
         title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output, inches=inches)
-    from model.choice import best_of
+    from model.arrays import best_of
 
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
     rows = [
@@ -170,7 +170,7 @@ def convergence(
     Print errors of natural frequencies and of responses.
     """
     from model.rig.file import load_rig
-    from model.vibration.convergence import (
+    from model.vibration import (
         FOOT,
         MOVED,
         default_frequencies,

@@ -21,7 +21,6 @@ from model.commands.options import (
     progress_bar,
 )
 from model.config.points import parse_frequencies, parse_pair, parse_point
-from model.counting import counted
 from model.errors import InputError
 from model.files.replacing import (
     begins_with,
@@ -30,6 +29,7 @@ from model.files.replacing import (
     check_place,
     check_replaceable,
 )
+from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.spectral.mesh import PlateMesh
@@ -154,7 +154,7 @@ def contrast_map(
     as_json: JsonOption = False,
 ) -> None:
     """Map the promised contrast of every place to given quiet fingers."""
-    from model.finger.grid import Grid
+    from model.finger import Grid
     from model.study.contrast_map import map_contrast
     from model.table.file import load_table
 
@@ -240,7 +240,7 @@ def build(
     """Solve the plate and write its table."""
     from model.compiled.kernels import why_slow
     from model.drive_modes import checked_mode
-    from model.finger.grid import Grid
+    from model.finger import Grid
     from model.rig.file import load_rig
     from model.table.build import TableProblem, solve_table
     from model.table.file import ZIP, save_table

@@ -14,9 +14,9 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.counting import counted
 from model.errors import InputError
 from model.files.replacing import begins_with, check_picture
+from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.study.promise_at_sensors import MeasuredVerification
@@ -153,7 +153,7 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
 
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
-    from model.finger.perception import FELT_DB_SL
+    from model.finger import FELT_DB_SL
     from model.study.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:

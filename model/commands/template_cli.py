@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from model.commands.options import JsonOption, RigArgument, print_report
-from model.counting import counted
 from model.files.replacing import check_picture
+from model.quantities import counted
 
 
 class Side(StrEnum):

@@ -1,4 +1,4 @@
-/* Choices that rounding cannot turn, as of `model.choice`, and percentiles. */
+/* Choices that rounding cannot turn, as of `model.arrays`, and percentiles. */
 #ifndef CHOICE_H
 #define CHOICE_H
 

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from model.cache_folder import cache_folder
+from model.caching import cache_folder
 from model.errors import InputError
 
 _COMPILERS = ("cc", "gcc", "clang")

@@ -1,4 +1,4 @@
-/* Weights of all ERAs at one frequency for the targets of one content: `model.drive_modes.coherent` in C. */
+/* Weights of all ERAs at one frequency for the targets of one content: `model.drive_modes` in C. */
 #ifndef SEARCH_H
 #define SEARCH_H
 

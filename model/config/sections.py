@@ -20,7 +20,7 @@ from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schem
 
 from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
 from model.config.units import Dimension, quantity, shown
-from model.counting import counted
+from model.quantities import counted
 from registry.plugins import did_you_mean
 from registry.wording import reworded
 

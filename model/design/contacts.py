@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import ConfigDict, Field, Strict
 
-from model.arrays import FloatArray, IntArray, least_gap
-from model.choice import best_of
+from model.arrays import FloatArray, IntArray, best_of, least_gap
 from model.config.document import read_document
 from model.config.sections import Quantity, Section, Validation
 from model.config.shapes import (

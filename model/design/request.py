@@ -6,16 +6,6 @@ from functools import partial
 from os import PathLike
 from typing import Any
 
-from model.arguments import (
-    MAX_VALUE,
-    expect,
-    expect_between,
-    expect_number,
-    expect_path,
-    is_whole,
-    shown,
-)
-from model.cluster import on_cluster
 from model.design.area import EDGE, area_of
 from model.design.contacts import contact_rule
 from model.design.problem import DEFAULT_APART, DEFAULT_LOWEST, DesignProblem, supported_layouts
@@ -27,9 +17,17 @@ from model.design.run import (
     rank_layouts,
     search_layouts,
 )
-from model.errors import InputError
-from model.processes import on_processes
-from model.progress import Progress, check_progress, unseen
+from model.errors import (
+    MAX_VALUE,
+    InputError,
+    expect,
+    expect_between,
+    expect_number,
+    expect_path,
+    is_whole,
+    shown,
+)
+from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.rig.rig import Rig
 from model.structure.support import MIN_RIGID_BODY_FREQUENCY
 

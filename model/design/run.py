@@ -13,17 +13,15 @@ import numpy as np
 
 from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
-from model.arrays import FloatArray, IntArray
-from model.choice import best_by, best_first
+from model.arrays import FloatArray, IntArray, best_by, best_first
 from model.config.document import Document
 from model.design.layout_keys import layout_keys
 from model.design.problem import DesignProblem, NamedLayouts
 from model.design.search import LayoutSearch, ScoredLayout
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
-from model.finger.perception import STRONG_DB_SL
-from model.processes import on_processes
-from model.progress import Progress, unseen
+from model.finger import STRONG_DB_SL
+from model.processes import Progress, on_processes, unseen
 from model.rig.file import rig_of
 from model.rig.from_keys import stated
 from model.rig.rig import Rig
@@ -42,7 +40,7 @@ CHUNK = 100
 """Given layouts that are scored together, about a second of work."""
 
 Machines: TypeAlias = Callable[..., Iterator[tuple[int, Any]]]
-"""Solves tasks: `model.processes.on_processes` or `model.cluster.on_cluster` somewhere."""
+"""Solves tasks: `model.processes.on_processes` or `model.processes.on_cluster` somewhere."""
 
 _HERE: Machines = partial(on_processes, 1)
 

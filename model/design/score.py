@@ -1,6 +1,6 @@
 """A fast score of a layout: expected contrast over sampled contact sets.
 
-As answers are found (`model.ensemble.touched_plate`, `model.drive_modes.coherent`), at a few
+As answers are found (`model.ensemble.touched_plate`, `model.drive_modes`), at a few
 frequencies, from the receptances of the free plate, and with each finger loading the plate where it
 rests: what it changes at the others is left out, so that all is computed once for each finger. With
 ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D and its points p:
@@ -25,13 +25,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.choice import best_rows
+from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_rows
 from model.ensemble.attached_plate import mounts_of
 from model.ensemble.touched_plate import expected_power, power_of
-from model.finger.fingertip import FIVE_POINTS, fingertips_on
-from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL, detection_threshold
+from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.structure.actuators import Actuator

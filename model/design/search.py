@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import FloatArray
-from model.choice import best_by
+from model.arrays import FloatArray, best_by
 from model.design import problem as design_problem
 from model.design.area import ANYWHERE, area_of
 from model.design.problem import MIN_SUPPORTING, DesignProblem

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtr
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_by, best_of
 from model.calibration.responses import Responses, typical
 from model.calibration.sensed_plate import STARTS, SensedPlate
 from model.calibration.variable_projection import modal_assurance
-from model.choice import best_by, best_of
 
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import chdtrc
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_by
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.calibration.variable_projection import (
@@ -28,9 +28,8 @@ from model.calibration.variable_projection import (
     responses_of,
     row_rms,
 )
-from model.choice import best_by
 from model.diagnosis.plate_match import FALSE_ALARM, Match, match_plate
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.least_squares import Linearization
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad

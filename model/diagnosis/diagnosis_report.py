@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from model.choice import best_of
-from model.counting import counted
+from model.arrays import best_of
 from model.diagnosis.beyond_tolerances import BeyondTolerances
 from model.diagnosis.causes import Explanation
 from model.diagnosis.exchanged_sensors import ExchangedSensors, ReversedAxes
@@ -13,7 +12,7 @@ from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
 from model.diagnosis.resonance_meaning import MisreadResonance
 from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
 from model.identification.fit_report import value_rows
-from model.quantities import in_display_unit, percent
+from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verify import MIN_KEPT_SHARE
 

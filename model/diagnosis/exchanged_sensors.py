@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_by
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.calibration.variable_projection import project_gains, row_rms
-from model.choice import best_by
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.quantities import percent
 from model.rig.rig import Rig

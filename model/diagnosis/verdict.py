@@ -8,10 +8,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, best_by, best_of
 from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
 from model.calibration.sensed_plate import SensedPlate, plate_of
-from model.choice import best_by, best_of
 from model.diagnosis.assignment import (
     ChannelPhase,
     ShapeMatch,

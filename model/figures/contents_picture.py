@@ -12,8 +12,7 @@ from matplotlib.patches import Circle
 from model.answer.answer import OWN_CONTRAST_DB, Layer, Sensation, verdict_shown
 from model.arrays import FloatArray, lattice
 from model.figures.drawing import label_plate, raster
-from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.perception import sensation_level
+from model.finger import FINGERTIP_RADIUS, sensation_level
 from model.table.table import LocalizationTable
 
 COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.structure.plate import Plate
-from model.vibration.excitation import G
-from model.vibration.maps import PlateMap
+from model.vibration import G, PlateMap
 
 COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"

@@ -14,20 +14,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from model.arrays import FloatArray, lattice
-from model.choice import best_by, best_of
+from model.arrays import FloatArray, best_by, best_of, lattice
 from model.errors import InputError
 from model.figures.drawing import MapPanel, draw_eras, label_plate, maps_figure, raster
 from model.files.csv_file import Columns
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike, diagonal_pair, edge_pair
 from model.rig.rig import Rig
 from model.structure.actuators import Actuator
 from model.structure.plate import Plate
-from model.vibration.excitation import G, Tone
-from model.vibration.maps import plate_map
-from model.vibration.natural_modes import natural_modes
+from model.vibration import G, Tone, natural_modes, plate_map
 
 SWEEP = np.arange(60.0, 321.0, 10.0)
 """The 27 frequencies [Hz] of figures 10 and 11: they hold every one the paper names."""

@@ -18,14 +18,12 @@ from model.answer.plan import query
 from model.arrays import FloatArray, Point, lattice
 from model.errors import InputError
 from model.figures.drawing import COLORS, draw_eras, label_plate
-from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.grid import Grid
-from model.finger.perception import FELT_DB_SL, sensation_level
+from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, Grid, sensation_level
 from model.study.contrast_map import ContrastMap
 from model.study.overview import Overview
 from model.study.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 _CONTRAST = "promised felt contrast / dB"
 

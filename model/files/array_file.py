@@ -19,7 +19,7 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arguments import shown
+from model.errors import shown
 from registry.files import open_regular
 
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]

@@ -16,8 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arguments import MAX_VALUE
-from model.errors import InputError
+from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
 from model.files.uff import read_bytes, text_of
 from registry.plugins import did_you_mean

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arguments import MAX_VALUE
 from model.arrays import FloatArray
-from model.errors import InputError
+from model.errors import MAX_VALUE, InputError
 from model.files.array_file import whole_or_nothing
 from registry.files import read_regular
 

@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
-from model.choice import best_of
+from model.arrays import ComplexArray, FloatArray, best_of
 from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.posterior import Posterior, relevant

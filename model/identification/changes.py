@@ -21,9 +21,8 @@ import numpy as np
 from scipy import linalg
 from scipy.special import chdtrc
 
-from model.arrays import FloatArray
-from model.choice import best_of, ranked_by
-from model.finger.grid import Grid
+from model.arrays import FloatArray, best_of, ranked_by
+from model.finger import Grid
 from model.identification.least_squares import single_changes
 from model.identification.parameters import Space
 from model.identification.settled import PatternModel, State, StateUpdate, finger_covariance, update

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import FloatArray
-from model.fem.mesh import Mesh
-from model.fem.plate import element_slopes
-from model.finger.grid import Grid
+from model.fem import Mesh, element_slopes
+from model.finger import Grid
 from model.reduction.free_plate import TERMS, FreePlate
 from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.rig.rig import Rig

@@ -15,8 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.arrays import FloatArray
-from model.choice import best_by
+from model.arrays import FloatArray, best_by
 from model.identification.parameters import KINDS
 from model.identification.posterior import Posterior
 from model.identification.stages import FittedModel, Setting, chi2, fit_in_stages

@@ -17,7 +17,7 @@ from model.arrays import FloatArray
 from model.identification.derivatives import jacobian
 from model.identification.least_squares import IdentificationProblem, solve
 from model.identification.stages import FittedModel, chi2
-from model.progress import Progress, unseen
+from model.processes import Progress, unseen
 
 SHARE = 5
 """One in so many is held out."""

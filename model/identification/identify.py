@@ -15,7 +15,7 @@ from model.identification.parameters import Space
 from model.identification.posterior import Posterior
 from model.identification.stages import FittedModel, Setting, chi2
 from model.identification.values import Values, rig_with
-from model.progress import Progress, unseen
+from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from model.arrays import ComplexArray, FloatArray
-from model.choice import best_first
+from model.arrays import ComplexArray, FloatArray, best_first
 from model.identification.derivatives import jacobian
 from model.identification.forward import ForwardModel
 from model.identification.measurement import Measurement

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.identification.forward import Sensor
-from model.progress import Progress
+from model.processes import Progress
 from model.rig.rig import Rig
 
 NONLINEAR = 0.02

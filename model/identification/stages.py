@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from model.arrays import FloatArray
-from model.choice import NEARLY, best_by, ranked_by
-from model.finger.grid import Grid
+from model.arrays import NEARLY, FloatArray, best_by, ranked_by
+from model.finger import Grid
 from model.identification.derivatives import by_mass_at
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.least_squares import (

@@ -13,8 +13,15 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.fem.mesh import DOF_PER_NODE, Mesh
-from model.fem.plate import RIGID_BODY_MODES, PlateMatrices, assemble, factorise, lowest_modes
+from model.fem import (
+    DOF_PER_NODE,
+    RIGID_BODY_MODES,
+    Mesh,
+    PlateMatrices,
+    assemble,
+    factorise,
+    lowest_modes,
+)
 from model.reduction.truncation import RESIDUAL_ORDER
 from model.spectral.functions import CLASSES, deflections_by_class
 from model.spectral.local_compliance import (

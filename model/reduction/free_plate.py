@@ -30,7 +30,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.reduction.free_modes import FiniteElementModes, FreeModes, SpectralModes
 from model.reduction.truncation import RESIDUAL_ORDER, truncation_slopes, truncation_weights
 from model.spectral.mesh import PlateMesh

@@ -36,9 +36,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from model.arguments import shown
 from model.arrays import FloatArray
-from model.errors import InputError
+from model.errors import InputError, shown
 from model.files.csv_file import as_frame
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import PlateMesh

@@ -3,11 +3,10 @@
 import math
 from pathlib import Path
 
-from model.arguments import expect_path, shown
 from model.config.document import Document, parse_document, read_document
 from model.config.kinds import check_is_rig
 from model.config.sections import Validation
-from model.errors import InputError
+from model.errors import InputError, expect_path, shown
 from model.rig.checks import check_across
 from model.rig.meshes import mesh_of
 from model.rig.parts import (

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Strict
 
 from model.config.sections import Quantity
 from model.config.units import FREQUENCY, LENGTH
-from model.finger.perception import THRESHOLDS
+from model.finger import THRESHOLDS
 from model.structure.attachments import Gain
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean

@@ -10,8 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from model.arrays import FloatArray
-from model.choice import best_of
+from model.arrays import FloatArray, best_of
 from model.errors import InputError
 from model.structure.actuators import OneKind
 from model.structure.attachments import Source

@@ -13,8 +13,7 @@ from typing import Any
 
 from model.config.document import Document
 from model.errors import InputError
-from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
+from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
 from model.rig.uncertainty import BOUNDS, Uncertainty
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
@@ -48,7 +47,7 @@ class Rig:
     amplifier, whose names are supports; laminate: of which the plate is made, also where its layers
     are solved as a homogeneous one; uncertainty: of its parameters; fingertip: load of each finger
     on the plate, None for weightless ones; threshold: name of the set of detection thresholds that
-    levels are above (`model.finger.perception`); promised_thresholds: of the sets by which promises
+    levels are above (`model.finger`); promised_thresholds: of the sets by which promises
     hold, beside that one; outputs: the amplifiers whose full level is an output, to which bases
     move by their gains, not a motion;
     clock_errors: what each amplifier is taken to state of its clock [s], infinite for one that

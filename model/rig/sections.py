@@ -33,7 +33,7 @@ from model.config.units import (
     TIME,
     Dimension,
 )
-from model.finger.perception import DEFAULT_THRESHOLD, THRESHOLDS
+from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.actuators import ActuatorOfAnyKind
 from model.rig.key_types import (
     MODES,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from model.arguments import expect_between
+from model.errors import expect_between
 
 BOUNDS = {
     "gain": (0.0, 0.5),

@@ -7,7 +7,7 @@ from typing import ClassVar, Self, TypeAlias
 import numpy as np
 
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.spectral.local_compliance import edge_compliance
 from model.structure.discretisation import Discretisation
 from model.structure.plate import Plate

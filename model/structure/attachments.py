@@ -20,9 +20,8 @@ from typing import Any, ClassVar, Protocol, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from model.arguments import expect_values
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
+from model.errors import InputError, expect_values
 
 Gain: TypeAlias = tuple[float, float, float]
 """Frequency [Hz], magnitude, phase [rad]."""

@@ -24,9 +24,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from model.arguments import MAX_VALUE, expect_values
 from model.arrays import ComplexArray, FloatArray
-from model.errors import InputError
+from model.errors import MAX_VALUE, InputError, expect_values
 from model.structure.attachments import Factor, InTime, PointLoad, Source
 
 _MAX_LAG = 0.1

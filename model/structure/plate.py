@@ -36,8 +36,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from model.arguments import expect_between, expect_values
-from model.errors import InputError
+from model.errors import InputError, expect_between, expect_values
 
 if TYPE_CHECKING:
     from model.arrays import FloatArray

@@ -14,7 +14,7 @@ from model.answer.plan import answer, worst_of
 from model.arrays import FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.ensemble.delays import ClockErrors
-from model.finger.fingertip import FINGERTIP_RADIUS
+from model.finger import FINGERTIP_RADIUS
 from model.rig.rig import Rig
 from model.study.random_contacts import random_contacts
 from model.table.build import TableProblem, solve_table

@@ -12,10 +12,8 @@ from model.arrays import FloatArray, Point, nullable
 from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.csv_file import Columns, as_frame
-from model.finger.fingertip import FINGERTIP_RADIUS
-from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL
-from model.progress import Progress, unseen
+from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL, Grid
+from model.processes import Progress, unseen
 from model.study.weak_cells import contrasts_of
 from model.table.table import LocalizationTable
 

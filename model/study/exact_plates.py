@@ -28,7 +28,7 @@ from model.structure.attachments import (
 )
 from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.table.table import LocalizationTable, read_fingertips
-from model.vibration.excitation import Excitation, base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 
 
 @dataclass(frozen=True, eq=False)

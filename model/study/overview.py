@@ -10,8 +10,8 @@ import numpy as np
 from model.answer.fingers import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.finger.perception import FELT_DB_SL, highest_measured
-from model.progress import Progress, unseen
+from model.finger import FELT_DB_SL, highest_measured
+from model.processes import Progress, unseen
 from model.study.random_contacts import random_contacts
 from model.study.weak_cells import (
     Contrasts,

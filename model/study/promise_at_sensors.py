@@ -18,7 +18,7 @@ from model.answer.plan import query
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import percentile
 from model.errors import InputError
-from model.finger.perception import decibels, sensation_level
+from model.finger import decibels, sensation_level
 from model.study.exact_plates import amplitudes_on, draw_plates
 from model.study.random_contacts import are_apart
 from model.study.verify import MIN_KEPT_SHARE, PLATES

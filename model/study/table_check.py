@@ -5,7 +5,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Protocol
 
-from model.progress import Progress
+from model.processes import Progress
 from model.rig.rig import Channel, Rig
 from model.study.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable

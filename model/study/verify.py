@@ -25,10 +25,15 @@ from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.grid import Grid
-from model.finger.perception import contrast_db, decibels, detection_threshold
-from model.progress import Progress, unseen
+from model.finger import (
+    Grid,
+    contrast_db,
+    decibels,
+    detection_threshold,
+    fingertip_points,
+    fingertip_weights,
+)
+from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
@@ -41,7 +46,7 @@ from model.table.table import LocalizationTable
 from model.transients.base_motion import ramped_onset
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation, base_amplitudes, tone_fields
+from model.vibration import Excitation, base_amplitudes, tone_fields
 
 CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""

@@ -20,8 +20,7 @@ from model.answer.fingers import Placement
 from model.answer.plan import query
 from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
-from model.finger.grid import Grid
-from model.finger.perception import FELT_DB_SL, STRONG_DB_SL
+from model.finger import FELT_DB_SL, STRONG_DB_SL, Grid
 from model.structure.actuators import Actuator
 from model.structure.attachments import PointLoad
 from model.structure.plate import Plate

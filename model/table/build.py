@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 
 from model.arrays import FloatArray
-from model.cache_folder import cache_folder
+from model.caching import NUMERICS_VERSION, cache_folder, code_version
 from model.drive_modes import checked_mode
 from model.errors import InputError
 from model.files.array_file import Arrays
-from model.finger.grid import Grid
-from model.finger.perception import check_has_threshold
-from model.processes import on_processes
-from model.progress import Progress, unseen
+from model.finger import Grid, check_has_threshold
+from model.processes import Progress, on_processes, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json
@@ -35,8 +33,7 @@ from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES, load_table, save_table
 from model.table.raster import Raster
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies
-from model.version import NUMERICS_VERSION, code_version
-from model.vibration.convergence import estimate_error, finer_mesh
+from model.vibration import estimate_error, finer_mesh
 
 
 @dataclass(frozen=True, eq=False)

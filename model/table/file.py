@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from pydantic_core import to_jsonable_python
 
-from model.arguments import expect, expect_path
 from model.drive_modes import checked_mode
-from model.errors import InputError
+from model.errors import InputError, expect, expect_path
 from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
 from model.files.replacing import begins_with
-from model.finger.grid import Grid
-from model.finger.perception import check_has_threshold
+from model.finger import Grid, check_has_threshold
 from model.rig.meshes import parse_mesh
 from model.rig.rig import PHYSICS, Rig, differences
 from model.table.raster import Raster

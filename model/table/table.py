@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
 from model.compiled.kernels import kernels, run
 from model.compiled.structures import GivenRaster
-from model.drive_modes.switched import highest_levels
+from model.drive_modes import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,
     PlateOnEras,
@@ -32,15 +32,13 @@ from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
 from model.ensemble.places import with_places
 from model.ensemble.touched_by_kernel import touch
 from model.errors import InputError
-from model.finger.fingertip import (
+from model.finger import (
     FINE_POINTS,
     FINGERTIP_RADIUS,
     FIVE_AND_FINE,
     FIVE_POINTS,
     GAUSS_LEGENDRE,
-)
-from model.finger.grid import Grid
-from model.finger.perception import (
+    Grid,
     decibels,
     detection_threshold,
     highest_known,
@@ -65,7 +63,7 @@ from model.table.raster import FingertipShapes, Raster
 from model.transients.excursions import MagnetMotions
 from model.transients.swings import Swing
 from model.transients.time_response import PlateInTime, plate_in_time
-from model.vibration.excitation import Excitation, base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 from registry.limits import GuardLimits
 
 EDGE = 0.05
@@ -111,7 +109,7 @@ class LocalizationTable:
     - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
     - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
     - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
-      (`model.vibration.convergence`), maximum over the ERAs
+      (`model.vibration`), maximum over the ERAs
     - clocks: errors of those of its amplifiers, which no file has: of those that are connected
     """
 

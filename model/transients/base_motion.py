@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray
 from model.structure.attachments import Source
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 
 class Term(NamedTuple):

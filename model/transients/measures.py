@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import contrast_db, felt_part
+from model.finger import contrast_db, felt_part, fingertip_points, fingertip_weights
 from model.transients.base_motion import BaseMotions, Bases
 from model.transients.knots import mean_square, steady_states
 from model.transients.time_response import ForcedVibration, PlateInTime
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 ONSET_WINDOW = 0.100
 """Time [s] from the first motion over which an onset is measured."""
@@ -65,7 +64,7 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
 
-        Of what skin can feel of them (`model.finger.perception`); mean over the points of the
+        Of what skin can feel of them (`model.finger`); mean over the points of the
         weakest target to the loudest quiet point; positions in m.
         """
         plate = self._plate.reduced.plate

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import FloatArray, lattice
-from model.finger.fingertip import FIVE_POINTS, fingertips_on
-from model.finger.perception import STRONG_DB_SL, decibels, detection_threshold
+from model.finger import FIVE_POINTS, STRONG_DB_SL, decibels, detection_threshold, fingertips_on
 from model.reduction.free_plate import FreePlate
 from model.rig.rig import Rig
 from model.transients.excursions import magnets_of

@@ -23,16 +23,14 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.finger.fingertip import FIVE_POINTS, fingertips_on
-from model.finger.grid import Grid
-from model.finger.perception import is_background
+from model.finger import FIVE_POINTS, Grid, fingertips_on, is_background
 from model.transients.base_motion import BaseEnvelope, Envelopes
 from model.transients.excursions import MagnetMotions
 from model.transients.knots import Carrier, FingerResponses, mean_square, solve_carrier
 from model.transients.knots_kernel import ending_knots, onset_knots
 from model.transients.measures import ENDING_WINDOW
 from model.transients.time_response import PlateInTime
-from model.vibration.excitation import Excitation, base_amplitudes
+from model.vibration import Excitation, base_amplitudes
 
 _SURROUNDINGS = Grid(8, 6)  # twice as fine changes the contrast by 0.1 dB
 _KEPT = 16  # readings; of an onset and its ending, and of fingers that rest

@@ -18,7 +18,7 @@ import numpy as np
 from drivers.playing.playback import Voice
 from drivers.protocol.records import Values
 from model.arrays import FloatArray
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad, Source, check_loads, footprints_of

@@ -16,24 +16,25 @@ from numpy.lib.stride_tricks import sliding_window_view
 from model.answer.answer import Layer
 from model.answer.fingers import Finger, check_fingers
 from model.arrays import FloatArray
-from model.counting import counted
 from model.errors import InputError
 from model.files.csv_file import as_frame
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import (
+from model.finger import (
     DEFAULT_THRESHOLD,
     contrast_db,
     decibels,
+    fingertip_points,
+    fingertip_weights,
     over_threshold,
     sensation_level,
 )
+from model.quantities import counted
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.from_rest import from_rest
 from model.transients.measures import ONSET_WINDOW
-from model.vibration.excitation import base_amplitudes
+from model.vibration import base_amplitudes
 from sim.plant import second_harmonic
 from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised

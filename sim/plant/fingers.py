@@ -13,8 +13,7 @@ import numpy as np
 from model.answer.fingers import check_on_plate
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import felt_part
+from model.finger import felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 
 KEPT = 10.0  # s

@@ -29,7 +29,7 @@ from model.structure.attachments import (
 )
 from model.study.exact_plates import draw_plates
 from model.transients.base_motion import Motion, Term
-from model.vibration.convergence import finer_mesh
+from model.vibration import finer_mesh
 from sim.amplifier.clock import Crystal
 
 _MAX_LOSS_FACTOR = 0.99

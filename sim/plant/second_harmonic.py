@@ -10,7 +10,7 @@ from dataclasses import replace
 from drivers.playing.playback import Voice
 from model.answer.answer import Layer
 from model.transients.base_motion import BaseEnvelope
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 
 
 def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:

@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from model.arrays import FloatArray, lattice
-from model.vibration.excitation import G
+from model.vibration import G
 from sim.bench.bench import Bench
 from sim.control.context import SimulationContext
 

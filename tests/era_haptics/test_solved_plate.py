@@ -10,7 +10,7 @@ import pytest
 import era_haptics as era
 from model.design import problem
 from model.structure.attachments import PointLoad
-from model.vibration.maps import plate_map
+from model.vibration import plate_map
 from paper_plate import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16)]

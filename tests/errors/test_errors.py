@@ -78,7 +78,7 @@ WRITING = {
     ),
     "table export table.npz --format csv -o out.csv": "model.study.export.export_csv",
     "table export table.npz --format mat -o out.mat": "model.study.export.export_mat",
-    "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.maps.plate_map",
+    "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "model.figures.paper.paper_figures",
     "design rig.yaml -o design --layouts random:2": "model.design.run.rank_layouts",
@@ -96,7 +96,7 @@ LONG = {
     "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
     "table show table.npz": "model.study.overview.find_overview",
     "table verify table.npz rig.yaml": "model.study.verify.verify_table",
-    "plate convergence rig.yaml": "model.vibration.convergence.study_convergence",
+    "plate convergence rig.yaml": "model.vibration.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
     "demo --wire sim": "model.table.build.cached_table",
 }

@@ -25,10 +25,10 @@ from drivers.judge.asking import opened
 from drivers.judge.watching.config import TimeLimits
 from drivers.opening import Lines
 from long_form import in_turn, shortly
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from registry import threads
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side

@@ -21,9 +21,14 @@ from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.ensemble.delays import ClockErrors
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.grid import Grid
-from model.finger.perception import contrast_db, felt_part, mean_level_db_sl
+from model.finger import (
+    Grid,
+    contrast_db,
+    felt_part,
+    fingertip_points,
+    fingertip_weights,
+    mean_level_db_sl,
+)
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from model import cluster
-from model.choice import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
-from model.cluster import on_cluster
+from model import processes
+from model.arrays import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
 from model.errors import InputError
+from model.processes import on_cluster
 from model.quantities import in_display_unit, percent, with_error
 
 TASKS = {number: number for number in range(6)}
@@ -63,7 +63,9 @@ def test_cluster_gives_up_on_a_task_that_kills_its_workers(address: str, monkeyp
     """A task that ends whichever worker takes it, as one does for which memory is too short."""
     from distributed import Client
 
-    monkeypatch.setattr(cluster, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+    monkeypatch.setattr(
+        processes, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    )
     with Client(address, set_as_default=False) as client:
         client.run_on_scheduler(_allow_failures, 0)
     with pytest.raises(InputError, match="memory"):
@@ -84,7 +86,7 @@ def test_cluster_without_dask_names_the_extra(monkeypatch) -> None:
 
 def test_cluster_without_scheduler_is_refused(monkeypatch) -> None:
     """Nothing listens at the address: the error says so, and how to start one."""
-    monkeypatch.setattr(cluster, "_CONNECT_TIMEOUT", 0.2)
+    monkeypatch.setattr(processes, "_CONNECT_TIMEOUT", 0.2)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
         dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
 
@@ -99,7 +101,7 @@ def test_address_that_dask_would_hang_over_is_refused(text: str) -> None:
 def test_every_worker_checks_its_code() -> None:
     """Nothing is called on a worker that joins later, with other code."""
     with pytest.raises(InputError, match="same era-haptics"):
-        cluster._run_same_code("0.0.1+123456789abc", pytest.fail, "called")
+        processes._run_same_code("0.0.1+123456789abc", pytest.fail, "called")
 
 
 def test_the_first_of_the_nearly_equal_best_is_chosen():

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from model import version
-from model.version import NUMERICS_VERSION, code_version
+from model import caching
+from model.caching import NUMERICS_VERSION, code_version
 from reference_figures import RECORD, reference_figures
 
 REMEDY = "increase NUMERICS_VERSION and run python tests/support/reference_figures.py"
@@ -26,7 +26,7 @@ def test_code_version_changes_with_the_source(monkeypatch, tmp_path):
     """One more space in a module is another version."""
     (tmp_path / "inner").mkdir()
     (tmp_path / "inner" / "module.py").write_text("a = 1", encoding="utf-8")
-    monkeypatch.setattr(version.resources, "files", lambda package: tmp_path)
+    monkeypatch.setattr(caching.resources, "files", lambda package: tmp_path)
     first = code_version.__wrapped__()
     (tmp_path / "inner" / "module.py").write_text("a =  1", encoding="utf-8")
     assert code_version.__wrapped__() != first

@@ -21,7 +21,7 @@ from drivers import errors
 from drivers.errors import CommandError, CommandRefused
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import FAULTS, STATES
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from registry import threads
 from set_chain import FINGER, OTHER
 from sim.faults.fault_window import FaultKind

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.drive_modes.forms import Drive, Forms
+from model.drive_modes import Drive, Forms
 
 
 def by_hand(forms: Forms, drive: Drive) -> tuple[float, float]:

@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import FloatArray
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
-from model.vibration.convergence import estimate_error
+from model.vibration import estimate_error
 
 MAX_RATIO = 1.4
 """Largest error, relative to its estimate."""

@@ -24,7 +24,7 @@ from controller.play.intent import HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import DriverError
 from model.rig.rig import Channel
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire

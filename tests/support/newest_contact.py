@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from controller.play.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL
 
 
 class BuzzNewestContact:

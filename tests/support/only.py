@@ -8,7 +8,7 @@ from model.answer.fingers import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stim
 from model.answer.plan import answer, query
 from model.arrays import Point
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 
 
 def only(

@@ -1,6 +1,6 @@
 """The founding paper's plate, for tests that need a rig without a file."""
 
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era, damping_from_ratio
 from model.structure.plate import Material, Plate

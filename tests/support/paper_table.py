@@ -7,8 +7,8 @@ import numpy as np
 
 from model.answer.fingers import Placement
 from model.answer.fingers_on_plate import FingersOnPlate
-from model.drive_modes.forms import Forms
-from model.fem.mesh import ELEMENTS, Mesh
+from model.drive_modes import Forms
+from model.fem import ELEMENTS, Mesh
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.direct_plate import direct_acceleration
 from model.calibration.responses import Responses
-from model.fem.plate import assemble
+from model.fem import assemble
 from model.rig.rig import Rig
 from model.structure.attachments import Gain
 

@@ -14,14 +14,14 @@ from model.answer.fingers import Placement
 from model.answer.measures import measures as measures_of
 from model.answer.plan import query
 from model.answer.timing import Timing
+from model.caching import NUMERICS_VERSION
 from model.design.area import area_of
 from model.design.contacts import anywhere
 from model.design.problem import DesignProblem, layouts_of
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
 from model.table.build import solve_table
-from model.version import NUMERICS_VERSION
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 from paper_plate import make_paper_rig
 from small_table import small_problem
 

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
 from chain import Chain
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire

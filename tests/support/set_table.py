@@ -20,11 +20,11 @@ from model.answer.search import Contents, Stream, Tones
 from model.answer.strength import scaled
 from model.arrays import FloatArray
 from model.ensemble.delays import ClockErrors
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
-from model.vibration.excitation import Excitation
+from model.vibration import Excitation
 from registry.limits import GuardLimits
 
 STROKE = 100e-6  # m

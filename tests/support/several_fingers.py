@@ -28,7 +28,7 @@ from model.answer.answer import Limits
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.table.build import TableProblem, solve_table
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig

@@ -16,8 +16,7 @@ from controller.effects.texture import Texture
 from controller.play.intent import IntentSource
 from model.answer.timing import Timing
 from model.config.shapes import Rectangle
-from model.finger.grid import Grid
-from model.finger.perception import STRONG_DB_SL
+from model.finger import STRONG_DB_SL, Grid
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import TableProblem, solve_table

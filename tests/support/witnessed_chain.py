@@ -18,7 +18,7 @@ from chain import Chain
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.judge.watching.capture import Violation
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from plate_witness import OperatorCommand
 from registry import threads
 from registry.limits import GuardLimits

@@ -12,7 +12,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.calibration.responses_file import write_responses
 from model.commands.options import Stopwatch, progress_bar
-from model.progress import Progress
+from model.processes import Progress
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.live_plot import Show, live_plot
 from sim.desk.measuring.loopback import (

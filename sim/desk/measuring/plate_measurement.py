@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.arrays import FloatArray
+from model.arrays import FloatArray, best_first
 from model.calibration.sensor_file import read_sensors
-from model.choice import best_first
 from model.identification.forward import Sensor
 from model.identification.measurement import (
     DeviceSettings,
@@ -15,7 +14,7 @@ from model.identification.measurement import (
     Measurement,
     Repeat,
 )
-from model.progress import Progress
+from model.processes import Progress
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk, converters
 from sim.desk.measuring.measure import Measured, measure, open_desk, play_run

@@ -17,9 +17,9 @@ import numpy as np
 from model.calibration.responses import MeasuredValue, Responses, responses_of
 from model.calibration.responses_file import write_responses
 from model.calibration.sensor_file import WiredSensor, are_places
-from model.counting import counted
 from model.errors import InputError
 from model.files.csv_file import read_lines
+from model.quantities import counted
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.stepped_recording import CLOSE, tones_of
 

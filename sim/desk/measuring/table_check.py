@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.playing import contents
 from model.answer.answer import Layer
 from model.calibration.sensor_file import read_sensors
-from model.progress import Progress
+from model.processes import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
     MeasuredVerification,

@@ -15,8 +15,13 @@ from controller.check.simulated_touch import loaded_plate
 from controller.content.pattern import Pattern, Transient
 from era_haptics.lab.cli import app
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import decibels, detection_threshold, over_threshold
+from model.finger import (
+    decibels,
+    detection_threshold,
+    fingertip_points,
+    fingertip_weights,
+    over_threshold,
+)
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable

@@ -27,7 +27,7 @@ from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.rig.file import example_rig_path
 from registry import threads
 from sim.faults.fault_window import FaultWindow

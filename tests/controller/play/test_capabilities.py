@@ -20,12 +20,12 @@ from drivers.playing.contents import Tone as Played
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.transients.base_motion import BaseEnvelope
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 

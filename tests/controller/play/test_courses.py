@@ -15,7 +15,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact
 from model.answer.course import Course
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from set_chain import FINGER, OTHER, set_running
 from several_fingers import LEFT, fingers_on, table
 from virtual_loop import in_virtual_time

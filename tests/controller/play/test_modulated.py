@@ -20,7 +20,7 @@ from model.answer.answer import Layer
 from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.config.shapes import Rectangle
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from paper_table import smooth_rig
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, playable, table
 from virtual_loop import in_virtual_time

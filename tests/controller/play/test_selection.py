@@ -19,7 +19,7 @@ from model.answer.fingers import Finger, Stimulus
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from set_table import set_answer
 from small_table import small_table
 

@@ -17,7 +17,7 @@ from model.answer.promised import felt_amplitudes, loudest_power
 from model.answer.search_in_c import choose_tones
 from model.cli import app
 from model.errors import InputError
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
 from model.table.build import build_table
 from model.table.file import save_table

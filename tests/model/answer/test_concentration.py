@@ -10,8 +10,7 @@ from model.answer.fingers import Placement
 from model.answer.measures import cell_centres, concentration_of, measures
 from model.answer.plan import query
 from model.arrays import lattice
-from model.finger.fingertip import fingertip_points
-from model.finger.perception import is_beyond
+from model.finger import fingertip_points, is_beyond
 from paper_table import smooth_rig, smooth_table
 
 TARGET = (0.15, 0.12)

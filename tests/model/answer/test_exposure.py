@@ -5,7 +5,7 @@ import pytest
 
 from model.answer.exposure import exposures, hand_weighting
 from model.answer.fingers import Finger
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from only import phased as answer
 from only import wants
 from paper_table import smooth_table

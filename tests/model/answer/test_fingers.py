@@ -11,9 +11,7 @@ from model.answer.fingers import Finger, Placement, Stimulus, check_fingers, tog
 from model.answer.plan import answer, query
 from model.ensemble.delays import ClockErrors
 from model.errors import InputError
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.grid import Grid
-from model.finger.perception import detection_threshold
+from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from only import only
 from paper_table import FREQUENCIES, contact_sets, smooth_table
 

@@ -9,7 +9,7 @@ import pytest
 from model.answer.answer import Limits
 from model.answer.fingers import Finger, Placement
 from model.answer.strength import with_gains
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import read_fingertips

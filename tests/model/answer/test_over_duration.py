@@ -19,12 +19,11 @@ from model.answer.over_duration import (
 )
 from model.answer.plan import answer, query
 from model.ensemble.draws import JUDGING_DRAWS
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.table.build import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
-from model.vibration.excitation import Excitation, Tone, base_amplitudes
+from model.vibration import Excitation, Tone, base_amplitudes
 from paper_table import contact_sets, smooth_rig, smooth_table
 from small_table import small_table
 

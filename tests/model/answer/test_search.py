@@ -16,7 +16,7 @@ from model.answer.promised import share_stroke
 from model.answer.search import KEPT, MISSING, Contents, Stream
 from model.answer.search_in_c import choose_tones
 from model.answer.search_in_numpy import choose_by_numpy, ranked, worst_ratios
-from model.finger.perception import THRESHOLDS
+from model.finger import THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.build import build_table

@@ -13,8 +13,7 @@ from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses
 from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis.consistency import check_consistency
-from model.fem.mesh import Mesh
-from model.fem.plate import assemble
+from model.fem import Mesh, assemble
 from model.identification.derivatives import jacobian
 from model.identification.viscous_loss import viscous_difference
 from model.rig.file import load_rig

@@ -15,7 +15,7 @@ from model.commands.config_cli import config_app
 from model.commands.options import next_line, progress_bar
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
-from model.vibration.convergence import study_convergence
+from model.vibration import study_convergence
 from rig_files import write_rig
 
 RIG = str(example_rig_path())
@@ -125,8 +125,8 @@ def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeyp
         studied.append(studied[0] if studied else study_convergence(*args, **keywords))
         return studied[0]
 
-    monkeypatch.setattr("model.vibration.convergence.study_convergence", study_once)
-    monkeypatch.setattr("model.vibration.convergence._DOUBLINGS", 1)
+    monkeypatch.setattr("model.vibration.study_convergence", study_once)
+    monkeypatch.setattr("model.vibration._DOUBLINGS", 1)
     rig = write_rig(tmp_path / "rig.yaml", ("[40 Hz, 500 Hz]", "[40 Hz, 125 Hz]"))
     arguments = ("convergence", rig, "--mesh", "6x5", "--frequencies", "110")
     found = answer(*arguments)

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from exciter_rig import exciter_rig_text
-from model.cluster import on_cluster
 from model.config.document import parse_document
 from model.design.area import area_of
 from model.design.contacts import anywhere
 from model.design.layout_keys import layout_keys
 from model.design.problem import DesignProblem, layouts_of
 from model.design.run import Design, Runner, judge, rank_layouts
-from model.processes import on_processes
+from model.processes import on_cluster, on_processes
 from model.rig.file import parse_rig
 from paper_plate import make_paper_rig
 

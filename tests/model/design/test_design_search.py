@@ -17,7 +17,7 @@ from model.design.run import judge
 from model.design.score import Scorer
 from model.design.search import LayoutSearch
 from model.errors import InputError
-from model.finger.fingertip import FIVE_POINTS, fingertips_on
+from model.finger import FIVE_POINTS, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig

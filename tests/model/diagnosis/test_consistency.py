@@ -16,7 +16,7 @@ from model.diagnosis.diagnosis_report import as_json
 from model.diagnosis.kept_promises import judged_by_promises
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.rig import Rig
 from paper_plate import make_paper_rig
 from perturbed_plate import measured, perturbed

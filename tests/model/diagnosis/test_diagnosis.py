@@ -1,6 +1,6 @@
 """Diagnosis from responses that another solver computes for a known truth.
 
-Truth comes from one sparse solve a frequency (`model.fem.plate`), the comparison from the
+Truth comes from one sparse solve a frequency (`model.fem`), the comparison from the
 reduced plate. Gains of 5 % and 5 degrees at random and noise of 2 % of each row are in every
 measurement.
 """
@@ -26,7 +26,7 @@ from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_row
 from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
 from model.diagnosis.verdict import Verdict, diagnose
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from perturbed_plate import noise_like, random_gains

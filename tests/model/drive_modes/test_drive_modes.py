@@ -8,13 +8,12 @@ import pytest
 from scipy.optimize import minimize
 
 from drives import by_hand
+from model import drive_modes
+from model import drive_modes as switched_mode
 from model.answer.fingers import Placement
-from model.arrays import Complex64Array
-from model.choice import NEARLY
-from model.drive_modes import coherent, playable_drive_modes
-from model.drive_modes import switched as switched_mode
-from model.drive_modes.forms import Forms
-from model.finger.fingertip import fingertip_points
+from model.arrays import NEARLY, Complex64Array
+from model.drive_modes import Forms, playable_drive_modes
+from model.finger import fingertip_points
 from model.rig.uncertainty import Uncertainty
 from paper_table import contact_sets, forms_of, smooth_table
 
@@ -83,7 +82,7 @@ def found_in(mode, given):
     """The scores and drives that a mode finds, the best first; none where none reach the level."""
     if mode == "switched":
         return switched_mode.find_switched(given)
-    found = coherent.search(given)
+    found = drive_modes.search(given)
     order = [at for at in np.argsort(-found.score).tolist() if found.score[at] > 0]
     return [(float(found.score[at]), [(at, found.weights[at])]) for at in order]
 
@@ -92,7 +91,7 @@ def highest_of(mode, given):
     """The highest amplitude to threshold of a mode."""
     if mode == "switched":
         return switched_mode.max_sensation_switched(given)
-    return coherent.max_sensation(given)
+    return drive_modes.max_sensation(given)
 
 
 def found_alone(mode, given):
@@ -234,7 +233,7 @@ def test_max_sensation_of_phased_is_the_sum_of_magnitudes():
     """No weights of up to full stroke give more than the sum of the magnitudes."""
     given = random_forms(2)
     sums = np.abs(given.targets[0]).sum(axis=1) / given.threshold
-    assert coherent.max_sensation(given) == pytest.approx(sums.max(), rel=1e-4)
+    assert drive_modes.max_sensation(given) == pytest.approx(sums.max(), rel=1e-4)
 
 
 def semidefinite_bound(fields, form):
@@ -275,7 +274,7 @@ def test_the_weakest_of_many_targets_has_nearly_all_there_is(targets):
     short = []
     for seed in range(8):
         given = spread_forms(targets, 1 + seed % 2, seed)
-        weights = coherent.search_all(given).weights.astype(complex)
+        weights = drive_modes.search_all(given).weights.astype(complex)
         for f, w in enumerate(weights):
             fields, form = given.targets[:, f].astype(complex), given.quiet[f, 0].astype(complex)
             ratio = (np.abs(fields @ w) ** 2).min() / (w.conj() @ form @ w).real
@@ -295,7 +294,7 @@ def test_the_highest_level_of_many_targets_is_nearly_the_highest(targets):
         given = spread_forms(targets, 1, seed)
         fields = (given.targets / given.threshold[:, None]).swapaxes(0, 1)
         best = max(np.abs(phases @ each.T).min(axis=1).max() for each in fields)
-        short.append(20 * np.log10(best / coherent.max_sensation(given)))
+        short.append(20 * np.log10(best / drive_modes.max_sensation(given)))
     assert np.median(short) < 0.5
     assert np.percentile(short, 90) < 2
 

@@ -10,10 +10,8 @@ from benchmarks.direct_plate import direct_acceleration
 from model.answer.fingers_on_plate import FingersOnPlate
 from model.arrays import FloatArray
 from model.ensemble.draws import Drawing, percentile
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble
-from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
-from model.finger.perception import detection_threshold
+from model.fem import ELEMENTS, Mesh, assemble
+from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import FingertipLoad
 from model.table.build import build_table

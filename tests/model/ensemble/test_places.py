@@ -9,7 +9,7 @@ from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import random_contacts
 from model.answer.fingers import Placement
 from model.arrays import ComplexArray
-from model.fem.plate import assemble
+from model.fem import assemble
 from model.rig.file import load_rig
 from model.rig.uncertainty import Uncertainty
 from model.study.exact_plates import draw_plates, felt_on

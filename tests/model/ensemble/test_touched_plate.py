@@ -12,9 +12,8 @@ from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickne
 from model.ensemble.draws import Drawing
 from model.ensemble.touched_by_kernel import touch
 from model.ensemble.touched_plate import TouchedPlate
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble
-from model.finger.fingertip import FINGERTIP_RADIUS, FIVE_POINTS
+from model.fem import ELEMENTS, Mesh, assemble
+from model.finger import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad, footprints_of

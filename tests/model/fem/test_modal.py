@@ -9,13 +9,12 @@ from scipy.linalg import eigh
 from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.mesh import ELEMENTS, Element, Mesh
-from model.fem.plate import PlateMatrices, assemble, lowest_modes, rigidities
+from model.fem import ELEMENTS, Element, Mesh, PlateMatrices, assemble, lowest_modes, rigidities
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Converged Reissner-Mindlin frequencies [Hz] of the same plate: NGSolve 6.2, order 5; scikit-fem of

@@ -14,7 +14,7 @@ from model.figures.table_pictures import (
     levels_figure,
     weak_cells_figure,
 )
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike
 from model.spectral.mesh import SpectralMesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from model.finger.fingertip import (
+from model.finger import (
     FINE_POINTS,
     FINGERTIP_RADIUS,
     FIVE_POINTS,

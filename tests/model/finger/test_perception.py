@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from model.finger.grid import Grid
-from model.finger.perception import (
+from model.finger import (
     THRESHOLDS,
+    Grid,
     check_has_threshold,
     detection_threshold,
     felt_part,

@@ -9,8 +9,7 @@ from benchmarks.direct_plate import direct_acceleration
 from exciter_rig import exciter_rig, exciter_rig_text
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble
+from model.fem import ELEMENTS, Mesh, assemble
 from model.identification.derivatives import jacobian
 from model.identification.forward import SENSOR_FOOT, ForwardModel, Sensor
 from model.identification.identification_report import parameter_rows

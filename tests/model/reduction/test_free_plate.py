@@ -9,13 +9,12 @@ from scipy.sparse.linalg import splu
 
 from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble
+from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Laminate, LaminateLayer, Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Even and odd counts of elements, low and high order, with strips along the edges and without.

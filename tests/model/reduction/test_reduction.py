@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import assemble
+from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.place_slopes import place_slopes
 from model.reduction.reduced_plate import SupportedModes, reduce_plate, supported_modes
 from model.reduction.truncation import truncation_weights

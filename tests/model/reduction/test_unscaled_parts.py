@@ -9,9 +9,8 @@ from scipy import sparse
 from model.arrays import FloatArray
 from model.calibration.sensed_plate import sensed_plate
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.fem.plate import PlateMatrices, assemble
-from model.finger.grid import Grid
+from model.fem import Mesh, PlateMatrices, assemble
+from model.finger import Grid
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.parameters import space_of
 from model.reduction import free_modes

@@ -11,7 +11,7 @@ from benchmarks.direct_plate import direct_acceleration
 from exciter_rig import exciter_rig, exciter_rig_text
 from model.answer.fingers import Placement
 from model.config.document import ConfigError
-from model.fem.plate import assemble
+from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.file import load_rig, parse_rig

@@ -12,7 +12,7 @@ from model.rig.plate_summary import plate_summary
 from model.rig.rig import Rig
 from model.rig.sections import PlateSection
 from model.structure.support import rigid_body_frequencies
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 
 PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}
 GLASS = {"E": 70e9, "rho": 2500.0, "nu": 0.2}

@@ -15,7 +15,7 @@ from model.spectral.modes import SpectralPlate
 from model.spectral.stiffness import air_motion
 from model.structure.attachments import Era
 from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 PLATE = Plate(0.375, 0.225, 2.5e-3, GLASS)

@@ -10,8 +10,7 @@ from scipy import linalg
 from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.elasticity import strip_frequencies
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.fem.plate import assemble
+from model.fem import Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.file import load_rig
@@ -21,7 +20,7 @@ from model.spectral.modes import Band, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Laminate, LaminateLayer, Material, Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)

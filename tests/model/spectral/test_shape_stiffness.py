@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.fem.mesh import ELEMENTS, Mesh
-from model.fem.plate import element_slopes
+from model.fem import ELEMENTS, Mesh, element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.mesh import SpectralMesh
 from model.spectral.shape_stiffness import grain_slopes, stiffness_slopes

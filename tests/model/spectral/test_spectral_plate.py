@@ -9,7 +9,7 @@ from scipy import linalg
 
 from long_form import in_turn
 from model.errors import InputError
-from model.fem.mesh import Q5, Mesh
+from model.fem import Q5, Mesh
 from model.reduction.free_modes import SpectralModes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
@@ -20,7 +20,7 @@ from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Material, Plate
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 from paper_plate import make_paper_rig
 
 RIG = make_paper_rig(12, 9)

@@ -9,8 +9,8 @@ import pytest
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.mesh import ELEMENTS, Mesh
-from model.finger.grid import Grid
+from model.fem import ELEMENTS, Mesh
+from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.from_keys import rig as rig_by_keys
@@ -22,7 +22,7 @@ from model.structure.support import GRAVITY, static_loads, support_problem
 from model.table.build import TableProblem, solve_table
 from model.table.following import table_following
 from model.table.table import LocalizationTable
-from model.vibration.natural_modes import natural_modes
+from model.vibration import natural_modes
 
 SIDES = {"length": 0.4, "width": 0.3}
 BIRCH = {"E1": 12.7e9, "E2": 4.8e9, "nu12": 0.05, "G12": 0.70e9, "G13": 0.35e9, "G23": 0.25e9}

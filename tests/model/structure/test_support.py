@@ -9,7 +9,7 @@ import pytest
 from benchmarks.direct_plate import direct_responder
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.footprint import mean_over

@@ -10,14 +10,13 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.answer.fingers import Placement
 from model.ensemble.draws import percentile
-from model.fem.plate import assemble
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import detection_threshold
+from model.fem import assemble
+from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
 from model.table.build import build_table
-from model.vibration.excitation import base_amplitudes
+from model.vibration import base_amplitudes
 from only import only
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
 

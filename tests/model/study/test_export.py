@@ -11,7 +11,7 @@ from scipy.io import loadmat
 
 from model.answer.fingers import Placement
 from model.errors import InputError
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import export

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from model.answer.fingers import Placement
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import Laminate, LaminateLayer
 from model.study.overview import (

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.fem.plate import assemble
-from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.fem import assemble
+from model.finger import fingertip_points, fingertip_weights
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verify import AnswerCheck, verify_table
 from model.table.build import solve_table
 from model.table.file import load_table, save_table
-from model.vibration.excitation import tone_fields
+from model.vibration import tone_fields
 from only import only
 from paper_plate import make_paper_rig
 from small_table import small_problem, small_table

@@ -10,12 +10,10 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.answer.fingers import Placement
 from model.answer.plan import query
-from model.drive_modes.switched import highest_levels
+from model.drive_modes import highest_levels
 from model.errors import InputError
-from model.fem.plate import assemble
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.grid import Grid
-from model.finger.perception import detection_threshold
+from model.fem import assemble
+from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
@@ -25,7 +23,7 @@ from model.table.build import TableProblem, build_table
 from model.table.following import table_following
 from model.table.raster import Raster
 from model.table.table import LocalizationTable, default_drive_frequencies, read_fingertips
-from model.vibration.excitation import Tone, tone_fields
+from model.vibration import Tone, tone_fields
 from only import only
 from paper_plate import make_paper_rig
 from paper_table import contact_sets, smooth_rig, smooth_table

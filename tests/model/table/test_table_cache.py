@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model import cache_folder
-from model.finger.grid import Grid
+from model import caching
+from model.finger import Grid
 from model.table import build
 from model.table.build import cached_table
 from paper_plate import make_paper_rig
@@ -28,7 +28,7 @@ STIFFER = replace(RIG, eras=(replace(RIG.eras[0], stiffness=18000.0), *RIG.eras[
 def cache(tmp_path, monkeypatch):
     """A cache folder of the test's own."""
     folder = tmp_path / "cache"
-    monkeypatch.setattr(cache_folder.platformdirs, "user_cache_path", lambda *_, **__: folder)
+    monkeypatch.setattr(caching.platformdirs, "user_cache_path", lambda *_, **__: folder)
     return folder
 
 

@@ -14,7 +14,7 @@ import rig_page
 from key_tables import quantities
 from model.config.sections import Section
 from model.errors import InputError
-from model.finger.grid import Grid
+from model.finger import Grid
 from model.rig import sections
 from model.rig.era_section import EraSection
 from model.rig.exciter_section import ExciterSection

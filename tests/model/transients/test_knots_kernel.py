@@ -18,7 +18,7 @@ from model.transients.knots import (
 from model.transients.knots_kernel import ending_knots, onset_knots, quiet_weight
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper, of_eras, responses_at
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2

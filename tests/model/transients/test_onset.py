@@ -35,7 +35,7 @@ from model.transients.knots import (
 from model.transients.measures import Transients
 from model.transients.shaping import responses_at
 from model.transients.time_response import plate_in_time
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from paper_plate import make_paper_rig
 from plate_in_time import make_plate_in_time
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from model.answer.fingers import Placement
-from model.finger.fingertip import fingertip_points, fingertip_weights
+from model.finger import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.table.build import build_table
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper
-from model.vibration.excitation import Excitation, Tone
+from model.vibration import Excitation, Tone
 from only import only
 from plate_in_time import make_plate_in_time
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from model.finger.fingertip import fingertip_points
+from model.finger import fingertip_points
 from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_onset
 from model.transients.knots import hat_accelerations
 from model.transients.measures import SAMPLE_RATE, Transients
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from plate_in_time import make_plate_in_time, stepped_acceleration
 
 STEP = 0.005

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.fem.mesh import Mesh
+from model.fem import Mesh
 from model.rig.meshes import mesh_of
-from model.vibration.convergence import default_frequencies, meshes_to_compare, study_convergence
+from model.vibration import default_frequencies, meshes_to_compare, study_convergence
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 # On four corner springs: founding paper, in-house column of Table 2, and converged (NGSolve).

@@ -10,8 +10,7 @@ from error_estimates import CASES, MAX_RATIO, judge
 from long_form import shortly
 from model.errors import InputError
 from model.spectral.mesh import SpectralMesh
-from model.vibration.excitation import Tone, find_nulls, peak_acceleration, tone_fields
-from model.vibration.maps import plate_map
+from model.vibration import Tone, find_nulls, peak_acceleration, plate_map, tone_fields
 from paper_plate import LENGTH, WIDTH
 
 FULL = 100e-6

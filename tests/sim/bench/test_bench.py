@@ -13,8 +13,8 @@ from bench_driving import arm, keep_alive, play
 from benchmarks.direct_plate import direct_acceleration
 from drivers.playing.contents import Tone
 from model.arrays import FloatArray
-from model.fem.plate import assemble
-from model.finger.fingertip import fingertip_points
+from model.fem import assemble
+from model.finger import fingertip_points
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in

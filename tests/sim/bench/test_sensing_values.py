@@ -11,7 +11,7 @@ from drivers.host.sensors import measure_tones, read_sensors
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import READING_STATES
-from model.fem.plate import assemble
+from model.fem import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart
 from registry import threads

@@ -17,7 +17,7 @@ from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.sensor_file import WiredSensor, read_sensors
 from model.errors import InputError
-from model.finger.fingertip import fingertips_on
+from model.finger import fingertips_on
 from model.identification.identify import identify
 from model.identification.measurement import MeasuredPlate
 from model.rig.rig import Rig

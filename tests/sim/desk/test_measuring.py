@@ -15,7 +15,7 @@ from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.calibration.sensor_file import WiredSensor
 from model.errors import InputError
-from model.progress import unseen
+from model.processes import unseen
 from model.rig.file import parse_rig
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk

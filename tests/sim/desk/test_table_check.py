@@ -23,7 +23,7 @@ from model.arrays import Float32Array, FloatArray
 from model.calibration.sensor_file import read_sensors
 from model.cli import app
 from model.errors import InputError
-from model.finger.perception import detection_threshold
+from model.finger import detection_threshold
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -32,7 +32,7 @@ from model.study.table_check import CheckSettings
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable
-from model.vibration.excitation import tone_fields
+from model.vibration import tone_fields
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard
 

@@ -10,16 +10,21 @@ from benchmarks.direct_plate import direct_acceleration
 from model.answer.answer import Layer
 from model.answer.fingers import Placement, Stimulus, together
 from model.errors import InputError
-from model.fem.plate import assemble
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import detection_threshold, mean_level_db_sl, sensation_level
+from model.fem import assemble
+from model.finger import (
+    detection_threshold,
+    fingertip_points,
+    fingertip_weights,
+    mean_level_db_sl,
+    sensation_level,
+)
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
 from model.transients.base_motion import BaseEnvelope, shaped
 from model.transients.measures import Transients
 from model.transients.time_response import plate_in_time
-from model.vibration.excitation import Tone
+from model.vibration import Tone
 from sim.plant.excited_plate import Playback, Vibration, play
 from sim.plant.fingers import Fingers, Record, measure_vibration
 

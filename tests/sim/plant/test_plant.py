@@ -14,9 +14,8 @@ from model.answer.fingers import Placement
 from model.answer.timing import Timing
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.fem.mesh import Mesh
-from model.finger.fingertip import fingertip_points, fingertip_weights
-from model.finger.perception import contrast_db, felt_part
+from model.fem import Mesh
+from model.finger import contrast_db, felt_part, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad

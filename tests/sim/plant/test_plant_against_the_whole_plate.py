@@ -11,8 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from benchmarks.direct_plate import direct_acceleration
 from driven_bases import BASES, STROKE, Base, resting
 from model.arrays import ComplexArray, FloatArray
-from model.fem.mesh import Mesh
-from model.fem.plate import PlateMatrices, assemble
+from model.fem import Mesh, PlateMatrices, assemble
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad, footprints_of

@@ -1,0 +1,541 @@
+"""Drive modes: which frequencies, amplitudes and phases the ERAs may have.
+
+`switched` drives one or two ERAs at full stroke, each at a frequency of its own; `phased` all ERAs
+at one frequency with any weights (`model.drive_modes`).
+
+Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet fingertips, r
+reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
+the quiet fingertips, c right-hand side from the targets, w complex weights of the ERAs. In
+`model.transients`, q are the modal coordinates and z those of the eigenvectors in time.
+
+Input of the drive modes: what the ERAs' weights do at the fingertips, over the ensemble.
+
+A drive is a complex weight for each ERA at each frequency. It is ranked by its robust score: the
+amplitude at the target, over the root of the expected power at the loudest quiet fingertip, over
+all plates within the rig's uncertainty (`model.ensemble.touched_plate`). The optimum for the
+nominal plate relies on cancellation and is 10 dB worse on a real one.
+
+Tones of different frequencies are felt together as the root of the sum of their squares over the
+detection thresholds, and so are a score's powers: each in units of its threshold.
+
+The drive mode `phased`: all ERAs at one frequency, with any amplitudes and phases.
+
+Robust weights reach the targets with little at the quiet fingers; a spring or damper at an ERA adds
+a force where the drive acts anyway: without errors the best contrast does not depend on it.
+
+At each frequency the expected power at the quiet fingertips, a weighted mean over them, is the
+quadratic form w^H R w of the weights w, and the weights that reach the targets with the least of it
+solve R w = c, where c sums conj(h_t) of the targets, each times a factor. Where the maximum
+over the quiet fingertips counts, their weights mu_q are multiplied by the root of their expected
+power and the system is solved again (Lawson's algorithm for minimax approximation; three steps, of
+which the best is kept, since the minimax of expected powers is not the best percentile). A mean is
+at most the maximum, so that for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
+Of several it estimates it: phases and factors in c are the best of those tried.
+
+`model/compiled/search.h` is the same in C.
+
+The drive mode `switched`: one or two ERAs at full stroke, each at a frequency of its own.
+
+The paper's idea: switching frequencies and activation sets moves the nulls. Four ERAs and 27
+frequencies make 4 * 27 + 6 * 27² = 4482 patterns, sixteen and 47 a quarter of a million.
+
+Powers of tones of different frequencies, each over the squared threshold of its frequency, add to
+what is felt, at the target and at every quiet fingertip; at one frequency the fields add. So all
+patterns of two ERAs are the sums of a column and a row, but for their diagonal. The maximum over
+the quiet fingertips is at least any weighted mean, and the mean of a sum is the sum of the means:
+one number for each pattern, which leaves few to be looked at closely.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import Complex64Array, Float32Array, IntArray, best_along, best_few
+from model.errors import InputError, shown
+
+MAX_PHASE_STEP = 10.0
+"""Largest phase step [degrees] for `phased`: its rms error of 3 degrees is within the allowance."""
+
+DRIVE_MODES = ("switched", "phased")
+"""Drive modes, from the least freedom to the most."""
+
+UNRESTRICTED = "phased"
+"""The mode of any weights."""
+
+
+def checked_mode(name: str, what: str = "drive mode") -> str:
+    """Return the name of a drive mode; raises InputError for any other; what: its name there."""
+    if name not in DRIVE_MODES:
+        raise InputError(f"{what} must be one of {', '.join(DRIVE_MODES)}, got {shown(name)}")
+    return name
+
+
+def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:
+    """Return the modes that an amplifier with such steps of level and phase [degrees] can play.
+
+    A level step of 1 is on or off.
+    """
+    return DRIVE_MODES if level_step < 1 and phase_step <= MAX_PHASE_STEP else DRIVE_MODES[:1]
+
+
+Drive: TypeAlias = list[tuple[int, Complex64Array]]
+"""Tones: a frequency, by index, and the weights (eras,) at it, in full strokes."""
+
+LEVEL_MARGIN = 1.0
+"""Standard deviations of a target's amplitude that a drive must have in reserve.
+
+About what nine of ten plates need; the answer's own draws decide.
+"""
+
+_LEAST = np.float32(1e-20)
+
+
+@dataclass(frozen=True, eq=False)
+class Forms:
+    """Amplitudes at the targets, and expected power at targets and quiet fingertips.
+
+    - targets: (t, f, eras) field of each ERA alone at full stroke [m/s²], mean over the fingertip
+    - target_power: (t, f, eras, eras) expected power there, w^H R w of weights w
+    - quiet: (f, q, eras, eras) the same at each quiet fingertip, or without any one form for the
+      rest of the plate
+    - threshold: (f,) [m/s²]; wanted: amplitude to threshold for every target
+    - few, fine: (f, q, p, eras) fields of each ERA at few points of each quiet fingertip, by whose
+      mean the expected power counts the nominal plate, each times the root of its weight; and
+      at many points, of which the loudest counts. None where the mean is good enough
+    - driven: (eras,) which ERAs may have weights, None for all; see `among`
+    """
+
+    targets: Complex64Array
+    target_power: Complex64Array
+    quiet: Complex64Array
+    threshold: Float32Array
+    wanted: float
+    level_margin: float = LEVEL_MARGIN
+    few: Complex64Array | None = None
+    fine: Complex64Array | None = None
+    driven: NDArray[np.bool_] | None = None
+
+    @property
+    def era_count(self) -> int:
+        """Number of ERAs."""
+        return int(self.quiet.shape[-1])
+
+    def at(self, frequencies: IntArray) -> "Forms":
+        """Select some of the frequencies, by index (n,)."""
+        return Forms(
+            self.targets.take(frequencies, axis=1),
+            self.target_power.take(frequencies, axis=1),
+            self.quiet.take(frequencies, axis=0),
+            self.threshold.take(frequencies),
+            self.wanted,
+            self.level_margin,
+            None if self.few is None else self.few.take(frequencies, axis=0),
+            None if self.fine is None else self.fine.take(frequencies, axis=0),
+            self.driven,
+        )
+
+    def among(self, is_driven: NDArray[np.bool_]) -> "Forms":
+        """The forms for weights of some ERAs (eras,), all others 0: these do and cost nothing.
+
+        Each keeps its own power, so that a form can be inverted.
+        """
+        if is_driven.all():
+            return self
+        pairs = np.outer(is_driven, is_driven) | np.eye(len(is_driven), dtype=bool)
+        return replace(
+            self,
+            targets=self.targets * is_driven,
+            target_power=self.target_power * pairs,
+            quiet=self.quiet * pairs,
+            few=None if self.few is None else self.few * is_driven,
+            fine=None if self.fine is None else self.fine * is_driven,
+            driven=is_driven,
+        )
+
+    def amplitude(self, weights: Complex64Array) -> Float32Array:
+        """Amplitude [m/s²] at the weakest target of weights (..., f, eras), (..., f)."""
+        return np.asarray(np.minimum.reduce(self._amplitudes(weights), axis=-2))
+
+    def reached(self, weights: Complex64Array) -> tuple[Float32Array, NDArray[np.bool_]]:
+        """Amplitude as `amplitude`, and whether all targets have the wanted level, (..., f)."""
+        amplitudes = self._amplitudes(weights)
+        least = self._least_amplitudes(weights, amplitudes)
+        reaches = np.logical_and.reduce(least >= self.wanted * self.threshold, axis=-2)
+        return np.asarray(np.minimum.reduce(amplitudes, axis=-2)), np.asarray(reaches)
+
+    def gain_to_level(self, weights: Complex64Array) -> Float32Array:
+        """Factor on weights (f, eras) that just reaches the wanted level at all targets, (f,)."""
+        amplitudes = self._amplitudes(weights)
+        least = np.minimum.reduce(self._least_amplitudes(weights, amplitudes), axis=0)
+        amplitude = np.minimum.reduce(amplitudes, axis=0)
+        return np.asarray(
+            self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude + _LEAST)
+        )
+
+    def quiet_power(self, weights: Complex64Array) -> Float32Array:
+        """Expected power [m²/s⁴] at each quiet fingertip of weights (f, eras), (f, q)."""
+        power = expected_power(self.quiet.swapaxes(0, 1), weights).T
+        if self.few is None or self.fine is None:
+            return power
+        mean = np.add.reduce(_powers(self.few, weights), axis=2)
+        loudest = np.maximum.reduce(_powers(self.fine, weights), axis=2)
+        return np.asarray(power + np.maximum(loudest - mean, 0))
+
+    def _amplitudes(self, weights: Complex64Array) -> Float32Array:
+        """Amplitudes at the targets of weights (..., f, eras), (..., t, f)."""
+        fields = np.add.reduce(self.targets * weights[..., None, :, :], axis=-1)
+        return np.asarray(np.abs(fields))
+
+    def _least_amplitudes(self, weights: Complex64Array, amplitudes: Float32Array) -> Float32Array:
+        """Amplitudes (..., t, f) less the margin."""
+        if not self.level_margin:
+            return amplitudes
+        variance = expected_power(self.target_power, weights) - amplitudes * amplitudes
+        deviation = np.sqrt(np.maximum(variance, 0))
+        return np.asarray(amplitudes - np.float32(self.level_margin) * deviation)
+
+
+def _powers(fields: Complex64Array, weights: Complex64Array) -> Float32Array:
+    """Squared magnitudes (f, q, p) of fields (f, q, p, eras) for weights (f, eras)."""
+    found = np.matvec(fields, weights[:, None])
+    return np.asarray(found.real * found.real + found.imag * found.imag)
+
+
+def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Array:
+    """w^H R w of forms (q, f, eras, eras) and weights (..., f, eras): (..., q, f)."""
+    each = weights[..., None, :, :]
+    moved = np.matvec(forms, each)
+    return np.asarray(np.vecdot(each, moved).real)
+
+
+LAWSON_STEPS = 3
+"""Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
+
+TARGET_STARTS, ALIGNMENTS, REALIGNMENTS = 8, 16, 5
+"""Targets whose own optimum gives phases to start from; iterations from each that align phases with
+those reached, and from the factors of the step before.
+
+Of 20 targets, 4 starts of 8 iterations lose 0.3 dB more in the median.
+"""
+
+LIMITED_STEPS = 30
+"""Iterations towards weights that reach the level within full stroke; ten lose up to 1.4 dB where
+drives are known to 5 %."""
+
+MAX_GROWTH, MAX_MULTIPLIER = 100.0, 1e12
+"""Factor on a multiplier in one iteration, and in all."""
+
+NEARLY_HIGHEST = 0.99
+"""Of the highest level there is, what is searched where the level cannot be reached."""
+
+LEVEL_RESERVE = 1.02
+"""Level aimed at, since the iterations come near to full stroke from above."""
+
+
+@dataclass(frozen=True)
+class LawsonMethod:
+    """Weights that are tried at each frequency.
+
+    steps: of Lawson's algorithm; is_limited: whether each is brought to the level within full
+    stroke, by multipliers; variance: of each ERA's contribution beyond that of the forms; gain: by
+    which weights are raised up to full stroke, 0 for none.
+    """
+
+    steps: int
+    is_limited: bool = False
+    variance: float = 0.0
+    gain: float = 0.0
+
+
+ONE_FINGER, SEVERAL = LawsonMethod(1), LawsonMethod(1 + LAWSON_STEPS)
+
+WITHIN_STROKE = (
+    LawsonMethod(LIMITED_STEPS, is_limited=True, gain=1.0),
+    LawsonMethod(1, variance=1.0, gain=3.0),
+    LawsonMethod(1, variance=1e6, gain=1e6),
+)
+"""Tried in turn where the first weights miss the level: such within full stroke, and then such for
+which the quiet points count less against each ERA's own power."""
+
+_TINY, _COHERENT_LEAST, _LEAST_FIELD = 1e-7, np.float32(1e-30), np.float32(1e-20)
+
+
+@dataclass(frozen=True, eq=False)
+class CoherentResult:
+    """The best weights (f, eras) at each frequency, and their robust score (f,).
+
+    The score is 0 where none were found that reach the level. bound (f,): of the score for one
+    target, for several an estimate that other phases may exceed; missed (f,): the best score of
+    weights that miss the level.
+    """
+
+    score: Float32Array
+    weights: Complex64Array
+    bound: Float32Array
+    missed: Float32Array
+
+    @property
+    def level_limited(self) -> IntArray:
+        """Frequencies without weights that reach the level, but of a better score than the best."""
+        is_missed = (self.score == 0) & (self.missed > self.score.max(initial=0))
+        return np.asarray(is_missed.nonzero()[0])
+
+
+def search(forms: Forms) -> CoherentResult:
+    """Find the best weights at each frequency, brought within full stroke where they must."""
+    found = search_all(forms)
+    for method in WITHIN_STROKE:
+        open_ = found.level_limited
+        if len(open_) == 0:
+            break
+        more = tried(forms.at(open_), method)
+        found.score[open_], found.weights[open_] = more.score, more.weights
+        found.missed[open_] = np.maximum(found.missed[open_], more.missed)
+    return found
+
+
+def search_to_level(forms: Forms) -> tuple[CoherentResult, Forms]:
+    """Search for weights of a level, without its margin where they must, or else near the highest.
+
+    Also return the forms with the level that was sought.
+    """
+    found = search(forms)
+    for is_highest in (False, True):
+        if found.score.any():
+            break
+        level = NEARLY_HIGHEST * max_sensation(forms) if is_highest else forms.wanted
+        forms = replace(forms, wanted=float(np.float32(level)), level_margin=0.0)
+        found = search(forms)
+    return found, forms
+
+
+def search_all(forms: Forms) -> CoherentResult:
+    """Find the best weights at every frequency, none raised to the level."""
+    return tried(forms, SEVERAL if forms.quiet.shape[1] > 1 else ONE_FINGER)
+
+
+def max_sensation(forms: Forms) -> float:
+    """Return the highest amplitude to threshold found at the weakest target."""
+    any_level = replace(forms, wanted=0.0, level_margin=0.0)
+    peak = forms.amplitude(tried(any_level, WITHIN_STROKE[-1]).weights)
+    return float((peak / forms.threshold).max())
+
+
+def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
+    """Find the best of the weights of a method at every frequency.
+
+    Within full stroke the optimum has R + diag(d) in place of R, with multipliers d that are
+    zero but for ERAs at full stroke; they are multiplied by the squared magnitudes of the
+    weights until they fit.
+    """
+    f, q, n, _ = forms.quiet.shape
+    shares = np.full((f, q), 1 / q, dtype=np.float32)
+    multipliers = limit = np.zeros((f, 1), dtype=np.float32)
+    bound = np.full(f, np.inf, dtype=np.float32)
+    every_weights, powers, factors = [], [], None
+    for step in range(method.steps):
+        R = _weighted(forms, shares)
+        diagonal = R.reshape(f, -1)[:, :: n + 1]
+        diagonal *= 1 + np.float32(method.variance)
+        diagonal += multipliers
+        weights, highest, factors = _optimise_targets(R, forms.targets, factors, method.gain)
+        bound = np.minimum(bound, highest)
+        if method.is_limited:
+            gain = LEVEL_RESERVE * forms.gain_to_level(weights)
+            weights = (weights * gain[:, None]).astype(np.complex64)
+        fitting = _saturated(weights, method.gain) if method.gain else weights
+        expected = forms.quiet_power(fitting)
+        every_weights.append(fitting)
+        powers.append(np.maximum.reduce(expected, axis=1))
+        shares = _moved(shares, expected)
+        if not method.is_limited:
+            continue
+        power = np.abs(weights) ** 2
+        if step == 0:
+            own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
+            multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _COHERENT_LEAST))[:, None]
+            limit = np.float32(MAX_MULTIPLIER) * multipliers
+        # Beyond any level that can be reached they would grow without end.
+        multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
+    every = np.array(every_weights)
+    peak, reaches = forms.reached(every)
+    each = peak / np.sqrt(np.maximum(powers, _COHERENT_LEAST) + _TINY * (peak * peak))
+    score = np.where(reaches, each, 0)
+    best = (best_along(score, axis=0), np.arange(f))
+    best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
+    missed = np.maximum.reduce(np.where(reaches, 0, each), axis=0)
+    return CoherentResult(score[best], best_weights, bound, missed)
+
+
+def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
+    """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers.
+
+    As they were at frequencies where no ERA is driven.
+    """
+    moved = shares * np.sqrt(np.maximum(expected, 0))
+    total = np.add.reduce(moved, axis=-1, keepdims=True)
+    return np.where(total > _COHERENT_LEAST, moved / np.maximum(total, _COHERENT_LEAST), shares)
+
+
+def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
+    """R (n, eras, eras) for weights (n, q) of the quiet fingertips."""
+    n, q, eras, _ = forms.quiet.shape
+    parts = forms.quiet.reshape(n, q, -1).view(np.float32)
+    return (shares[:, None] @ parts)[:, 0].view(np.complex64).reshape(n, eras, eras)
+
+
+def _optimise_targets(
+    R: Complex64Array, targets: Complex64Array, before: Complex64Array | None, gain: float
+) -> tuple[Complex64Array, Float32Array, Complex64Array]:
+    """Weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
+
+    Also their factors (n, t). Weights are R^-1 times a sum of the targets' conjugates, each times a
+    factor, so that what targets get follows from factors by the targets' Gram matrix, t by t. Each
+    iteration sets the factors' phases to those reached, and raises that of a weaker target. before:
+    factors to start from, None for the phases that the optimum for one target gives all others.
+    With a gain above 1 the level itself counts, of weights raised by it up to full stroke.
+    """
+    t, n, _ = targets.shape
+    fields = targets.swapaxes(0, 1)
+    columns = np.linalg.solve(R, fields.conj().swapaxes(1, 2))  # (n, eras, t)
+    gram = fields @ columns
+    if before is None:
+        count = min(t, TARGET_STARTS)
+        factors = _phases(gram[:, :, np.arange(count) * t // count].transpose(2, 0, 1))
+        steps = ALIGNMENTS
+    else:
+        factors, steps = before[None], REALIGNMENTS
+    tried, values = [], []
+    for _ in range(steps if t > 1 else 1):
+        if gain > 1:
+            reached = np.matvec(fields, _saturated(_largest_one(np.matvec(columns, factors)), gain))
+            cost = np.float32(1)
+        else:
+            reached = np.matvec(gram, factors)
+            cost = np.maximum(np.vecdot(factors, reached).real, _COHERENT_LEAST)
+        size = np.maximum(np.abs(reached), _LEAST_FIELD)
+        tried.append(factors)
+        values.append(np.minimum.reduce(size, axis=-1) / np.sqrt(cost))
+        factors = _largest_one(np.abs(factors) / size * _phases(reached))
+    every = np.concatenate(values)
+    best = (best_along(every, axis=0), np.arange(n))
+    factors = np.concatenate(tried)[best]
+    return _largest_one(np.matvec(columns, factors)), every[best], factors
+
+
+def _largest_one(values: Complex64Array) -> Complex64Array:
+    """Values scaled so that the largest magnitude along the last axis is 1."""
+    size = np.maximum.reduce(np.abs(values), axis=-1, keepdims=True)
+    return np.asarray(values / np.maximum(size, _COHERENT_LEAST), dtype=np.complex64)
+
+
+def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
+    """Weights raised by a gain up to full stroke."""
+    return np.asarray(weights / np.maximum(np.abs(weights), 1 / gain), dtype=np.complex64)
+
+
+def _phases(fields: Complex64Array) -> Complex64Array:
+    """Phase factors of fields."""
+    return np.asarray(fields / np.maximum(np.abs(fields), _LEAST_FIELD))
+
+
+ALTERNATIVES = 4
+"""Patterns that are kept, the best first, for drawn plates to choose among."""
+
+BATCH = 512
+"""Patterns that are looked at closely at first, those of the highest bounds."""
+
+_SWITCHED_LEAST = np.float32(1e-30)
+
+
+def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
+    """Find the patterns of the best robust scores that reach the level, best first.
+
+    Empty if none does. Exact: patterns are excluded by bounds only.
+    """
+    t, above = len(forms.targets), np.square(forms.threshold)[:, None, None]
+    expected = np.concatenate([forms.target_power, forms.quiet.swapaxes(0, 1)]).real
+    every = np.concatenate([power_forms(forms.targets), expected]) / above
+    powers = _with_silence(every.astype(np.float32))
+    alone = np.diagonal(powers[:, 1:], axis1=2, axis2=3)
+    loudest = (alone[2 * t :] / np.maximum(alone[:t].mean(axis=0), _SWITCHED_LEAST)).argmax(axis=0)
+    share = np.bincount(loudest.ravel(), minlength=len(powers) - 2 * t) / loudest.size
+    heard = np.tensordot(share.astype(np.float32), powers[2 * t :], axes=1)
+    target, quiet = _sums_of_pairs(np.stack([powers[:t].mean(axis=0), heard]))
+    bounds = target / np.maximum(quiet, _SWITCHED_LEAST)
+    one, other = np.triu_indices(forms.era_count, 1)
+    bounds[one + 1 < other, :, 0] = bounds[:-1, 0] = -1  # an ERA alone counts once
+    count, bound = BATCH, bounds.ravel()
+    while True:
+        order = np.argpartition(-bound, min(count, len(bound) - 1))
+        some = np.sort(order[:count])  # a partition's own order is another one elsewhere
+        pair, first, second = np.unravel_index(some, bounds.shape)
+        tones = np.array([[first, one[pair]], [second, other[pair]]])
+        score = np.where(bound[some] < 0, 0, _scores(forms, powers, *tones))
+        best = best_few(score, ALTERNATIVES)
+        if count >= len(bound) or score[best[-1]] >= bound[order[count]]:
+            break
+        count *= 4
+    return [
+        (float(np.sqrt(score[each])), _drive(tones[:, :, each].tolist(), forms.era_count))
+        for each in best.tolist()
+        if score[each] > 0
+    ]
+
+
+def _scores(forms: Forms, powers: Float32Array, one: IntArray, other: IntArray) -> Float32Array:
+    """Power ratios (m,) of patterns of two tones (2, m) of powers `_with_silence`.
+
+    0 where the level is not reached.
+    """
+    (i, a), (j, b), t = one, other, len(forms.targets)
+    sums = powers[:, i, a, a] + powers[:, j, b, b] + (i == j) * 2 * powers[:, i, a, b]
+    at, deviation = sums[:t], np.sqrt(np.maximum(sums[t : 2 * t] - sums[:t], 0))
+    reaches = np.sqrt(at) - np.float32(forms.level_margin) * deviation >= forms.wanted
+    ratio = at.min(axis=0) / np.maximum(sums[2 * t :].max(axis=0), _SWITCHED_LEAST)
+    return np.asarray(np.where(reaches.all(axis=0), ratio, 0))
+
+
+def max_sensation_switched(forms: Forms) -> float:
+    """Return the highest amplitude to threshold at the weakest target, the same pattern for all."""
+    return float(highest_levels((forms.targets / forms.threshold[:, None])[None])[0])
+
+
+def highest_levels(fields: Complex64Array) -> Float32Array:
+    """Highest amplitudes (m,) that a pattern gives the weakest of t targets, (m, t, f, eras)."""
+    found = [_sums_of_pairs(_with_silence(power_forms(each))).min(axis=0).max() for each in fields]
+    return np.sqrt(np.array(found, dtype=np.float32))
+
+
+def power_forms(fields: Complex64Array) -> Float32Array:
+    """Real parts of forms (c, f, eras, eras) of the squared magnitude of fields (c, f, eras)."""
+    return np.asarray((fields.conj()[..., None] * fields[..., None, :]).real)
+
+
+def _with_silence(powers: Float32Array) -> Float32Array:
+    """Forms (c, 1 + f, eras, eras): at the first frequency nothing plays."""
+    return np.pad(powers, [(0, 0), (1, 0), (0, 0), (0, 0)])
+
+
+def _sums_of_pairs(powers: Float32Array) -> Float32Array:
+    """Powers of all patterns of two ERAs, for every two (c, pairs, 1 + f, 1 + f).
+
+    By the frequency of each ERA; powers `_with_silence`.
+    """
+    one, other = np.triu_indices(powers.shape[-1], 1)
+    alone = np.diagonal(powers, axis1=2, axis2=3).swapaxes(1, 2)
+    sums = alone[:, one, :, None] + alone[:, other, None]
+    same = np.arange(powers.shape[1])
+    sums[:, :, same, same] += 2 * powers[:, :, one, other].swapaxes(1, 2)
+    return np.asarray(sums)
+
+
+def _drive(tones: list[list[int]], eras: int) -> Drive:
+    """ERAs at full stroke; of each the frequency, counted from 1, and its number."""
+    found: dict[int, Complex64Array] = {}
+    for row, era in sorted(tones):
+        if row:
+            found.setdefault(row - 1, np.zeros(eras, dtype=np.complex64))[era] = 1
+    return [*found.items()]

@@ -1,1 +1,0 @@
-"""Finite elements: mesh, matrices, and direct solutions of the plate."""

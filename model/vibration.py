@@ -1,0 +1,526 @@
+"""Steady vibration: what drives the plate, and how strongly it then moves where.
+
+Physical excitation of the plate, a tone per active ERA; its peak acceleration and nulls.
+
+ERAs at the same frequency add as complex numbers; only magnitudes of different frequencies add
+(paper Eq. 28). Magnitudes added within a frequency would wipe out the nodal lines.
+
+A map of the plate: peak acceleration on a regular raster, for any drive.
+
+Natural modes of a plate on any mesh, for any support.
+
+Discretisation error of natural frequencies and response, against a finer mesh.
+
+Without a converged response the error is estimated: of polynomials over the plate it is the sum of
+two changes of the response: by two further degrees, and where the compliance under forces that
+polynomials do not resolve is higher by 20 % and, under points, by a decade of the logarithm
+(`model.spectral.local_compliance`). Of finite elements it is the change to polynomials over the
+plate, which are solved in a tenth of the time of elements as accurate or less (`reference_mesh`).
+"""
+
+import cmath
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from scipy import linalg
+
+from model.arrays import ComplexArray, FloatArray, lattice
+from model.errors import InputError
+from model.fem import RIGID_BODY_MODES, Mesh, assemble, simply_supported_modes
+from model.files.csv_file import as_frame
+from model.processes import Progress, unseen
+from model.quantities import counted
+from model.reduction.free_modes import SpectralModes
+from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.reduced_plate import on_springs, reduce_free_plate
+from model.rig.meshes import mesh_of
+from model.rig.rig import Rig
+from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.structure.actuators import Actuator
+from model.structure.attachments import PointLoad, Source, footprints_of
+from model.structure.plate import Plate
+
+
+@dataclass(frozen=True)
+class Tone:
+    """One frequency [Hz], base amplitude a [m] and phase [rad]: y(t) = a sin(2 pi f t + phase)."""
+
+    frequency: float
+    amplitude: float
+    phase: float = 0.0
+
+    @classmethod
+    def from_phasor(cls, frequency: float, phasor: complex) -> Self:
+        """Make the tone of a phasor [m] at a frequency [Hz]."""
+        return cls(frequency, abs(phasor), cmath.phase(phasor))
+
+    @property
+    def phasor(self) -> complex:
+        """Complex amplitude a exp(i phase) [m]: y(t) = Im[phasor exp(2 pi i f t)]."""
+        return cmath.rect(self.amplitude, self.phase)
+
+
+Excitation: TypeAlias = Mapping[str, Tone]
+"""A tone per active ERA, by the ERA's name; an ERA that is not named is still."""
+
+
+G = 9.8
+"""Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
+
+NULL_SHARE = 0.1
+"""A null is below this share of the map's maximum."""
+
+
+def base_amplitudes(
+    excitation: Excitation, eras: Sequence[Source], *others: Excitation
+) -> tuple[FloatArray, ComplexArray]:
+    """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
+
+    others: that play at the same time. Raises InputError where no ERA is driven, or an unknown one.
+    """
+    tones = [each for one in (excitation, *others) for each in one.items()]
+    if not tones:
+        raise InputError("excitation: must drive at least one ERA")
+    names = [era.name for era in eras]
+    frequencies = sorted({tone.frequency for _, tone in tones})
+    amplitudes = np.zeros((len(frequencies), len(eras)), dtype=complex)
+    for name, tone in tones:
+        if name not in names:
+            raise InputError(f"the rig has no ERA {name!r}; it has {', '.join(names)}")
+        phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
+        amplitudes[frequencies.index(tone.frequency), names.index(name)] += phasor
+    return np.array(frequencies), amplitudes
+
+
+def tone_fields(
+    excitation: Excitation,
+    eras: Sequence[Source],
+    response: Callable[[FloatArray], ComplexArray],
+    *others: Excitation,
+) -> tuple[FloatArray, ComplexArray]:
+    """Complex acceleration [m/s²] at each distinct frequency: frequencies (f,) [Hz], field (f, p).
+
+    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p); others:
+    excitations that play at the same time.
+    """
+    frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
+    weights = amplitudes / np.array([era.full_level for era in eras])
+    return frequencies, np.einsum("fe,fep->fp", weights, response(frequencies))
+
+
+def peak_acceleration(amplitudes: FloatArray) -> FloatArray:
+    """Peak acceleration over time (p,) [m/s²] from amplitudes per frequency (f, p): their sum."""
+    return np.asarray(amplitudes.sum(axis=0))
+
+
+def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
+    """Positions [m] (n, 2) of the nulls of a map (len(y), len(x)): low local minima.
+
+    A curve of nulls shows as the lowest points along it.
+    """
+    from scipy.ndimage import minimum_filter  # only maps need it, and it takes long to load
+
+    low = peak <= NULL_SHARE * peak.max()
+    rows, columns = np.nonzero(low & (peak == minimum_filter(peak, size=3, mode="nearest")))
+    return np.column_stack([x[columns], y[rows]])
+
+
+MAX_POINTS = 1_000_000
+"""More would be finer than any screen, at some hundred bytes of memory each."""
+
+_AT_ONCE = 10_000  # points that are solved together, at some kilobytes each
+
+
+@dataclass(frozen=True)
+class PlateMap:
+    """Peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]: peak (ny, nx), and its nulls.
+
+    nulls: positions [m] (n, 2); frequencies (f,) [Hz] and field (f, ny, nx): the complex
+    acceleration [m/s²] at each, of which the peak is the sum of magnitudes. Phases are those of
+    exp(+i omega t), as a tone's.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    peak: FloatArray
+    nulls: FloatArray
+    frequencies: FloatArray
+    field: ComplexArray
+
+    def to_frame(self) -> Any:
+        """Points and peak acceleration as a pandas DataFrame, a row a point; needs pandas."""
+        x, y = np.meshgrid(self.x, self.y)
+        return as_frame({"x_m": x.ravel(), "y_m": y.ravel(), "peak_m_s2": self.peak.ravel()})
+
+    def __repr__(self) -> str:
+        return (
+            f"<PlateMap of {len(self.x)} x {len(self.y)} points, "
+            f"at most {self.peak.max():.3g} m/s², {counted(len(self.nulls), 'null')}>"
+        )
+
+
+def plate_map(
+    rig: Rig,
+    *excitations: Excitation,
+    raster: tuple[int, int] | None = None,
+    free: FreePlate | None = None,
+) -> PlateMap:
+    """Solve the rig's plate for excitations at once; the raster defaults to that of the mesh.
+
+    free: the same plate where it has been solved before. Raises InputError for a raster below 2x2
+    or of millions of points, or a frequency that the mesh cannot carry.
+    """
+    mesh = rig.mesh
+    columns, rows = raster or mesh.raster
+    if columns < 2 or rows < 2:
+        raise InputError(f"map: points must be 2x2 or more, got {columns}x{rows}")
+    if columns * rows > MAX_POINTS:
+        raise InputError(
+            f"map: points must be at most {MAX_POINTS}, got {columns}x{rows}; take a coarser one"
+        )
+    x = np.linspace(0, rig.plate.length, columns)
+    y = np.linspace(0, rig.plate.width, rows)
+    points = lattice(x, y)
+
+    def respond(driven: FloatArray) -> ComplexArray:
+        highest = max(rig.limits.frequency_max, float(driven.max()))
+        solved = free or solve_free_plate(rig.plate, mesh, frequency_max=highest)
+        parts = np.array_split(points, 1 + len(points) // _AT_ONCE)
+        found = [solved.acceleration(rig.eras, driven, part, loads=rig.masses) for part in parts]
+        return np.concatenate(found, axis=2)
+
+    frequencies, field = tone_fields(excitations[0], rig.eras, respond, *excitations[1:])
+    peak = peak_acceleration(np.abs(field)).reshape(rows, columns)
+    nulls = find_nulls(x, y, peak)
+    return PlateMap(x, y, peak, nulls, frequencies, field.reshape(-1, rows, columns))
+
+
+@dataclass(frozen=True, eq=False)
+class NaturalModes:
+    """Undamped modes: frequencies (n,) [Hz], ascending, and shapes by `at`.
+
+    basis: functions at points (p, m), of which the modes are columns of coordinates (m, n); mesh:
+    that they were solved on.
+    """
+
+    frequencies: FloatArray
+    basis: Callable[[FloatArray], Any]
+    coordinates: FloatArray
+    mesh: PlateMesh
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points (p, 2) [m], (p, n) [1/sqrt(kg)]."""
+        return np.asarray(self.basis(points) @ self.coordinates)
+
+    def only(self, chosen: slice) -> "NaturalModes":
+        """Some of them."""
+        return replace(
+            self,
+            frequencies=self.frequencies[chosen],
+            coordinates=self.coordinates[:, chosen],
+        )
+
+
+_BEYOND = 4.0  # times what a mesh resolves: coarse ones are compared with others, too
+
+
+def natural_modes(
+    rig: Rig,
+    count: int,
+    *,
+    support: str,
+    mesh: PlateMesh | None = None,
+    free: FreePlate | None = None,
+) -> NaturalModes:
+    """Solve for the lowest modes of a rig, on a mesh, by default its own.
+
+    support: free (elastic modes only), eras or simply-supported, for which polynomials over the
+    plate give way to finite elements; free: its plate where it has been solved on the mesh. Raises
+    InputError for a count below 1 or above what the mesh has, and for a simply supported plate of
+    layers.
+    """
+    if count < 1:
+        raise InputError(f"modes must be 1 or more, got {count}")
+    chosen = mesh or rig.mesh
+    if support == "simply-supported":
+        return _simply_supported(rig, count, chosen)
+    attached: list[Source | PointLoad] = [*rig.masses]
+    if support == "eras":
+        attached += rig.eras
+    gap = rig.plate.air_gap
+    # Air sealed in resists motion up and down; it only flows to and fro under tilts.
+    rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
+    highest = rig.limits.frequency_max
+    while True:
+        solved = free or solve_free_plate(rig.plate, chosen, frequency_max=highest)
+        modes = _modes_with(solved, attached)
+        found = int((modes.frequencies <= highest).sum()) - rigid
+        if found >= count:
+            break
+        if highest > _BEYOND * chosen.highest_frequency(rig.plate):
+            raise InputError(
+                f"modes must be at most {found} with mesh {chosen}, got {count}; take fewer modes "
+                "or a finer mesh"
+            )
+        highest, free = 1.5 * highest, None
+    return modes.only(slice(rigid, rigid + count))
+
+
+def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalModes:
+    """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
+    places = footprints_of(attached)
+    reduced = reduce_free_plate(free, places)
+    _, (M, _, K) = on_springs(reduced, [each.in_time for each in attached], reduced.at(places))
+    squares, coordinates = linalg.eigh(K, M)
+    frequencies = np.sqrt(np.maximum(squares, 0)) / (2 * np.pi)
+    return NaturalModes(frequencies, reduced.at, coordinates[: len(reduced.omega)], free.mesh)
+
+
+def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
+    """Modes of finite elements, whose shapes are those of the nodes."""
+    if rig.plate.is_layered:
+        raise InputError(
+            "support must be free or eras for a plate of layers or with an air gap, got "
+            "simply-supported: finite elements of it are not solved"
+        )
+    if isinstance(mesh, SpectralMesh):
+        mesh = Mesh.accurate(rig.plate, frequency_max=rig.limits.frequency_max)
+    matrices = assemble(rig.plate, mesh)
+    frequencies, unknowns = simply_supported_modes(matrices, count, rig.masses)
+    return NaturalModes(frequencies, matrices.deflection_at, unknowns, mesh)
+
+
+MAP_FREQUENCIES = (110.0, 250.0)
+"""Where the founding paper shows maps [Hz]."""
+
+MODE_COUNT = 12
+
+MOVED = 0.1e-3
+"""How far an ERA may be from where it should be [m]; few are mounted better."""
+
+FOOT = 5e-3
+"""Radius of a foot [m] that a point stands for."""
+
+# The coarsest MITC4 mesh of a study; on the paper's plate up to 500 Hz it is the paper's 12x9. Each
+# next one has twice as many elements along both sides.
+_COARSEST_PER_WAVELENGTH = 6.5
+_DOUBLINGS = 3
+
+# Relative to the plate's lowest bending frequency, below which a natural frequency is rounding of
+# free tilting on one or two ERAs.
+_MIN_FREQUENCY_RATIO = 1e-3
+
+# Raster for comparing responses, finer than half a wavelength.
+_RASTER = (49, 37)
+
+
+@dataclass(frozen=True)
+class MeshError:
+    """Discretisation error of a mesh, relative to the reference.
+
+    frequency: of the natural frequencies that are compared, signed, (n,); response: of the
+    acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,);
+    estimate: of that error, without the reference, of polynomials only.
+    """
+
+    mesh: PlateMesh
+    frequency: FloatArray
+    response: FloatArray
+    estimate: FloatArray | None
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Errors of several meshes against a reference mesh, response at f frequencies.
+
+    natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,). For
+    comparison, by how much the response changes, as `MeshError.response`, where every ERA stands
+    MOVED nearer to the middle, and where it stands on a disc FOOT wider in radius.
+    """
+
+    reference: PlateMesh
+    natural_frequencies: FloatArray
+    errors: tuple[MeshError, ...]
+    by_place: FloatArray
+    by_foot: FloatArray
+
+
+def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
+    """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own.
+
+    For a plate of layers or with air behind it, which are solved in polynomials only, three degrees
+    in place of meshes of elements.
+    """
+    plate, high = rig.plate, rig.limits.frequency_max
+    stiffness = rig.largest_stiffness
+    foot = min(era.foot for era in rig.eras)
+    automatic = mesh_of("auto", plate, frequency_max=high, stiffness=stiffness, foot=foot)
+    if plate.is_layered and isinstance(automatic, SpectralMesh):
+        lowest = automatic.resolving(plate, high)
+        return tuple(dict.fromkeys([lowest, automatic, automatic.finer(), rig.mesh]))
+    size = plate.bending_wavelength(high) / _COARSEST_PER_WAVELENGTH
+    nx, ny = (max(1, math.ceil(side / size)) for side in (plate.length, plate.width))
+    plain = [Mesh(nx << n, ny << n, plate.length, plate.width) for n in range(_DOUBLINGS + 1)]
+    chosen = [*plain, automatic, Mesh.accurate(plate, frequency_max=high), rig.mesh]
+    return tuple(dict.fromkeys(chosen))
+
+
+def default_frequencies(rig: Rig) -> FloatArray:
+    """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
+    high = rig.limits.frequency_max
+    within = [frequency for frequency in MAP_FREQUENCIES if frequency <= high]
+    return np.array(within or [high])
+
+
+def study_convergence(
+    rig: Rig,
+    meshes: Sequence[PlateMesh],
+    *,
+    frequencies: Sequence[float] | FloatArray,
+    progress: Progress = unseen,
+) -> Convergence:
+    """Solve a rig on each mesh and on the reference.
+
+    frequencies (f,) [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot
+    resolve. progress is called with the number of solved meshes, the reference first, and of all.
+    """
+    high = rig.limits.frequency_max
+    checked, sides = np.asarray(frequencies, dtype=float), (rig.plate.length, rig.plate.width)
+    points = lattice(*(np.linspace(0, side, n) for side, n in zip(sides, _RASTER, strict=True)))
+    if (checked > high).any():
+        raise InputError(
+            f"frequencies must be at most the rig's limits.frequency of {high:g} Hz, got "
+            f"{checked.max():g} Hz; take lower frequencies or raise the limit"
+        )
+
+    def response(of: FreePlate, eras: Sequence[Actuator]) -> ComplexArray:
+        return of.acceleration(eras, checked, points, loads=rig.masses)
+
+    reference = _solved(rig, _reference(rig))
+    exact, exact_response = _natural_frequencies(rig, reference), response(reference, rig.eras)
+    supported = exact > _MIN_FREQUENCY_RATIO * rig.plate.lowest_bending_frequency
+    errors = []
+    for done, mesh in enumerate(meshes, start=1):
+        progress(done, 1 + len(meshes))
+        free, estimate = _solved(rig, mesh), None
+        if isinstance(mesh, SpectralMesh):
+            estimate = estimate_error(
+                free, mesh.finer(), rig.eras, checked, points, loads=rig.masses
+            ).max(axis=1)
+        found = _relative_error(response(free, rig.eras), exact_response).max(axis=1)
+        of_frequencies = _natural_frequencies(rig, free)[supported] / exact[supported] - 1
+        errors.append(MeshError(mesh, of_frequencies, found, estimate))
+    progress(1 + len(meshes), 1 + len(meshes))
+    accurate = rig.mesh if rig.plate.is_layered else Mesh.accurate(rig.plate, frequency_max=high)
+    plain = _solved(rig, accurate)
+    before = response(plain, rig.eras)
+    by_place, by_foot = (
+        _relative_error(response(plain, eras), before).max(axis=1)
+        for eras in (
+            [_nearer_the_middle(era, rig.plate) for era in rig.eras],
+            [replace(era, foot=era.foot + FOOT) for era in rig.eras],
+        )
+    )
+    return Convergence(
+        reference.mesh,
+        exact[supported],
+        tuple(errors),
+        by_place=by_place,
+        by_foot=by_foot,
+    )
+
+
+def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
+    """Of fields over points (f, eras, points), relative L2, (f, eras)."""
+    size = np.linalg.norm(exact, axis=2)
+    return np.asarray(np.linalg.norm(found - exact, axis=2) / size)
+
+
+def _nearer_the_middle(era: Actuator, plate: Plate) -> Actuator:
+    """An ERA moved by MOVED along both sides."""
+    x, y = (
+        at + MOVED * np.sign(side / 2 - at)
+        for at, side in ((era.x, plate.length), (era.y, plate.width))
+    )
+    return replace(era, x=float(x), y=float(y))
+
+
+def _reference(rig: Rig) -> PlateMesh:
+    """The mesh that others are compared with: of elements, or of polynomials for layers."""
+    high = rig.limits.frequency_max
+    if not rig.plate.is_layered:
+        return reference_mesh(rig.plate, frequency_max=high)
+    automatic = mesh_of("auto", rig.plate, frequency_max=high)
+    return replace(automatic, nx=2 * automatic.nx, ny=2 * automatic.ny)
+
+
+def _natural_frequencies(rig: Rig, free: FreePlate) -> FloatArray:
+    solved = natural_modes(rig, MODE_COUNT, support="eras", mesh=free.mesh, free=free)
+    return solved.frequencies
+
+
+def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
+    return solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
+
+
+_MAX_FIELDS = 1_000_000  # values at once, of 16 bytes each
+_ACCURACY = 0.005  # of polynomials before their two further degrees
+
+
+def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
+    """Half as many elements again along both sides as an accurate mesh, in strips half as wide."""
+    accurate = Mesh.accurate(plate, frequency_max=frequency_max)
+    nx, ny = (math.ceil(1.5 * count) for count in (accurate.nx, accurate.ny))
+    return replace(accurate, nx=nx, ny=ny, strip=accurate.strip / 2)
+
+
+def finer_mesh(
+    plate: Plate, mesh: PlateMesh, *, frequency_max: float, stiffness: float = 0.0
+) -> PlateMesh:
+    """The mesh whose response a mesh is compared with, accurate up to a frequency [Hz].
+
+    Two further degrees of polynomials; for elements those of polynomials, or elements where there
+    would be too many. stiffness [N/m]: of the stiffest ERA.
+    """
+    if isinstance(mesh, SpectralMesh):
+        return mesh.finer()
+    polynomials = SpectralMesh.accurate(
+        plate, frequency_max=frequency_max, accuracy=_ACCURACY, stiffness=stiffness
+    )
+    if polynomials is None:
+        return reference_mesh(plate, frequency_max=frequency_max)
+    return polynomials.finer()
+
+
+def estimate_error(
+    free: FreePlate,
+    finer: PlateMesh,
+    eras: Sequence[Actuator],
+    frequencies: FloatArray,
+    points: FloatArray,
+    *,
+    loads: Sequence[PointLoad] = (),
+) -> FloatArray:
+    """Estimated error of the acceleration over points (p, 2) [m], relative L2, (f, eras).
+
+    finer: of `finer_mesh`; frequencies (f,) [Hz]. Each ERA is driven alone.
+    """
+
+    plates = [solve_free_plate(free.plate, finer, frequency_max=free.frequency_max), free]
+    if isinstance(free.modes, SpectralModes):
+        plates.append(replace(free, modes=free.modes.softer()))
+    squares = np.zeros((len(plates), len(frequencies), len(eras)))
+    # A few points at a time: whole fields of sixteen ERAs take a gigabyte.
+    parts = math.ceil(len(frequencies) * len(eras) * len(points) / _MAX_FIELDS)
+    for few in np.array_split(points, parts):
+        exact, own, *others = (
+            of.acceleration(eras, frequencies, few, loads=loads) for of in plates
+        )
+        differences = [own - each for each in (exact, *others)]
+        for square, field in zip(squares, (exact, *differences), strict=True):
+            square += np.linalg.norm(field, axis=2) ** 2
+    size, *errors = np.sqrt(squares)
+    return np.asarray(sum(errors) / size)

@@ -1,1 +1,0 @@
-"""Steady vibration: what drives the plate, and how strongly it then moves where."""

@@ -122,8 +122,8 @@ def _print_row(
 ) -> None:
     import numpy as np
 
-    from model.answer.fingers import ANY_BAND, Finger, Stimulus
     from model.answer.plan import answer
+    from model.answer.stimulus import ANY_BAND, Finger, Stimulus
 
     choices = list(combinations(BANDS, contents)) if has_bands else [(ANY_BAND,) * contents]
 
@@ -168,9 +168,8 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     import numpy as np
 
     from model import drive_modes as coherent
-    from model.answer.search import Contents, Stream
-    from model.answer.search_in_c import choose_tones
-    from model.answer.search_in_numpy import choose_by_numpy
+    from model.answer.stimulus import Contents, Stream
+    from model.answer.tone_search import choose_by_numpy, choose_tones
 
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
     coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS = 20, 400, 100
@@ -228,8 +227,8 @@ def _print_modulated(
     """Print what side bands cost the worst finger."""
     import numpy as np
 
-    from model.answer.fingers import Finger, Stimulus
     from model.answer.plan import answer
+    from model.answer.stimulus import Finger, Stimulus
 
     steady, cost = [], []
     for places in _sets(table, contents, quiet, count=count, apart=apart):
@@ -262,9 +261,8 @@ def _print_distorted(
     """Print how far each content is above the second harmonics, sums and differences there."""
     import numpy as np
 
-    from model.answer.fingers import Finger, Stimulus
     from model.answer.plan import answer
-    from model.answer.search import APART_HZ
+    from model.answer.stimulus import APART_HZ, Finger, Stimulus
     from model.vibration import base_amplitudes
 
     above, near = [], []
@@ -314,7 +312,7 @@ def _kept(
     """Share of held-out plates on which the worst finger has what is promised."""
     import numpy as np
 
-    from model.answer.fingers import Placement
+    from model.answer.stimulus import Placement
     from model.study.exact_plates import draw_plates, powers_on
 
     count = len(found.layers) + len(quiet)

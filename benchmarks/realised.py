@@ -18,7 +18,7 @@ from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
 
 if TYPE_CHECKING:
-    from model.answer.fingers import Placement
+    from model.answer.stimulus import Placement
     from model.arrays import FloatArray
     from model.rig.rig import Rig
     from model.vibration import Excitation
@@ -80,8 +80,8 @@ def _line(row: Row, sets: int) -> str:
 
     from benchmarks.identification.answers import DRIVES
     from benchmarks.identification.plates import FREQUENCIES
-    from model.answer.fingers import Placement
     from model.answer.plan import query
+    from model.answer.stimulus import Placement
     from model.rig.file import load_rig
     from model.table.build import build_table
 

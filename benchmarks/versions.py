@@ -25,7 +25,7 @@ from model.answer.plan import query
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from model.answer.fingers import Placement
+    from model.answer.stimulus import Placement
     from model.rig.rig import Rig
     from model.table.table import LocalizationTable
 
@@ -81,7 +81,7 @@ def _placement(rig: "Rig", quiet: int, number: int) -> "Placement":
     """The fingers of a set."""
     import numpy as np
 
-    from model.answer.fingers import Placement
+    from model.answer.stimulus import Placement
 
     rng = np.random.default_rng([SEED, quiet, number])
     size = (rig.plate.length, rig.plate.width)

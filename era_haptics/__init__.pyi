@@ -31,10 +31,10 @@ from era_haptics.tables import table as table
 from model.answer.answer import Answer as Answer
 from model.answer.answer import Layer as Layer
 from model.answer.answer import Sensation as Sensation
-from model.answer.course import Course as Course
-from model.answer.fingers import Finger as Finger
-from model.answer.fingers import Stimulus as Stimulus
-from model.answer.measures import Measures as Measures
+from model.answer.answer_report import Measures as Measures
+from model.answer.stimulus import Course as Course
+from model.answer.stimulus import Finger as Finger
+from model.answer.stimulus import Stimulus as Stimulus
 from model.calibration.calibration_result import Calibration as Calibration
 from model.design.request import design as design
 from model.design.run import Assessment as Assessment

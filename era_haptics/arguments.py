@@ -6,7 +6,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from model.answer.fingers import Finger
+from model.answer.stimulus import Finger
 from model.arrays import FloatArray, Point
 from model.errors import InputError, expect, expect_number, is_whole, shown
 from model.rig.rig import Rig

@@ -20,7 +20,7 @@ from era_haptics.arguments import (
 )
 from era_haptics.drive import Played, layers_of
 from model.answer.answer import Answer
-from model.answer.fingers import Placement, Stimulus, check_on_plate, together
+from model.answer.stimulus import Placement, Stimulus, check_on_plate, together
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError, expect_number, is_whole, shown
 from model.reduction.free_plate import FreePlate, solve_free_plate

@@ -12,12 +12,10 @@ from era_haptics.arguments import (
     expect_rig,
 )
 from model.answer.answer import Answer
-from model.answer.fingers import MUST, Finger, Stimulus
-from model.answer.measures import Measures
-from model.answer.measures import measures as _measures
+from model.answer.answer_report import Measures, Timing
+from model.answer.answer_report import measures as _measures
 from model.answer.plan import answer as _answer
-from model.answer.search import APART_HZ
-from model.answer.timing import Timing
+from model.answer.stimulus import APART_HZ, MUST, Finger, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError, expect, expect_number, shown
 from model.finger import STRONG_DB_SL, Grid

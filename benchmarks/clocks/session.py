@@ -16,7 +16,7 @@ from controller.play.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.table import CLOCK_TURN, FEATURES
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads
 from sim.far_ends.opening import Wire

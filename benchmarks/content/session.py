@@ -20,7 +20,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.play.intent import CLICK
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.config.shapes import Circle
 from model.finger import FINGERTIP_RADIUS
 from registry import threads

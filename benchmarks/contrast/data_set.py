@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.arrays import Point
 from model.config.document import parse_document
 from model.rig.file import rig_of

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from benchmarks.contrast.data_set import VERSION, ContactSet, DataSet, data_set
 from benchmarks.contrast.optimum import optimum
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.uncertainty import Uncertainty

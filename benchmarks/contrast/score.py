@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.contrast.data_set import BenchmarkPlate, ContactSet, DataSet, data_set
 from model.answer.answer import Layer
-from model.answer.fingers import Stimulus, together
+from model.answer.stimulus import Stimulus, together
 from model.finger import decibels
 from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate

@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.identification.hidden import finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig

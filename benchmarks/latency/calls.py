@@ -20,7 +20,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.wires.serial_line.host import SerialWire
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import cached_table

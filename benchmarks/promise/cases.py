@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.answer.fingers import ANY_BAND, Finger, Stimulus
 from model.answer.plan import answer
+from model.answer.stimulus import ANY_BAND, Finger, Stimulus
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty

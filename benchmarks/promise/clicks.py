@@ -76,8 +76,8 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
     """What is played for a click with one to three quiet fingers in turn."""
     import numpy as np
 
-    from model.answer.fingers import Placement
     from model.answer.plan import query
+    from model.answer.stimulus import Placement
     from model.study.random_contacts import random_contacts
 
     rng, found = np.random.default_rng(seed), []
@@ -163,7 +163,7 @@ def _felt_on(
     """
     import numpy as np
 
-    from model.answer.over_duration import DriveEnvelope, RingingUnderFingers
+    from model.answer.answer import DriveEnvelope, RingingUnderFingers
     from model.finger import fingertip_points, fingertip_weights
     from model.vibration import Tone, base_amplitudes
 

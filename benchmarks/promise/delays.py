@@ -24,8 +24,8 @@ from benchmarks.promise.cases import LEVEL_DB_SL, Case
 from benchmarks.setting import random_contacts
 from controller.play.counted_clocks import MARGIN
 from model.answer.answer import Answer
-from model.answer.fingers import Finger, Placement, Stimulus
 from model.answer.plan import answer
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray, Point
 from model.ensemble.delays import ClockErrors
 from model.finger import FINGERTIP_RADIUS

@@ -36,8 +36,8 @@ def main() -> None:
     import numpy as np
 
     from benchmarks.promise.cases import CASES
-    from model.answer.fingers import Finger, Stimulus
     from model.answer.plan import answer
+    from model.answer.stimulus import Finger, Stimulus
     from model.study.exact_plates import draw_plates
     from model.study.random_contacts import random_contacts
 
@@ -70,7 +70,7 @@ def contrasts_on(table: "LocalizationTable", found: "Answer", plates: "Plates") 
     """Contrast of each finger to the other's content on plates [dB], (2, d)."""
     import numpy as np
 
-    from model.answer.fingers import Placement
+    from model.answer.stimulus import Placement
     from model.study.exact_plates import harmonics_on, powers_on
     from model.table.table import read_fingertips
 

@@ -33,7 +33,7 @@ from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
 from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.observer import PlayReport
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.opening import Wire

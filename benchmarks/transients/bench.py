@@ -16,8 +16,8 @@ from benchmarks.transients.cases import (
     quantised,
     with_errors,
 )
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray
 from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate

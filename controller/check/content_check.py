@@ -20,8 +20,8 @@ from controller.content.rendition import (
     requested_level,
 )
 from model.answer.answer import Answer
-from model.answer.fingers import Finger, Stimulus, check_level
 from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus, check_level
 from model.arrays import FloatArray, best_of
 from model.drive_modes import DRIVE_MODES
 from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold

@@ -12,7 +12,7 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
-from model.answer.exposure import exposures
+from model.answer.answer_report import exposures
 from model.arrays import NEARLY, FloatArray
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError

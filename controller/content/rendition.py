@@ -12,8 +12,7 @@ import numpy as np
 
 from controller.content.pattern import Pattern, Transient, along
 from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
-from model.answer.course import Course
-from model.answer.fingers import MAX_MODULATION, MIN_MODULATION
+from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray, best_of
 from model.finger import decibels
 from model.transients.base_motion import KNOT_STEP, rise

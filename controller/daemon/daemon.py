@@ -29,7 +29,7 @@ from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
 from registry import threads

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from controller.demo.touch_row import TouchRow
 from model.answer.answer import Sensation
-from model.answer.fingers import Finger
+from model.answer.stimulus import Finger
 from model.arrays import ranked_by
 from model.figures import save_figure
 from model.figures.contents_picture import contents_figure

@@ -11,8 +11,7 @@ from pydantic import Strict, model_validator
 from controller.effects.region import Region
 from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.course import Course
-from model.answer.fingers import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION
+from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray
 from model.config.sections import Quantity, Section
 from model.config.units import FREQUENCY, LEVEL

@@ -15,7 +15,7 @@ from controller.effects.effect import (
 from controller.effects.kinds import effect_kind, effect_kinds
 from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import ON_MOVE, ON_RELEASE, USES, Region
-from model.answer.fingers import MAX_LEVEL_DB_SL
+from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.config.document import Document, KeyPath, read_document
 from model.config.kinds import CheckedFile, ConfigKind
 from model.config.sections import Quantity, Section, Validation

@@ -8,7 +8,7 @@ import asyncio
 
 from controller.learning.messages import Answers
 from controller.play.loop import Controller
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.table.table import LocalizationTable
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from controller.sources.contacts import Contact
-from model.answer.answer import HELD_BACK, MIXED, OWN, Answer, Sensation, verdict_of
-from model.answer.fingers import MUST, Finger
-from model.answer.over_duration import ONSET_RAMP
+from model.answer.answer import HELD_BACK, MIXED, ONSET_RAMP, OWN, Answer, Sensation, verdict_of
+from model.answer.stimulus import MUST, Finger
 from model.arrays import Point
 from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS
 from model.structure.attachments import MIN_LOAD

@@ -23,8 +23,8 @@ from controller.play.joint_answer import (
 )
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer
-from model.answer.search import APART_HZ
-from model.answer.strength import scaled
+from model.answer.promise import scaled
+from model.answer.stimulus import APART_HZ
 from model.arrays import NEARLY
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable

@@ -10,8 +10,7 @@ import numpy as np
 from controller.play.intent import Gains, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
-from model.answer.course import Course
-from model.answer.fingers import Placement
+from model.answer.stimulus import Course, Placement
 from model.finger import detection_threshold, fingertip_points
 from model.table.table import LocalizationTable
 

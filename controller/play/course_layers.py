@@ -9,7 +9,7 @@ from controller.play.layer_content import LayerContent
 from controller.play.pieces import HELD, piece_of
 from controller.play.routing import Drive, PlateLayer, SetBuilder, full_drive
 from model.answer import answer
-from model.answer.course import Course
+from model.answer.stimulus import Course
 
 MIN_LEFT = 0.001
 """Time [s] of a pulse that is about to end."""

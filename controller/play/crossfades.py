@@ -19,8 +19,8 @@ from controller.play.joint_answer import Shape, answered, selection_of
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import SAME_LEVEL, Answer
 from model.answer.plan import worst_of
-from model.answer.promised import with_tones
-from model.answer.search import APART_HZ
+from model.answer.promise import with_tones
+from model.answer.stimulus import APART_HZ
 from model.arrays import NEARLY
 from model.drive_modes import UNRESTRICTED
 from model.table.table import LocalizationTable

@@ -11,8 +11,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from controller.sources.contacts import Contact, ContactKey
-from model.answer.course import Course
-from model.answer.fingers import SHAPED_FROM
+from model.answer.stimulus import SHAPED_FROM, Course
 from model.arrays import FloatArray, best_of
 from model.finger import STRONG_DB_SL
 

@@ -27,8 +27,8 @@ from model.answer.answer import (
     Layer,
     Sensation,
 )
-from model.answer.fingers import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
 from model.answer.plan import answer
+from model.answer.stimulus import ANY, BY_NAME, NEVER, Finger, Placement, Stimulus
 from model.arrays import Complex64Array, FloatArray
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes

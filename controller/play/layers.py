@@ -33,8 +33,8 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.sets import is_vibrating
 from drivers.protocol.table import QUANTITIES
 from model.answer import answer
-from model.answer.over_duration import FADE_RAMP
-from model.answer.timing import Timing
+from model.answer.answer import FADE_RAMP
+from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.

@@ -10,8 +10,8 @@ from controller.play.planner import Plan
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.play.intent import Pulse
-from model.answer.course import KNOT_STEP, Course
+from model.answer.stimulus import KNOT_STEP, Course
 
 PLAIN_STEP = 0.050
 """Time [s] of ramps, where amplifiers have no knots, of which each is a set of its own."""

@@ -19,11 +19,10 @@ from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.timing import HEARTBEAT
-from model.answer.answer import Limits
-from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
-from model.answer.over_duration import FADE_RAMP
+from model.answer.answer import FADE_RAMP, Limits
+from model.answer.answer_report import Timing
 from model.answer.plan import prepare_answers, query
-from model.answer.timing import Timing
+from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text

@@ -21,9 +21,9 @@ from drivers.protocol.sets import Envelope, LayerSet
 from drivers.protocol.table import QUANTITIES
 from model import vibration as physics
 from model.answer import answer
-from model.answer.fingers import Placement
-from model.answer.over_duration import FADE_RAMP
-from model.answer.timing import Timing
+from model.answer.answer import FADE_RAMP
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.transients.base_motion import BaseEnvelope, Envelopes

@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from model.answer.fingers import check_on_plate
+from model.answer.stimulus import check_on_plate
 from model.arrays import Point
 from model.calibration.responses_file import sensor_mass
 from model.errors import InputError

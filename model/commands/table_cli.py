@@ -63,7 +63,7 @@ def query(
     Or with --own a vibration for each of several fingers. Print frequency, level and phase of each
     ERA, and predicted levels and contrast.
     """
-    from model.answer.as_json import query_one
+    from model.answer.answer_report import query_one
     from model.table.file import load_table
 
     if batch is not None:
@@ -205,7 +205,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
 
     defaults: of keys that lines leave out.
     """
-    from model.answer.as_json import query_batch
+    from model.answer.answer_report import query_batch
     from model.table.file import load_table
     from registry.files import regular_file
 

@@ -8,7 +8,7 @@
 #include "forms.h"
 #include "search.h"
 
-/* How tones are chosen: constants of `model.answer.search` and of the searches. */
+/* How tones are chosen: constants of `model.answer.stimulus` and of the searches. */
 typedef struct {
     int kept, missing;             /* frequencies that are ranked first, and how many of these may miss the level */
     int max_by_point, pruning_step; /* other fingers whose points count one by one; of the plates that judge first */

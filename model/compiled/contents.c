@@ -1,4 +1,4 @@
-/* From fingers to the tones of all their contents and what they promise: `model.answer.search` in C. */
+/* From fingers to the tones of all their contents and what they promise: `model.answer.stimulus` in C. */
 #include "candidates.h"
 #include "promise.h"
 

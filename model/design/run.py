@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray, IntArray, best_by, best_first
 from model.config.document import Document
 from model.design.layout_keys import layout_keys

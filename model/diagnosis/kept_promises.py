@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.diagnosis.verdict import Verdict
 from model.errors import InputError
 from model.rig.rig import Rig

@@ -13,8 +13,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from model.answer.answer import Answer, Layer
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point, lattice
 from model.errors import InputError
 from model.figures.drawing import COLORS, draw_eras, label_plate

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.answer.fingers import MIN_LEVEL_DB_SL, Placement
 from model.answer.plan import query
+from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import FloatArray
 from model.ensemble.draws import PERCENTILE
 from model.identification.identify import Identification

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer, worst_of
+from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray
 from model.drive_modes import UNRESTRICTED
 from model.ensemble.delays import ClockErrors

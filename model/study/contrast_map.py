@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.fingers import Placement, check_on_plate
+from model.answer.stimulus import Placement, check_on_plate
 from model.arrays import FloatArray, Point, nullable
 from model.drive_modes import checked_mode
 from model.errors import InputError

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.draws import over_fingertips

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger import FELT_DB_SL, highest_measured

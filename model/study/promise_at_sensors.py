@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import percentile
 from model.errors import InputError

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.answer.answer import Answer
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger import (

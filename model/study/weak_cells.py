@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, Grid

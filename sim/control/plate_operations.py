@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from model.answer.fingers import check_on_plate
+from model.answer.stimulus import check_on_plate
 from model.errors import InputError
 from model.structure.attachments import PointLoad
 from sim.control.context import SimulationContext

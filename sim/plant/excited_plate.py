@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from model.answer.answer import Layer
-from model.answer.fingers import Finger, check_fingers
+from model.answer.stimulus import Finger, check_fingers
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.files.csv_file import as_frame

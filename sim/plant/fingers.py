@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from model.answer.fingers import check_on_plate
+from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.finger import felt_part, fingertip_points, fingertip_weights

@@ -14,7 +14,7 @@ from zlib import crc32
 import numpy as np
 
 from drivers.protocol.table import CLOCK_TURN
-from model.answer.fingers import Finger
+from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.meshes import mesh_of

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.answer.fingers import check_on_plate
+from model.answer.stimulus import check_on_plate
 from model.arrays import FloatArray
 from model.errors import InputError
 from sim.bench.bench import Bench

@@ -17,8 +17,8 @@ from benchmarks.direct_plate import direct_responder
 from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
 from long_form import shortly
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
 from model.ensemble.delays import ClockErrors
 from model.finger import (

@@ -18,7 +18,7 @@ from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.observer import PlayReport
 from drivers.judge.watching.capture import Violation
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable

@@ -22,7 +22,7 @@ from ctypes import CDLL, c_char_p
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.compiled.kernels import processor_features, versions
 
 ROOT = Path(__file__).parents[2]

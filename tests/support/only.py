@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from model.answer.answer import Answer, Layer, Sensation
-from model.answer.fingers import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus
 from model.answer.plan import answer, query
+from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus
 from model.arrays import Point
 from model.table.table import LocalizationTable
 from model.vibration import Excitation

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from model.answer.fingers import Placement
-from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.promise import FingersOnPlate
+from model.answer.stimulus import Placement
 from model.drive_modes import Forms
 from model.fem import ELEMENTS, Mesh
 from model.rig.rig import Rig

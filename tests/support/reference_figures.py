@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from model.answer.fingers import Placement
-from model.answer.measures import measures as measures_of
+from model.answer.answer_report import Timing
+from model.answer.answer_report import measures as measures_of
 from model.answer.plan import query
-from model.answer.timing import Timing
+from model.answer.stimulus import Placement
 from model.caching import NUMERICS_VERSION
 from model.design.area import area_of
 from model.design.contacts import anywhere

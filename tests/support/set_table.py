@@ -14,10 +14,9 @@ import numpy as np
 
 from controller.play import joint_answer, planner
 from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
-from model.answer.fingers import Finger, Placement, Stimulus, together
 from model.answer.plan import answer, prepare_answers, query
-from model.answer.search import Contents, Stream, Tones
-from model.answer.strength import scaled
+from model.answer.promise import scaled
+from model.answer.stimulus import Contents, Finger, Placement, Stimulus, Stream, Tones, together
 from model.arrays import FloatArray
 from model.ensemble.delays import ClockErrors
 from model.fem import Mesh

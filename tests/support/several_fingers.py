@@ -25,7 +25,7 @@ from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.playing.contents import Layer
 from model.answer.answer import Limits
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.arrays import FloatArray
 from model.config.shapes import Rectangle
 from model.finger import detection_threshold

@@ -14,7 +14,7 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.effects.texture import Texture
 from controller.play.intent import IntentSource
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.config.shapes import Rectangle
 from model.finger import STRONG_DB_SL, Grid
 from model.rig.file import load_rig

@@ -27,7 +27,7 @@ from controller.play.chooser import Chooser
 from controller.sources import udp_source
 from daemon_bench import ENABLED, DaemonBench, daemon_table, holding, ready_daemon
 from memory_machine import MemoryMachine
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from registry import threads
 from sim.transport.far_end import FarEnd
 from tuio_messages import frame

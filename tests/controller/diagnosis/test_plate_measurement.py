@@ -20,8 +20,8 @@ from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
 from drivers.host.sensors import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify

@@ -32,7 +32,7 @@ from controller.learning.messages import (
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
 from drivers.playing.contents import Layer, Tone
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.learned_table import LearnedTable

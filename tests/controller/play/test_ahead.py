@@ -12,8 +12,8 @@ from controller.play.intent import Target
 from controller.play.joint_answer import answered, selection_of
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.motion import AT_REST, Motion
-from model.answer.fingers import Finger, Stimulus
 from model.answer.plan import answer
+from model.answer.stimulus import Finger, Stimulus
 from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 

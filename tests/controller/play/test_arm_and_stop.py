@@ -13,7 +13,7 @@ from drivers.errors import LinkError
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.records import Refusal, Values
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.rig.rig import Channel
 from newest_contact import BuzzNewestContact

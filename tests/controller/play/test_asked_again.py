@@ -17,7 +17,7 @@ from controller.sources.contacts import Contact
 from drivers.errors import CommandRefused
 from drivers.host.group import Group
 from long_form import shortly
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table

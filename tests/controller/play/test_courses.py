@@ -14,7 +14,7 @@ from controller.effects.file import File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact
-from model.answer.course import Course
+from model.answer.stimulus import Course
 from model.vibration import Tone
 from set_chain import FINGER, OTHER, set_running
 from several_fingers import LEFT, fingers_on, table

@@ -12,8 +12,8 @@ from controller.effects.file import File
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
-from model.answer.course import STRONGEST
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
+from model.answer.stimulus import STRONGEST
 from model.config.shapes import Circle
 from model.rig.file import load_rig
 from model.table.build import build_table

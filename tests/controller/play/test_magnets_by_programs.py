@@ -26,7 +26,7 @@ from controller.effects.region import Region
 from controller.effects.texture import Texture
 from long_form import shortly
 from magnets import Magnets, Outputs
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.arrays import ComplexArray
 from model.config.shapes import Circle
 from model.rig.file import parse_rig

@@ -14,9 +14,9 @@ import pytest
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from magnets import STEP, Magnets
 from model.answer.answer import Answer, Limits
-from model.answer.fingers import Finger, Stimulus
+from model.answer.answer_report import Timing
 from model.answer.plan import answer
-from model.answer.timing import Timing
+from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, Point
 from model.rig.file import load_rig
 from model.rig.rig import Rig

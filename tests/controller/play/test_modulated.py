@@ -17,8 +17,8 @@ from controller.play.layer_content import LayerContent
 from controller.play.layers import Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 from model.config.shapes import Rectangle
 from model.vibration import Tone
 from paper_table import smooth_rig

@@ -15,7 +15,7 @@ from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
-from model.answer.fingers import Finger, Stimulus
+from model.answer.stimulus import Finger, Stimulus
 from model.errors import InputError
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable

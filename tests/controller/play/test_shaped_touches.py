@@ -20,7 +20,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.protocol.sets import Envelope
 from drivers.protocol.table import QUANTITIES
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.transients.base_motion import BaseEnvelope
 from set_chain import FINGER, OTHER, set_running
 from set_table import SetTiming

@@ -16,7 +16,7 @@ from controller.play.counted_clocks import CountedClocks
 from controller.sources.contacts import Contact, ContactKey
 from drivers.host.group import Group
 from drivers.protocol.table import CLOCK_UNKNOWN
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.rig.rig import Channel, Rig
 from model.rig.uncertainty import Uncertainty

@@ -9,12 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 import era_haptics
-from model.answer.as_json import query_one
-from model.answer.fingers import NEVER, Finger, Placement, Stimulus
+from model.answer.answer_report import query_one
 from model.answer.plan import answer as answer_by_table
 from model.answer.plan import prepare_answers
-from model.answer.promised import felt_amplitudes, loudest_power
-from model.answer.search_in_c import choose_tones
+from model.answer.promise import felt_amplitudes, loudest_power
+from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
+from model.answer.tone_search import choose_tones
 from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold

@@ -8,8 +8,8 @@ from unittest.mock import Mock
 import pytest
 from typer.testing import CliRunner
 
-from model.answer.as_json import query_batch
-from model.answer.fingers import Placement
+from model.answer.answer_report import query_batch
+from model.answer.stimulus import Placement
 from model.cli import app
 from model.commands.table_cli import query
 from model.errors import InputError

@@ -6,9 +6,9 @@ from math import pi
 import numpy as np
 import pytest
 
-from model.answer.fingers import Placement
-from model.answer.measures import cell_centres, concentration_of, measures
+from model.answer.answer_report import cell_centres, concentration_of, measures
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.arrays import lattice
 from model.finger import fingertip_points, is_beyond
 from paper_table import smooth_rig, smooth_table

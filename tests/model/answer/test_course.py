@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.clicks import given
-from model.answer.course import Course
-from model.answer.fingers import Finger, Placement, Stimulus
-from model.answer.over_duration import DriveEnvelope, RingingUnderFingers, pulse_ramp
+from model.answer.answer import DriveEnvelope, RingingUnderFingers, pulse_ramp
 from model.answer.plan import answer, query
+from model.answer.stimulus import Course, Finger, Placement, Stimulus
 from model.arrays import FloatArray, Point
 from model.errors import InputError
 from model.finger import detection_threshold, fingertip_points, fingertip_weights

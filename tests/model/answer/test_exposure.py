@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from model.answer.exposure import exposures, hand_weighting
-from model.answer.fingers import Finger
+from model.answer.answer_report import exposures, hand_weighting
+from model.answer.stimulus import Finger
 from model.finger import detection_threshold
 from only import phased as answer
 from only import wants

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from model.answer.answer import Limits
-from model.answer.fingers import Finger, Placement
-from model.answer.strength import with_gains
+from model.answer.promise import with_gains
+from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from model.answer.answer import MIN_CONTRAST_DB
-from model.answer.fingers import ANY, BY_NAME, MUST, NEVER, Finger, Stimulus
+from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Stimulus
 from model.rig.file import load_rig
 from model.table.build import build_table
 from only import drives

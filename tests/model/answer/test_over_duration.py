@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.clicks import clicks_on, given
-from model.answer.answer import Limits
-from model.answer.fingers import Finger, Placement, Stimulus
-from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.over_duration import (
+from model.answer.answer import (
     DriveEnvelope,
+    Limits,
     OverDuration,
     RingingUnderFingers,
     on_drawn_plates,
@@ -18,6 +16,8 @@ from model.answer.over_duration import (
     shaped_gain,
 )
 from model.answer.plan import answer, query
+from model.answer.promise import FingersOnPlate
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.ensemble.draws import JUDGING_DRAWS
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.table.build import build_table

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from model.answer import search_in_c, search_in_numpy
-from model.answer.fingers import Placement
-from model.answer.fingers_on_plate import FingersOnPlate
-from model.answer.promised import share_stroke
-from model.answer.search import KEPT, MISSING, Contents, Stream
-from model.answer.search_in_c import choose_tones
-from model.answer.search_in_numpy import choose_by_numpy, ranked, worst_ratios
+from model.answer import tone_search
+from model.answer.promise import FingersOnPlate, share_stroke
+from model.answer.stimulus import KEPT, MISSING, Contents, Placement, Stream
+from model.answer.tone_search import choose_by_numpy, choose_tones, ranked, worst_ratios
 from model.finger import THRESHOLDS
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad
@@ -164,7 +161,7 @@ def test_answers_lose_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a search of all frequencies: 0.1 dB in the mean, and the level is as high."""
     of, lost = table(), []
     all_kept = replace(of)  # that keeps no rules yet
-    monkeypatch.setattr(search_in_c, "KEPT", len(of.frequencies))
+    monkeypatch.setattr(tone_search, "KEPT", len(of.frequencies))
     only(all_kept, Placement((PLACES[0],), (PLACES[1],)))
     monkeypatch.undo()
     for at in range(4):
@@ -183,7 +180,7 @@ def test_level_that_no_kept_frequency_reaches_is_sought_at_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where the ranking keeps only a frequency that is too weak the answer is that of all."""
-    for module in (search_in_c, search_in_numpy):
+    for module in (tone_search, tone_search):
         monkeypatch.setattr(module, "KEPT", 1)
         monkeypatch.setattr(module, "MISSING", 1)
     of = replace(table())  # that keeps no rules yet

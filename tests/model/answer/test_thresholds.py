@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.answer.answer import MIXED, OWN, verdict_of, verdict_shown
-from model.answer.fingers import Finger, Placement
+from model.answer.stimulus import Finger, Placement
 from model.finger import THRESHOLDS, detection_threshold
 from model.rig.uncertainty import Uncertainty
 from model.study.exact_plates import draw_plates, powers_on

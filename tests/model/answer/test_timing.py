@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.answer.as_json import query_batch
-from model.answer.fingers import Placement
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing, query_batch
+from model.answer.stimulus import Placement
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import footprints_of

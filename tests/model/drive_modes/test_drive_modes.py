@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from drives import by_hand
 from model import drive_modes
 from model import drive_modes as switched_mode
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.arrays import NEARLY, Complex64Array
 from model.drive_modes import Forms, playable_drive_modes
 from model.finger import fingertip_points

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from model.answer.answer import Answer
-from model.answer.fingers import Finger, Placement, Stimulus
-from model.answer.fingers_on_plate import FingersOnPlate
 from model.answer.plan import answer
+from model.answer.promise import FingersOnPlate
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors, delayed
 from model.ensemble.draws import PROMISED_DRAWS, Drawing, draw

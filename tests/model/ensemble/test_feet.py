@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks.setting import random_contacts
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.ensemble.draws import draw
 from model.rig.file import load_rig
 from model.rig.uncertainty import Uncertainty

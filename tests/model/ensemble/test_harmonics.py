@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.fingers_on_plate import FingersOnPlate
+from model.answer.promise import FingersOnPlate
 from model.arrays import FloatArray
 from model.ensemble.draws import Drawing, percentile
 from model.fem import ELEMENTS, Mesh, assemble

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import random_contacts
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.arrays import ComplexArray
 from model.fem import assemble
 from model.rig.file import load_rig

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from exciter_rig import exciter_rig, exciter_rig_text
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.config.document import ConfigError
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.ensemble.draws import percentile
 from model.fem import assemble
 from model.finger import detection_threshold, fingertip_points, fingertip_weights

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.finger import Grid
 from model.structure.attachments import PointLoad

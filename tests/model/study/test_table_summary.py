@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.finger import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import Laminate, LaminateLayer

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from model.answer.fingers import Placement
 from model.answer.plan import query
+from model.answer.stimulus import Placement
 from model.drive_modes import highest_levels
 from model.errors import InputError
 from model.fem import assemble

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.answer.fingers import Placement
+from model.answer.stimulus import Placement
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.file import load_rig
 from model.table.build import build_table

@@ -8,8 +8,8 @@ import pytest
 from scipy.signal import lsim
 
 from exciter_rig import exciter_rig
-from model.answer.course import Course
-from model.answer.over_duration import swings_of_pulse
+from model.answer.answer import swings_of_pulse
+from model.answer.stimulus import Course
 from model.reduction.free_plate import solve_free_plate
 from model.transients.excursions import MagnetMotions, magnets_of
 from model.transients.swings import CLICKS_APART, Swing, motions_along

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from model.answer.answer import Layer
-from model.answer.fingers import Placement, Stimulus, together
+from model.answer.stimulus import Placement, Stimulus, together
 from model.errors import InputError
 from model.fem import assemble
 from model.finger import (

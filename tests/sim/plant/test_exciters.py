@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from exciter_rig import exciter_rig
-from model.answer.fingers import Finger, Placement, Stimulus
 from model.answer.plan import query
+from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig

@@ -10,8 +10,8 @@ from scipy.signal import lsim
 
 from driven_bases import FINGERTIP, faded_base, resting, shaped_base
 from model.answer.answer import Layer
-from model.answer.fingers import Placement
-from model.answer.timing import Timing
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Placement
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import Mesh

@@ -1,0 +1,492 @@
+"""What of an answer takes longer: its transients, and how concentrated it is over the plate.
+
+Onset, ending and transient measures of layers.
+
+Exposure of fingers to vibration, weighted as ISO 5349-1 does for the hand.
+
+What a finger feels above its threshold says nothing of what harms it in the long run: that goes by
+acceleration, weighted by frequency (docs/concepts/people.md).
+
+Answers of a table as JSON: the lines of a batch in, one object each out.
+"""
+
+import cmath
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.answer.answer import IMPERCEPTIBLE_DB_SL, QUIET, Answer, Layer
+from model.answer.plan import answer, prepare_answers
+from model.answer.promise import FingersOnPlate, loudest_power, promise
+from model.answer.stimulus import (
+    APART_HZ,
+    BY_NAME,
+    MUST,
+    PROMISED_PERCENTILE,
+    Finger,
+    Placement,
+    Stimulus,
+)
+from model.arrays import FloatArray, Point, lattice, nullable
+from model.ensemble.draws import PROMISED_DRAWS
+from model.errors import InputError
+from model.finger import (
+    STRONG_DB_SL,
+    decibels,
+    fingertip_points,
+    fingertip_weights,
+    highest_measured,
+    is_beyond,
+)
+from model.structure.plate import Plate
+from model.table.table import LocalizationTable, read_fingertips
+from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
+from model.transients.measures import Transients
+from model.transients.shaping import Shaper
+from registry.wording import first_problem
+
+
+class Timing:
+    """Shapes and rates layers on the plate of a table in time.
+
+    Takes about ten milliseconds to make, and one more at the first use of each frequency.
+    """
+
+    def __init__(self, table: LocalizationTable, *, shaper: Shaper | None = None) -> None:
+        self._table, self._eras = table, table.eras
+        variance = table.uncertainty.gain_variance
+        self._shaper = shaper or Shaper(
+            table.in_time, gain_variance=variance, fingertips=partial(_few_points, table)
+        )
+
+    def following(self, table: LocalizationTable) -> "Timing":
+        """The timing of a table that has followed its plate, with envelopes as shaped for this one.
+
+        Nothing need be prepared anew.
+        """
+        return Timing(table, shaper=self._shaper)
+
+    def prepare(self, frequencies: Iterable[float]) -> None:
+        """Compute ahead what shaping needs at frequencies [Hz]."""
+        for frequency in frequencies:
+            self._shaper.prepare(frequency)
+
+    def with_envelopes(
+        self, layer: Layer, placement: Placement, *, onset: bool = True, ending: bool = True
+    ) -> Layer:
+        """Add a shaped onset and ending, or one of them; takes some milliseconds.
+
+        Without other fingers the onset keeps the rest of the plate quiet. Envelopes are those of
+        the plate without fingers: solved with them they would win 1 to 1.5 dB of the contrast over
+        the first 100 ms, and take 6 ms longer.
+        """
+        targets, quiet, tones = placement.targets, placement.quiet, layer.excitation
+        if onset:
+            envelopes = self._shaper.onset(tones, targets=targets, quiet=quiet)
+            layer = replace(layer, onset=envelopes)
+        if ending:
+            envelopes = self._shaper.ending(tones, targets=targets, quiet=quiet)
+            layer = replace(layer, ending=envelopes)
+        return layer
+
+    def shaped(self, found: Answer) -> Answer:
+        """Add onsets and endings to all layers of an answer that was asked for them."""
+        layers = [self.with_envelopes(each, found.placement(each)) for each in found.layers]
+        both = [(each.onset, each.ending) for each in layers]
+        return replace(found, envelopes=tuple(both))
+
+    def transient_contrast_db(self, layer: Layer, placement: Placement) -> float | None:
+        """Contrast over the first 100 ms [dB], along the onset or the ramp; None without others.
+
+        The fingers are on the plate.
+        """
+        if not placement.quiet:
+            return None
+        if layer.onset is None:
+            onset = ramped_onset(layer.excitation, self._eras, ramp=layer.ramp)
+        else:
+            onset = shaped(layer.onset, self._eras)
+        targets, quiet = placement.targets, placement.quiet
+        return self._under(placement).contrast_db(onset, targets=targets, quiet=quiet)
+
+    def residual_db(self, layer: Layer, placement: Placement) -> float:
+        """Residual vibration in the 100 ms after the end, relative to the steady one [dB]."""
+        if layer.ending is None:
+            ending = ramped_ending(layer.excitation, self._eras, ramp=layer.ramp)
+        else:
+            ending = shaped(layer.ending, self._eras)
+        return self._under(placement).residual_db(layer.excitation, ending)
+
+    def _under(self, placement: Placement) -> Transients:
+        return Transients(self._table.in_time_under(placement.contacts, placement.loads))
+
+
+def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[FloatArray, FloatArray]:
+    """Weights (k, p) of few points under fingertips, and their shapes (k, p, r)."""
+    tips = read_fingertips(table, places)
+    return tips.few_weights.astype(float), tips.few.astype(float)
+
+
+SPACING = 0.0025  # m; resolves the area of a circle of 50 mm to a percent
+PERCENTILE = 95
+
+
+@dataclass(frozen=True)
+class Concentration:
+    """How much of a vibration is near its targets.
+
+    contrast_95_db: targets to the 95th percentile of the plate farther than 50 mm, by peak
+    acceleration; area_above_half [m²]: of the plate, targets included, that vibrates more than
+    half as strongly as they do; energy_share_near: share of kinetic energy within 50 mm of them.
+    """
+
+    contrast_95_db: float
+    area_above_half: float
+    energy_share_near: float
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What takes some ten milliseconds to say of the first layer of an answer.
+
+    transient_contrast_db: over the first 100 ms, as accelerations; residual_db: residual vibration
+    in the 100 ms after the end, relative to the steady one. transient_contrast_db is None without
+    other fingers, concentration with them; is_imperceptible_to_quiet: whether every quiet finger
+    stays 10 dB below all sets of thresholds by which promises hold, on nine of ten plates.
+    """
+
+    transient_contrast_db: float | None
+    residual_db: float
+    concentration: Concentration | None
+    is_imperceptible_to_quiet: bool | None
+
+
+def measures(table: LocalizationTable, answer: Answer, *, timing: Timing | None = None) -> Measures:
+    """Return the measures in time and over the whole plate of the first layer of an answer."""
+    layer, timing = answer.layers[0], timing or Timing(table)
+    placement = answer.placement(layer)
+    quiet = [each.foreign_level_db_sl for each in answer.fingers if each.verdict == QUIET]
+    loudest = max([each for each in quiet if each is not None], default=None)
+    return Measures(
+        timing.transient_contrast_db(layer, placement),
+        timing.residual_db(layer, placement),
+        None if placement.quiet else concentration(table, layer, placement),
+        None if loudest is None else loudest <= IMPERCEPTIBLE_DB_SL,
+    )
+
+
+def concentration(table: LocalizationTable, layer: Layer, placement: Placement) -> Concentration:
+    """Return the concentration of a layer for fingers without others; takes some milliseconds."""
+    contacts, loads, tones = placement.targets, placement.loads, layer.excitation
+    felt = []
+    for target in contacts:
+        disc = fingertip_points(*target, table.plate)
+        _, found = table.amplitudes(tones, disc, contacts=contacts, loads=loads)
+        felt.append(found.sum(axis=0) @ fingertip_weights(*target, table.plate))
+    points = cell_centres(table.plate)
+    frequencies, amplitudes = table.amplitudes(tones, points, contacts=contacts, loads=loads)
+    near = ~is_beyond(points, contacts)
+    return concentration_of(frequencies, amplitudes, near, felt=min(felt), plate=table.plate)
+
+
+def cell_centres(plate: Plate) -> FloatArray:
+    """Centres (p, 2) [m] of equal small cells that tile the plate."""
+    count_x, count_y = (max(1, round(side / SPACING)) for side in (plate.length, plate.width))
+    x = np.linspace(0, plate.length, 2 * count_x + 1)[1::2]
+    y = np.linspace(0, plate.width, 2 * count_y + 1)[1::2]
+    return lattice(x, y)
+
+
+def concentration_of(
+    frequencies: FloatArray,
+    amplitudes: FloatArray,
+    near: NDArray[np.bool_],
+    *,
+    felt: float,
+    plate: Plate,
+) -> Concentration:
+    """Rate a vibration with amplitudes (f, p) [m/s²] at `cell_centres`, frequencies (f,) [Hz].
+
+    near (p,): centres within 50 mm of a target; felt [m/s²]: mean amplitude at the least driven
+    target. Energy is kinetic, of uniform mass. Where all centres are near, contrast is to all.
+    """
+    peak = amplitudes.sum(axis=0)
+    around = peak if near.all() else peak[~near]
+    energy = ((amplitudes.T / frequencies) ** 2).sum(axis=1)
+    return Concentration(
+        contrast_95_db=float(decibels(felt / np.percentile(around, PERCENTILE))),
+        area_above_half=float((peak > felt / 2).mean()) * plate.length * plate.width,
+        energy_share_near=float(energy[near].sum() / energy.sum()),
+    )
+
+
+# Hz; of the limits of the band, 10^0.8 and 10^3.1, and where the weighting begins to fall.
+_LOW, _HIGH, _FALL = 10**0.8, 10**3.1, 100 / (2 * np.pi)
+_BAND_Q, _FALL_Q = 1 / np.sqrt(2), 0.64
+
+
+def hand_weighting(frequencies: FloatArray) -> FloatArray:
+    """Weighting Wh at frequencies [Hz], of the same shape: 0.96 at 12.5 Hz, 0.063 at 250 Hz.
+
+    Of a band from 6.3 to 1259 Hz, second-order Butterworth on both sides, and of a transition from
+    acceleration to velocity at 15.9 Hz (ISO 5349-1:2001, annex A; ISO 8041).
+    """
+    s = 1j * np.asarray(frequencies)
+    band = s**2 / (s**2 + _LOW / _BAND_Q * s + _LOW**2)
+    band = band * _HIGH**2 / (s**2 + _HIGH / _BAND_Q * s + _HIGH**2)
+    fall = (s + _FALL) * _FALL / (s**2 + _FALL / _FALL_Q * s + _FALL**2)
+    return np.asarray(np.abs(band * fall))
+
+
+def exposures(table: LocalizationTable, found: Answer) -> list[float]:
+    """Weighted acceleration at each finger of an answer, root mean square [m/s²].
+
+    Of all vibrations together, normal to the plate, at the loudest point of the fingertip, while
+    they are at their full strength; nine of ten plates do not exceed it. Beyond 1 kHz, where
+    thresholds end, harmonics do not count.
+    """
+    tones, contents = found.tones, found.contents
+    if not tones.rows:
+        return [0.0] * len(contents.places)
+    rows, gains = np.array(tones.rows), np.array(tones.gains)
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
+    drawn = PROMISED_DRAWS, rows, np.array(tones.weights, dtype=np.complex64)
+    frequencies, at_harmonics = table.frequencies[rows], table.compared_harmonic_thresholds[rows]
+    factors, of_harmonics = (
+        (gains * np.where(np.isfinite(each), each, 0.0) * hand_weighting(at)) ** 2 / 2
+        for each, at in ((table.thresholds[rows], frequencies), (at_harmonics, 2 * frequencies))
+    )
+    power = fingers.powers(*drawn) * factors.astype(np.float32)[:, None, None, None]
+    harmonics = fingers.harmonics(*drawn) * of_harmonics.astype(np.float32)[:, None, None]
+    return [
+        promise(np.sqrt(loudest_power(power, harmonics, rows, finger)), 100 - PROMISED_PERCENTILE)
+        for finger in range(len(contents.places))
+    ]
+
+
+_Place = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _Own(BaseModel):
+    """Schema of a finger with a vibration of its own: what `Stimulus` and `Finger` have."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    at: _Place
+    level_db_sl: float | None = None
+    band_hz: _Place | None = None
+    duration: float | None = None
+    modulation_hz: float | None = None
+    is_limit: bool = False
+    name: str | None = None
+    load: float = 1.0
+    priority: int = 0
+    sharing: str = BY_NAME
+    is_protected: bool = True
+
+    def finger(self, level_db_sl: float) -> Finger:
+        """The finger; level_db_sl: that of the line."""
+        given = self.model_dump(exclude_none=True)
+        at = _point(given.pop("at"))
+        if self.band_hz is not None:
+            given["band_hz"] = _point(self.band_hz)
+        keys = [key for key in Stimulus.__dataclass_fields__ if key in given]
+        stimulus = {"level_db_sl": level_db_sl} | {key: given.pop(key) for key in keys}
+        return Finger(at, Stimulus(**stimulus), **given)
+
+
+class _Line(BaseModel):
+    """Schema of a line of a batch."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    target: _Place | None = None
+    targets: list[_Place] = []
+    own: list[_Own] = []
+    quiet: list[_Place] = []
+    bands_may_swap: bool = False
+    apart_hz: float = APART_HZ
+    mode: str | None = None
+    level_db_sl: float = STRONG_DB_SL
+    duration: float | None = None
+    envelopes: bool = False
+    loads: list[float] = []
+
+
+_OF_TARGETS = {"target", "targets", "duration"}
+_OF_OWN = {"bands_may_swap", "apart_hz"}
+"""Keys of a line that only one of both kinds of questions has."""
+
+
+def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line:
+    """A question, as JSON or as its keys and values; raises InputError."""
+    try:
+        if isinstance(line, str):
+            asked = _Line.model_validate_json(line)
+        else:
+            asked = _Line.model_validate(line)
+    except ValidationError as error:
+        key, rule = first_problem(error)
+        raise InputError(
+            f"{key}: {rule}"
+            if key
+            else 'line must be a JSON object such as {"target": [0.08, 0.06], "quiet": '
+            f"[[0.22, 0.16]]}}; {rule}"
+        ) from None
+    given = asked.model_fields_set
+    if others := given & (_OF_TARGETS if asked.own else _OF_OWN):
+        without = "without" if asked.own else "with"
+        raise InputError(f"{', '.join(sorted(others))} must be given {without} own")
+    if {"target", "targets"} <= given:
+        raise InputError("target must be given without targets; name all of them there")
+    return asked.model_copy(update={k: v for k, v in defaults.items() if k not in given})
+
+
+def answer_as_json(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
+    """Answer a line; with vibrations of their own its loads are those of the quiet fingers."""
+    if asked.own:
+        fingers = [each.finger(asked.level_db_sl) for each in asked.own]
+        loads = _loads(asked, len(asked.quiet), what="quiet finger")
+    else:
+        targets = [*([] if asked.target is None else [asked.target]), *asked.targets]
+        stimulus = Stimulus(asked.level_db_sl, duration=asked.duration, name="target")
+        loads = _loads(asked, len(targets) + len(asked.quiet), what="finger")
+        fingers = [Finger(_point(at), stimulus, loads.pop(0), sharing=MUST) for at in targets]
+    started = time.perf_counter()
+    found = answer(
+        table,
+        fingers,
+        quiet=[Finger(_point(at), load=load) for at, load in zip(asked.quiet, loads, strict=True)],
+        drive_mode=asked.mode,
+        shaped=asked.envelopes,
+        apart_hz=asked.apart_hz,
+        bands_may_swap=asked.bands_may_swap,
+    )
+    if asked.envelopes:
+        found = timing.shaped(found)
+    elapsed = time.perf_counter() - started
+    more = None if asked.own else measures(table, found, timing=timing)
+    return _shown(table, found, more) | {"solve_time_s": elapsed}
+
+
+def _loads(asked: _Line, count: int, *, what: str) -> list[float]:
+    loads = asked.loads or [1.0] * count
+    if len(loads) != count:
+        raise InputError(f"loads must have one value per {what} ({count}), got {len(loads)}")
+    return [*loads]
+
+
+def _point(pair: list[float]) -> Point:
+    return pair[0], pair[1]
+
+
+def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> dict[str, Any]:
+    """The JSON object of an answer; more: measures of a vibration that all targets share."""
+    shown: dict[str, Any] = {
+        "fingers": [
+            {
+                "at_m": list(each.finger.at),
+                "verdict": each.verdict,
+                "is_foreign_felt": each.is_foreign_felt,
+                "layer": each.layer,
+                "level_db_sl": nullable(each.level_db_sl),
+                "promised_level_db_sl": nullable(each.promised_level_db_sl),
+                "contrast_db": nullable(each.contrast_db),
+                "median_contrast_db": nullable(each.median_contrast_db),
+                "promised_contrast_db": nullable(each.promised_contrast_db),
+                "foreign_level_db_sl": nullable(each.foreign_level_db_sl),
+                "lowered_db": each.lowered_db,
+                "exposure_m_s2": exposure,
+            }
+            for each, exposure in zip(found.fingers, exposures(table, found), strict=True)
+        ],
+        "layers": [_layer_as_json(each, table) for each in found.layers],
+        "promised_worst_db": nullable(found.promised_worst_db),
+        "stroke_factor": found.stroke_factor,
+        "applied": list(found.applied),
+    }
+    if more is not None:
+        near = more.concentration
+        shown |= {
+            "transient_contrast_db": more.transient_contrast_db,
+            "residual_db": more.residual_db,
+            "surroundings_contrast_95_db": near and near.contrast_95_db,
+            "area_above_half_m2": near and near.area_above_half,
+            "energy_share_near": near and near.energy_share_near,
+            "is_imperceptible_to_quiet": more.is_imperceptible_to_quiet,
+        }
+    return shown
+
+
+def _layer_as_json(layer: Layer, table: LocalizationTable) -> dict[str, Any]:
+    highest = max([tone.frequency for tone in layer.excitation.values()], default=0.0)
+    return {
+        "frequency_hz": layer.frequency,
+        "drive": table.drive_of(layer.excitation),
+        "side_bands": [table.drive_of(each) for each in layer.side_bands],
+        "fingers": list(layer.fingers),
+        "mode": layer.drive_mode,
+        "ramp_s": layer.ramp,
+        "onset": _envelopes_as_json(layer.onset, table),
+        "ending": _envelopes_as_json(layer.ending, table),
+        "contrast_to_plate_db": layer.contrast_to_plate_db,
+        "is_level_extrapolated": highest > highest_measured(table.threshold),
+    }
+
+
+def _envelopes_as_json(
+    envelopes: Envelopes | None, table: LocalizationTable
+) -> dict[str, Any] | None:
+    """Return level 0..1 of the stroke and phase at the start and at every knot, by ERA."""
+    if envelopes is None:
+        return None
+
+    def shown(name: str, amplitude: complex) -> dict[str, float]:
+        level = abs(amplitude) / table.full_levels[name]
+        return {"level": level, "phase_deg": math.degrees(cmath.phase(amplitude))}
+
+    return {
+        name: {
+            "frequency_hz": envelope.frequency,
+            "step_s": envelope.step,
+            "start": shown(name, envelope.start),
+            "knots": [shown(name, knot) for knot in envelope.knots],
+        }
+        for name, envelope in envelopes.items()
+    }
+
+
+def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Answer one question, of the keys of a batch's line. Raises InputError."""
+    asked, timing = _parsed(values, {}), Timing(table)
+    prepare_answers(table, asked.mode)
+    timing.prepare(table.frequencies.tolist())
+    return answer_as_json(table, asked, timing)
+
+
+def query_batch(
+    table: LocalizationTable,
+    lines: Iterable[str],
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+) -> Iterator[dict[str, Any]]:
+    """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer.
+
+    defaults: of keys that lines leave out.
+    """
+    prepare_answers(table)
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                yield answer_as_json(table, _parsed(line, defaults), timing)
+            except InputError as error:
+                yield {"error": str(error), "line": number}

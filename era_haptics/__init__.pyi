@@ -35,7 +35,7 @@ from model.answer.answer_report import Measures as Measures
 from model.answer.stimulus import Course as Course
 from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
-from model.calibration.calibration_result import Calibration as Calibration
+from model.calibration.calibrate import Calibration as Calibration
 from model.design.request import design as design
 from model.design.run import Assessment as Assessment
 from model.design.run import Design as Design

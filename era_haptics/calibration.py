@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from era_haptics.arguments import expect_rig
+from model.calibration.calibrate import Calibration
 from model.calibration.calibrate import calibrate as fit
-from model.calibration.calibration_result import Calibration
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured
+from model.calibration.responses import read_measured, responses_of
 from model.diagnosis.consistency import check_consistency
 from model.errors import expect_path
 from model.processes import Progress, check_progress, unseen

@@ -22,10 +22,8 @@ import numpy as np
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses
-from model.calibration.responses_file import write_responses_csv
-from model.calibration.sensed_plate import sensed_plate
-from model.calibration.variable_projection import project_gains, row_rms
+from model.calibration.fit import project_gains, row_rms, sensed_plate
+from model.calibration.responses import Responses, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.file import load_rig
 from model.rig.rig import Rig
@@ -173,7 +171,7 @@ def measure(
 
 
 def true_values(rig: Rig) -> list[float]:
-    """The fitted values in the order of `model.calibration.sensed_plate.SensedPlate.rows`."""
+    """The fitted values in the order of `model.calibration.fit.SensedPlate.rows`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
     return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 

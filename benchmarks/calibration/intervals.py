@@ -18,8 +18,7 @@ from benchmarks.calibration.hidden_plates import CHOSEN, field_deviations, senso
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
-from model.calibration.responses import Responses, responses_of
-from model.calibration.responses_file import read_measured
+from model.calibration.responses import Responses, read_measured, responses_of
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.rig.file import load_rig

@@ -10,7 +10,7 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from model.arrays import FloatArray
-from model.calibration.sensor_file import WiredSensor, are_places
+from model.calibration.responses import WiredSensor, are_places
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads

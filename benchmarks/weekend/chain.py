@@ -31,9 +31,7 @@ from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sense
 from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
-from model.calibration.responses import Responses
-from model.calibration.responses_file import write_responses
-from model.calibration.sensor_file import WiredSensor, read_sensors
+from model.calibration.responses import Responses, WiredSensor, read_sensors, write_responses
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError
 from model.finger import fingertips_on

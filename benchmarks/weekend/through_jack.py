@@ -48,7 +48,7 @@ from controller.api.client import Client
 from controller.api.client_protocol import LeaseLost
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor
 from model.finger import fingertips_on
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig

@@ -209,8 +209,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Responses of a file, where they are what they claim to be; raises InputError."""
     import numpy as np
 
-    from model.calibration.responses import responses_of
-    from model.calibration.responses_file import read_measured
+    from model.calibration.responses import read_measured, responses_of
     from model.diagnosis.consistency import check_consistency
     from model.identification.measurement import MeasuredPlate
 

@@ -1,47 +1,361 @@
 """Calibration of a rig by measured responses, without dead channels and outliers.
 
 A fit is validated at sensors held out of it.
+
+Results of a calibration.
+
+The rig of a fit: what a rig file can express of it, and how well it is then known.
+
+Report of a calibration, as text and as JSON.
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import compress
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray, best_of
-from model.calibration.calibration_result import (
-    MAX_FIT_ERROR,
-    MAX_OUTLIERS,
-    Calibration,
-    FittedParameter,
-    HeldOutSensors,
-    SensorScale,
+from model.calibration.fit import (
+    CalibrationProblem,
+    Fit,
+    Parameter,
+    clear,
+    project_gains,
+    responses_of,
+    row_rms,
+    sensed_plate,
+    solve,
+    start_at,
+    without_form,
 )
-from model.calibration.fit import CalibrationProblem, Fit, solve, start_at, without_form
-from model.calibration.fitted_rig import (
-    gain_rows,
-    moved_eras,
-    predicted_by,
-    rig_of_fit,
-    standard_error,
-    uncertainty_of,
-)
-from model.calibration.responses import (
-    LEAST_SENSORS,
-    Responses,
-    Screening,
-    check_enough_sensors,
-)
-from model.calibration.sensed_plate import sensed_plate
-from model.calibration.variable_projection import responses_of, row_rms
+from model.calibration.responses import LEAST_SENSORS, Responses, Screening, check_enough_sensors
 from model.errors import InputError
+from model.files.csv_file import as_frame
+from model.identification.fit_report import quality_rows, value_rows
+from model.identification.form_errors import MASS_CELLS
 from model.identification.held_out import SHARE, relative_rms
 from model.identification.parameters import KINDS
 from model.processes import Progress, unseen
-from model.quantities import in_display_unit
+from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.structure.attachments import Gain
+
+MAX_FIT_ERROR = 0.25
+"""Largest relative error at held-out sensors of an acceptable fit."""
+
+MAX_OUTLIERS = 0.1
+"""Largest share of values left out of an acceptable fit."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """A parameter with the rig's value, the fitted one and its standard error.
+
+    One that is not identified has the rig's value and no standard error.
+    """
+
+    parameter: Parameter
+    before: float
+    value: float
+    standard_error: float | None
+    at_bound: bool
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether the data determine the value."""
+        return self.standard_error is not None
+
+
+@dataclass(frozen=True)
+class SensorScale:
+    """Scale of a sensor relative to the others' median, and its standard error."""
+
+    name: str
+    scale: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class MovedEra:
+    """An ERA that is clearly not at the rig's place: x, y [m] before and after, standard errors."""
+
+    name: str
+    before: tuple[float, float]
+    after: tuple[float, float]
+    standard_error: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class HeldOutSensors:
+    """Prediction at sensors held out of the fit.
+
+    before, after: error of the old and the fitted rig, root mean square over responses, each
+    relative to all sensors' at its frequency and ERA; median: of the fitted rig's; unexplained: by
+    it, without what noise and the sensors' own tolerances explain.
+    """
+
+    sensors: tuple[str, ...]
+    before: float
+    after: float
+    median: float
+    unexplained: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibrated rig with everything found about the measurement.
+
+    moved: ERAs at other places than in the rig before; gains_error (f, eras): standard errors of
+    the rig's gains, NaN where unmeasured; dead_sensors, dead_eras: left out of the
+    fit; scales: of sensors with a wrong scale, or of all if requested; held_out: None with too few
+    sensors; error: as in HeldOut, of the fit with its form errors; chi2: of that fit, about 1;
+    measured, before, after: responses (f, eras, s) [1/s²] of the live sensors, divided by their
+    scales.
+    """
+
+    rig: Rig
+    parameters: tuple[FittedParameter, ...]
+    moved: tuple[MovedEra, ...]
+    gains_error: FloatArray
+    dead_sensors: tuple[str, ...]
+    dead_eras: tuple[str, ...]
+    scales: tuple[SensorScale, ...]
+    outlier_count: int
+    value_count: int
+    error: float
+    chi2: float
+    held_out: HeldOutSensors | None
+    sensors: tuple[str, ...]
+    frequencies: FloatArray
+    measured: ComplexArray
+    before: ComplexArray
+    after: ComplexArray
+
+    def to_frame(self) -> Any:
+        """Parameters before and after, their units and errors, as a pandas DataFrame.
+
+        A row a parameter; needs pandas.
+        """
+        return as_frame(
+            {
+                "parameter": [each.parameter.name for each in self.parameters],
+                "unit": [each.parameter.unit for each in self.parameters],
+                "before": [each.before for each in self.parameters],
+                "after": [each.value for each in self.parameters],
+                "standard_error": [each.standard_error for each in self.parameters],
+            }
+        )
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the fit predicts what it was not shown; by few sensors it says nothing."""
+        return self.held_out is not None and self.held_out.after <= MAX_FIT_ERROR
+
+
+_LEAST = 1e-4  # of an uncertainty; no fit is exact
+
+# Relative error of values by idealisations of the model, of any but the loss factor, and of that:
+# what form errors leave unexplained widens resonances by 0.4 % (root mean square over plates
+# without noise).
+_MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
+_FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
+
+
+def rig_of_fit(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> Rig:
+    """Rig of a fit without form errors, z (p,); ERAs where they clearly are, gains unchanged."""
+    rig = problem.plate.rig_at(z)
+    moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
+    eras = tuple(
+        replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
+        for era in rig.eras
+    )
+    return replace(rig, eras=eras)
+
+
+def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
+    """List the ERAs that are off their places by several standard errors."""
+    rig, space, found = problem.plate.rig, problem.plate.model.space, []
+    sides = np.array([rig.plate.length, rig.plate.width])
+    off = np.where(clear(fit), fit.z, 0.0)
+    places, errors = (space.values(x, "place").reshape(-1, 2) for x in (off, fit.error))
+    for era, place, error in zip(rig.eras, places, errors, strict=True):
+        at = np.clip(np.array([era.x, era.y]) + place, 0, sides)
+        if np.abs(at - [era.x, era.y]).max() > 0:
+            found.append(
+                MovedEra(
+                    era.name,
+                    (era.x, era.y),
+                    (float(at[0]), float(at[1])),
+                    (float(error[0]), float(error[1])),
+                )
+            )
+    return tuple(found)
+
+
+def place_error(problem: CalibrationProblem, fit: Fit, before: float) -> float:
+    """Root mean square of what the rig of a fit has places of ERAs off by, along a side [m].
+
+    About the place that it keeps where the fit does not clearly have another one; before: of places
+    that the data determine less than their prior does.
+    """
+    space = problem.plate.model.space
+    kept, error = (space.values(x, "place") for x in (np.where(clear(fit), 0.0, fit.z), fit.error))
+    by_data = error < math.sqrt(0.5) * KINDS["place"].std
+    of_each = np.where(by_data, np.hypot(np.hypot(kept, error), KINDS["place"].theory), before)
+    return _rms(of_each)
+
+
+def predicted_by(
+    rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: Fit
+) -> tuple[ComplexArray, ComplexArray]:
+    """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
+    known = problem.plate
+    model = sensed_plate(rig, points, known.model.frequencies, masses=known.masses).responses()
+    weight = fit.used / fit.noise[:, :, None]
+    gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
+    return model, gains
+
+
+def lacking_of(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> FloatArray:
+    """What responses lack of a fit's without its form errors, z (p,), relative, (f, e).
+
+    But with its ERAs, whose places a rig states the errors of.
+    """
+    at_places = np.where(problem.plate.model.space.of("place"), fit.z, z)
+    model = problem.plate.responses(at_places)
+    gains, _ = project_gains(model, problem.values, fit.used / fit.noise[:, :, None])
+    predicted = gains[:, :, None] * model
+    squares = np.where(fit.used, np.abs(predicted - fit.predicted) ** 2, np.nan)
+    size = row_rms(fit.predicted, fit.used)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.nansum(squares, axis=2) / fit.used.sum(axis=2)
+    return np.asarray(np.sqrt(shares) / size)
+
+
+def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
+    """Rows of known gains (f,) for a rig."""
+    known = np.isfinite(gains) & (gains != 0)
+    return tuple(
+        (float(f), float(abs(gain)), float(np.angle(gain)))
+        for f, gain in zip(frequencies[known], gains[known], strict=True)
+    )
+
+
+def standard_error(
+    rig: Rig, parameter: Parameter, value: float, error: float, dampers: float
+) -> float:
+    """Standard error of a value by that of a fit, by the model's, and of the mass it goes by.
+
+    dampers: what they do to the responses relative to what the plate's own losses do, by which an
+    error of the model in the former looks like one of the latter.
+    """
+    share = math.hypot(_MODEL_ERROR, _mass_scale_error(rig))
+    if parameter.kind == "loss_factor":
+        share = math.hypot(_LOSS_ERROR, _MODEL_ERROR * dampers)
+    return math.hypot(error, share * value)
+
+
+def _mass_scale_error(rig: Rig) -> float:
+    """Standard error of the whole mass, relative: all that is fitted but losses scales with it."""
+    sides = KINDS["side"].std / np.array([rig.plate.length, rig.plate.width])
+    return float(np.hypot(_FOREIGN_MASS, np.linalg.norm(sides)))
+
+
+def uncertainty_of(
+    before: Uncertainty,
+    problem: CalibrationProblem,
+    fit: Fit,
+    plain: tuple[FloatArray, FloatArray],
+    parameters: Sequence[FittedParameter],
+    held_out: HeldOutSensors | None,
+) -> Uncertainty:
+    """How well a calibrated rig is known, for its file.
+
+    Without the error of the whole mass, by which all scales and which no pattern feels. Thickness
+    stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness does. Field
+    is what the fit's fields have that the rig's are lacking (f, e), as it cannot express form
+    errors, and at least what held-out sensors leave unexplained. Gain and phase are those of the
+    best gains of fields that are off by so much, as they are read at the sensors: what else is
+    off moves gains and fields the opposite ways. What is not identified keeps the value of the
+    rig before.
+    """
+    errors = problem.plate.errors(fit.z, fit.error)
+    # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+    by_coils = [each for each in problem.plate.of_exciters if each.kind == "damping"]
+    stated = [one for one in parameters if one.parameter not in by_coils]
+    relative = {
+        kind: [
+            math.hypot(
+                float(error) / one.value,
+                math.hypot(_LOSS_ERROR, _MODEL_ERROR * fit.dampers)
+                if kind == "loss_factor"
+                else _MODEL_ERROR,
+            )
+            for one, error in zip(parameters, errors, strict=True)
+            if one in stated and one.parameter.kind == kind and one.is_identified and one.value > 0
+        ]
+        for kind in ("modulus", "loss_factor", "stiffness", "damping")
+    }
+    known = {
+        kind: len(values) == sum(one.parameter.kind == kind for one in stated)
+        for kind, values in relative.items()
+    }
+
+    def rms(kind: str) -> float:
+        return _rms(relative[kind] or [0.0])
+
+    gains = {}
+    lacking = lacking_of(problem, fit, plain[0])
+    known_gains = np.isfinite(fit.readings_error[0]) & np.isfinite(lacking)
+    if known_gains.any(axis=0).all():
+        field = max(_rms(lacking[known_gains]), held_out.unexplained if held_out else 0.0)
+        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
+        # and stiffness that are off change a field in phase with it.
+        off = field / np.sqrt(fit.used.sum(axis=2)[known_gains])
+        gain, phase = (
+            max(_rms(np.hypot(share * off, error[known_gains])), _LEAST)
+            for share, error in zip((1, math.sqrt(0.5)), fit.readings_error, strict=True)
+        )
+        gains = {"gain": _rounded(gain), "phase_deg": _rounded(math.degrees(phase))}
+        gains |= {"field": _rounded(field), "common_gain": _rounded(fit.common_error)}
+    losses = (
+        max(rms("loss_factor"), rms("damping"))
+        if known["loss_factor"] and known["damping"]
+        else math.log(before.damping)
+    )
+    fitted = {
+        "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
+        "damping": 1 + _rounded(math.exp(losses) - 1),
+    }
+    fitted["place"] = _rounded(place_error(problem, fit, before.place))
+    feet = [
+        float(error) / one.value if one.is_identified else before.supports
+        for one, error in zip(parameters, errors, strict=True)
+        if one.parameter.foot
+    ]
+    if feet:
+        fitted["supports"] = _rounded(math.hypot(_rms(feet), _MODEL_ERROR))
+    if known["modulus"]:
+        # The rig's modulus is that of frequencies with form errors, whatever part is theirs.
+        of_plain, value = problem.plate.errors(*plain)[0], problem.plate.values(plain[0])[0]
+        of_modulus = math.hypot(of_plain / value, _MODEL_ERROR)
+        fitted |= Uncertainty.of_frequency(_rounded(of_modulus / 2))
+    return Uncertainty.clipped(**asdict(before) | fitted | gains)
+
+
+def _rms(values: ArrayLike) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _rounded(value: float) -> float:
+    """To two digits: an error is hardly known better."""
+    return float(f"{value:.2g}")
 
 
 def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutSensors | None:
@@ -345,3 +659,150 @@ def _report(
         before=initial_responses(problem),
         after=gains[:, :, None] * responses,
     )
+
+
+def change_rows(calibration: Calibration) -> list[str]:
+    """Table of all parameters, and of ERAs that are not at the rig's places."""
+    moved = [
+        (
+            f"{each.name} place",
+            _millimetres(each.before),
+            f"{_millimetres(each.after)} ± {_millimetres(each.standard_error)} mm",
+        )
+        for each in calibration.moved
+    ]
+    return value_rows([*map(_change, calibration.parameters), *moved])
+
+
+def calibration_report_gain_rows(calibration: Calibration) -> list[str]:
+    """Lines of all ERAs: median and range over frequency of their gains, with standard error."""
+    rows = []
+    for number, era in enumerate(calibration.rig.eras):
+        if era.name in calibration.dead_eras or not era.gains:
+            rows.append(f"{era.name} gain  not measured")
+            continue
+        size = 100 * (np.array([row[1] for row in era.gains]) - 1)
+        phase = np.degrees([row[2] for row in era.gains])
+        error = float(np.nanmedian(calibration.gains_error[:, number]))
+        rows.append(
+            f"{era.name} gain  {np.median(size):+.1f} % ({size.min():+.1f} to {size.max():+.1f}), "
+            f"phase {np.median(phase):+.1f}° ({phase.min():+.1f} to {phase.max():+.1f}), "
+            f"± {100 * error:.2g} % at {counted(len(size), 'frequency', plural='frequencies')}"
+        )
+    return rows
+
+
+def finding_rows(calibration: Calibration) -> list[str]:
+    """Lines of faults of the measurement, and of parameters that are not identified."""
+    rows = [f"sensor {name}: no signal, left out" for name in calibration.dead_sensors]
+    rows += [f"ERA {name}: no motion; gains unchanged" for name in calibration.dead_eras]
+    rows += [
+        f"sensor {scale.name}: scale {with_error(scale.scale, scale.standard_error)} of the others"
+        for scale in calibration.scales
+    ]
+    if calibration.outlier_count:
+        rows.append(
+            f"{calibration.outlier_count} of {calibration.value_count} values left out as outliers"
+        )
+    fixed = [p.parameter.name for p in calibration.parameters if not p.is_identified]
+    if fixed:
+        rows.append(f"not identified, rig's value kept: {', '.join(fixed)}")
+    return rows
+
+
+def check_rows(calibration: Calibration) -> list[str]:
+    """Lines of the new rig's uncertainty and of the held-out check."""
+    held, known = calibration.held_out, calibration.rig.uncertainty
+    if held is None:
+        return quality_rows(known, beside=f"error of the fit {percent(calibration.error)}")
+    return quality_rows(
+        known,
+        held_out=f"sensors {', '.join(held.sensors)}",
+        error=held.after,
+        beside=f"by the old rig {percent(held.before)}",
+    )
+
+
+def as_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
+    """All results for programs, units in the keys or beside the values."""
+    held_out = calibration.held_out
+    frequencies = calibration.frequencies
+    return {
+        "parameters": [
+            {
+                "name": fitted.parameter.name,
+                "era": fitted.parameter.era or None,
+                "foot": fitted.parameter.foot or None,
+                "kind": fitted.parameter.kind,
+                "unit": fitted.parameter.unit,
+                "before": fitted.before,
+                "after": fitted.value,
+                "standard_error": fitted.standard_error,
+                "identified": fitted.is_identified,
+                "at_bound": fitted.at_bound,
+            }
+            for fitted in calibration.parameters
+        ],
+        "gains": {
+            era.name: {
+                "frequency_hz": [row[0] for row in era.gains],
+                "magnitude": [row[1] for row in era.gains],
+                "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
+                "standard_error": [
+                    float(error)
+                    for error in calibration.gains_error[:, number]
+                    if np.isfinite(error)
+                ],
+            }
+            for number, era in enumerate(calibration.rig.eras)
+        },
+        "moved_eras": [
+            {
+                "era": moved.name,
+                "before_m": list(moved.before),
+                "after_m": list(moved.after),
+                "standard_error_m": list(moved.standard_error),
+            }
+            for moved in calibration.moved
+        ],
+        "uncertainty": asdict(calibration.rig.uncertainty),
+        "not_identified": [p.parameter.name for p in calibration.parameters if not p.is_identified],
+        "dead_sensors": list(calibration.dead_sensors),
+        "dead_eras": list(calibration.dead_eras),
+        "sensor_scales": {
+            scale.name: {"scale": scale.scale, "standard_error": scale.standard_error}
+            for scale in calibration.scales
+        },
+        "sensors": list(calibration.sensors),
+        "drive_frequencies_hz": frequencies.tolist(),
+        "values": calibration.value_count,
+        "outliers": calibration.outlier_count,
+        "fit_error": calibration.error,
+        "chi2": calibration.chi2,
+        "held_out": None
+        if held_out is None
+        else {
+            "sensors": list(held_out.sensors),
+            "error_before": held_out.before,
+            "error_after": held_out.after,
+            "median_error_after": held_out.median,
+        },
+        "good": calibration.is_good,
+        "fingerprint_before": before.fingerprint,
+        "fingerprint_after": calibration.rig.fingerprint,
+    }
+
+
+def _millimetres(place: tuple[float, float]) -> str:
+    return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
+
+
+def _change(fitted: FittedParameter) -> tuple[str, str, str]:
+    parameter = fitted.parameter
+    before = in_display_unit(fitted.before, parameter.unit, digits=5)
+    if fitted.standard_error is None:
+        return parameter.name, before, "not identified"
+    note = "  (at its bound)" if fitted.at_bound else ""
+    after = with_error(fitted.value, fitted.standard_error, parameter.unit)
+    share = f" ({100 * (fitted.value / fitted.before - 1):+.1f} %)" if fitted.before else ""
+    return parameter.name, before, f"{after}{share}{note}"

@@ -49,10 +49,9 @@ def calibrate(
 
     Write a new rig, and print its values with their uncertainties.
     """
-    from model.calibration import calibration_report
+    from model.calibration import calibrate as calibration_report
     from model.calibration.calibrate import calibrate as fit
-    from model.calibration.responses import LEAST_SENSORS, responses_of
-    from model.calibration.responses_file import read_measured
+    from model.calibration.responses import LEAST_SENSORS, read_measured, responses_of
     from model.config.document import read_document
     from model.diagnosis.consistency import check_consistency
     from model.rig.file import rig_of
@@ -95,7 +94,14 @@ def calibrate(
         f"{counted(responses.count, 'value')}"
     )
     finish(
-        [heading, "", *rows, *calibration_report.gain_rows(calibration), "", *notes],
+        [
+            heading,
+            "",
+            *rows,
+            *calibration_report.calibration_report_gain_rows(calibration),
+            "",
+            *notes,
+        ],
         calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
         if as_json
         else None,

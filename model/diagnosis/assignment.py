@@ -11,9 +11,8 @@ import numpy as np
 from scipy.special import stdtr
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
+from model.calibration.fit import STARTS, SensedPlate, modal_assurance
 from model.calibration.responses import Responses, typical
-from model.calibration.sensed_plate import STARTS, SensedPlate
-from model.calibration.variable_projection import modal_assurance
 
 _MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
 _LEAST_MISFIT = 0.02  # below it sensors' errors dominate

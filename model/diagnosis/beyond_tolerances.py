@@ -20,14 +20,15 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray, best_by
-from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, plate_of
-from model.calibration.variable_projection import (
+from model.calibration.fit import (
+    SensedPlate,
+    plate_of,
     project_gains,
     projection_slopes,
     responses_of,
     row_rms,
 )
+from model.calibration.responses import Responses
 from model.diagnosis.plate_match import FALSE_ALARM, Match, match_plate
 from model.finger import Grid
 from model.identification.derivatives import by_mass_at

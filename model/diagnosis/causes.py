@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from model.arrays import ComplexArray, FloatArray, best_by, ranked_by
-from model.calibration.sensed_plate import Parameter, SensedPlate, sensed_plate
-from model.calibration.variable_projection import modal_assurance
+from model.calibration.fit import Parameter, SensedPlate, modal_assurance, sensed_plate
 from model.diagnosis.plate_match import Match, match_plate
 from model.errors import InputError
 from model.identification.parameters import VALUE_UNITS

@@ -12,9 +12,8 @@ import numpy as np
 
 from model.arrays import best_by
 from model.calibration.calibrate import wrong_size
+from model.calibration.fit import SensedPlate, project_gains, row_rms
 from model.calibration.responses import Responses, Screening
-from model.calibration.sensed_plate import SensedPlate
-from model.calibration.variable_projection import project_gains, row_rms
 from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.plate_match import MAX_FIT_ERROR
 from model.diagnosis.verdict import Verdict, best_wiring, diagnose

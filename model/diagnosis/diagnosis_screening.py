@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray
+from model.calibration.fit import SensedPlate
 from model.calibration.responses import Responses, check_enough_sensors, silent_sensors
-from model.calibration.sensed_plate import SensedPlate
 from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.plate_match import MAX_FIT_ERROR, Match
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from model.arrays import ComplexArray, FloatArray, best_by
+from model.calibration.fit import SensedPlate, plate_of, project_gains, row_rms
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, plate_of
-from model.calibration.variable_projection import project_gains, row_rms
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.quantities import percent
 from model.rig.rig import Rig

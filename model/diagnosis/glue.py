@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.variable_projection import project_gains, row_rms
+from model.calibration.fit import project_gains, row_rms
 from model.diagnosis.plate_match import Match
 from model.structure.exciter import Exciter
 

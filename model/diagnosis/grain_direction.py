@@ -9,8 +9,8 @@ three quarters with their grain turned.
 
 from dataclasses import dataclass, replace
 
+from model.calibration.fit import SensedPlate, plate_of
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.identification.identify import solved_for
 from model.quantities import percent

@@ -2,8 +2,8 @@
 
 from typing import TypeAlias
 
+from model.calibration.fit import SensedPlate, plate_of
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.diagnosis.grain_direction import TurnedGrain, turned_grain
 from model.diagnosis.resonance_meaning import MisreadResonance, misread_resonance

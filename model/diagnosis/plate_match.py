@@ -17,9 +17,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from model.arrays import ComplexArray, FloatArray, best_by
-from model.calibration.fit import without_outliers
-from model.calibration.sensed_plate import SensedPlate
-from model.calibration.variable_projection import fit_with_gains, project_gains, row_rms
+from model.calibration.fit import (
+    SensedPlate,
+    fit_with_gains,
+    project_gains,
+    row_rms,
+    without_outliers,
+)
 from model.rig.rig import Rig
 
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself

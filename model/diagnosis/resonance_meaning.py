@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.calibration.fit import SensedPlate, plate_of, project_gains, row_rms
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import SensedPlate, plate_of
-from model.calibration.variable_projection import project_gains, row_rms
 from model.diagnosis.assignment import ShapeMatch, match_shapes
 from model.rig.exciter_checks import exciters_of, sections_of
 from model.rig.rig import Rig

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
+from model.calibration.fit import SensedPlate, plate_of
 from model.calibration.responses import LEAST_SENSORS, Responses, check_enough_sensors
-from model.calibration.sensed_plate import SensedPlate, plate_of
 from model.diagnosis.assignment import (
     ChannelPhase,
     ShapeMatch,

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from model.calibration.calibration_result import Calibration
+from model.calibration.calibrate import Calibration
 from model.figures.drawing import ACTIVE_COLOR
 from model.study.promise_at_sensors import MeasuredVerification
 

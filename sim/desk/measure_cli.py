@@ -104,7 +104,7 @@ def measure(
     input, one sensor is moved from line to line: the terminal says where to. The file is for era
     calibrate, and for era rig identify --measured.
     """
-    from model.calibration.sensor_file import are_places, read_sensors
+    from model.calibration.responses import are_places, read_sensors
     from model.config.points import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig

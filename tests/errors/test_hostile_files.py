@@ -15,8 +15,7 @@ from controller.gateway.settings import read_token
 from controller.sources.capture import read_capture
 from drivers.errors import CommandError
 from drivers.judge.watching import capture
-from model.calibration.responses_file import read_measured
-from model.calibration.sensor_file import WiredSensor, read_places, read_sensors
+from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.design.area import area_of
 from model.errors import InputError
 from model.identification.learned_file import load_learned

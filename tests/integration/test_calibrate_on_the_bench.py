@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from examples.make_measured import record_responses, scanning_grid
-from model.calibration.responses_file import write_responses_csv
+from model.calibration.responses import write_responses_csv
 from model.cli import app
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig

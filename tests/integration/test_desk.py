@@ -14,8 +14,7 @@ from benchmarks.desk.identified import identified_errors
 from benchmarks.desk.session import BLOCK, EXAMPLES, PLATE, Desk, desk
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured
+from model.calibration.responses import read_measured, responses_of
 from model.rig.file import load_rig
 
 pytestmark = [

@@ -16,7 +16,7 @@ from controller.cli.commands import app
 from controller.process.socket_lock import SocketLock
 from drivers.errors import CommandError, LinkError
 from examples.make_measured import record_responses, scanning_grid
-from model.calibration.responses_file import write_responses_csv, write_responses_uff
+from model.calibration.responses import write_responses_csv, write_responses_uff
 from model.errors import InputError
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig

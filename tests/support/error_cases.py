@@ -30,8 +30,7 @@ from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
 from distorted_responses import DISTORTIONS, every
 from gateway_bench import real_daemon, wait_for
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured, write_responses_csv
+from model.calibration.responses import read_measured, responses_of, write_responses_csv
 from model.rig.file import example_rig_path, load_rig
 
 ROOT = Path(__file__).parents[2]

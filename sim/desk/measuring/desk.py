@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import Responses, WiredSensor
 from model.errors import InputError
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig

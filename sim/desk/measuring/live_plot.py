@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from model.arrays import FloatArray
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor
 from sim.desk.measuring.multisine import Multisine
 
 Show = Callable[[Sequence[FloatArray]], None]

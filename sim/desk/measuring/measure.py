@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses
-from model.calibration.responses_file import write_responses
+from model.calibration.responses import Responses, write_responses
 from model.commands.options import Stopwatch, progress_bar
 from model.processes import Progress
 from sim.desk.measuring.desk import Desk

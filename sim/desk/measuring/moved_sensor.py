@@ -17,9 +17,13 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses, responses_of
-from model.calibration.responses_file import read_measured, write_responses
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import (
+    Responses,
+    WiredSensor,
+    read_measured,
+    responses_of,
+    write_responses,
+)
 from model.commands.options import Stopwatch
 from model.errors import InputError
 from sim.desk.measuring.desk import Desk

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.arrays import FloatArray, best_first
-from model.calibration.sensor_file import read_sensors
+from model.calibration.responses import read_sensors
 from model.identification.forward import Sensor
 from model.identification.measurement import (
     DeviceSettings,

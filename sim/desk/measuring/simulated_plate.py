@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import FloatArray
-from model.calibration.responses import Responses
-from model.calibration.sensor_file import are_places
+from model.calibration.responses import Responses, are_places
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import PointLoad
 from sim.desk.measuring.desk import Desk

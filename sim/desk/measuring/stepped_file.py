@@ -14,9 +14,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from model.calibration.responses import MeasuredValue, Responses, responses_of
-from model.calibration.responses_file import write_responses
-from model.calibration.sensor_file import WiredSensor, are_places
+from model.calibration.responses import (
+    MeasuredValue,
+    Responses,
+    WiredSensor,
+    are_places,
+    responses_of,
+    write_responses,
+)
 from model.errors import InputError
 from model.files.csv_file import read_lines
 from model.quantities import counted

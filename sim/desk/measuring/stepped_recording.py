@@ -17,7 +17,7 @@ from scipy import signal
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor
 from model.errors import InputError
 from model.files.uff import read_bytes
 from model.files.wav_file import samples_of

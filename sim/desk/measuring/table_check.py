@@ -10,7 +10,7 @@ from drivers.by_hand.blocking import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import contents
 from model.answer.answer import Layer
-from model.calibration.sensor_file import read_sensors
+from model.calibration.responses import read_sensors
 from model.processes import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (

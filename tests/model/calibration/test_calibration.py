@@ -8,8 +8,7 @@ import pytest
 
 import perturbed_plate
 from benchmarks.calibration.hidden_plates import gains_of, true_values
-from model.calibration.calibrate import calibrate
-from model.calibration.calibration_result import Calibration
+from model.calibration.calibrate import Calibration, calibrate
 from model.calibration.responses import Responses
 from model.diagnosis.consistency import check_consistency
 from model.errors import InputError

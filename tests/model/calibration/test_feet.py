@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.calibration.calibrate import calibrate
-from model.calibration.calibration_report import as_json, change_rows, finding_rows
+from model.calibration.calibrate import as_json, calibrate, change_rows, finding_rows
 from model.diagnosis.consistency import check_consistency
 from model.structure.attachments import PointLoad
 from paper_plate import make_paper_rig

@@ -17,7 +17,7 @@ from benchmarks.calibration.hidden_plates import (
 )
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
-from model.calibration.sensed_plate import sensed_plate
+from model.calibration.fit import sensed_plate
 from model.diagnosis.consistency import check_consistency
 from model.identification.form_errors import MASS_CELLS, reduced_modes
 from model.identification.parameters import KINDS

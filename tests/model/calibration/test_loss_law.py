@@ -10,8 +10,8 @@ from benchmarks.desk_plate.truth import draw_truth
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
+from model.calibration.fit import sensed_plate
 from model.calibration.responses import Responses
-from model.calibration.sensed_plate import sensed_plate
 from model.diagnosis.consistency import check_consistency
 from model.fem import Mesh, assemble
 from model.identification.derivatives import jacobian

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import pyuff
 
-from model.calibration.responses import Responses, responses_of
-from model.calibration.responses_file import (
+from model.calibration.responses import (
+    Responses,
     read_measured,
+    responses_of,
     write_responses_csv,
     write_responses_uff,
 )

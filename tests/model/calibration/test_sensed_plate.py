@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.calibration.sensed_plate import SensedPlate, sensed_plate
+from model.calibration.fit import SensedPlate, sensed_plate
 from model.rig.rig import Rig
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import PointLoad

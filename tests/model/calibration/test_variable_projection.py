@@ -11,7 +11,7 @@ from scipy import optimize
 from extrapolated import extrapolated_slopes
 from model.arrays import ComplexArray, FloatArray
 from model.calibration import fit
-from model.calibration.sensed_plate import sensed_plate
+from model.calibration.fit import sensed_plate
 from model.diagnosis import plate_match
 from model.identification import least_squares
 from model.rig.rig import Rig

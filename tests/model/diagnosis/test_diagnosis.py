@@ -15,11 +15,9 @@ import pytest
 import perturbed_plate
 from distorted_responses import DISTORTIONS
 from long_form import shortly
-from model.calibration.calibration_result import MAX_OUTLIERS
-from model.calibration.fit import without_outliers
-from model.calibration.responses import Responses, responses_of
-from model.calibration.responses_file import read_measured
-from model.calibration.sensed_plate import sensed_plate
+from model.calibration.calibrate import MAX_OUTLIERS
+from model.calibration.fit import sensed_plate, without_outliers
+from model.calibration.responses import Responses, read_measured, responses_of
 from model.diagnosis import causes
 from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows

@@ -9,8 +9,7 @@ import pytest
 import controller.cli.identify
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
-from model.calibration.responses import Responses
-from model.calibration.responses_file import write_responses
+from model.calibration.responses import Responses, write_responses
 from model.diagnosis.assignment import ShapeMatch
 from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, verdict_rows

@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from model.arrays import FloatArray
-from model.calibration.sensed_plate import sensed_plate
+from model.calibration.fit import sensed_plate
 from model.errors import InputError
 from model.fem import Mesh, PlateMatrices, assemble
 from model.finger import Grid

@@ -11,10 +11,8 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import as_built, draw_truth
 from desk_card import DeskCard
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured
-from model.calibration.sensed_plate import sensed_plate
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.fit import sensed_plate
+from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.identification.identify import identify
 from model.rig.file import parse_rig
 from model.rig.rig import Rig

@@ -15,7 +15,7 @@ from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.sensor_file import WiredSensor, read_sensors
+from model.calibration.responses import WiredSensor, read_sensors
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.identification.identify import identify

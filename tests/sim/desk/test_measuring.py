@@ -13,7 +13,7 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor
 from model.errors import InputError
 from model.processes import unseen
 from model.rig.file import parse_rig

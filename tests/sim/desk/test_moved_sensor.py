@@ -17,9 +17,7 @@ from benchmarks.desk_plate.truth import Truth
 from controller.cli.main import run
 from desk_card import DeskCard
 from model.arrays import Float32Array, FloatArray
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured
-from model.calibration.sensor_file import read_sensors
+from model.calibration.responses import read_measured, read_sensors, responses_of
 from model.errors import InputError
 from model.identification.identify import identify
 from model.rig.file import example_rig_path

@@ -16,7 +16,7 @@ from desk_card import DeskCard
 from era_haptics.lab.cli import app
 from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor
 from model.config.document import read_document
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate

@@ -8,9 +8,7 @@ import pytest
 
 from controller.cli.main import run
 from examples.make_measured import record_responses
-from model.calibration.responses import responses_of
-from model.calibration.responses_file import read_measured
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.rig.file import example_rig_path, load_rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.attachments import PointLoad

@@ -8,8 +8,7 @@ import pytest
 from scipy.io import wavfile
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses, responses_of
-from model.calibration.sensor_file import WiredSensor
+from model.calibration.responses import Responses, WiredSensor, responses_of
 from model.errors import InputError
 from model.rig.rig import Rig
 from sim.desk.measuring.desk import Desk

@@ -20,7 +20,7 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
 from drivers.playing.contents import Layer
 from model.arrays import Float32Array, FloatArray
-from model.calibration.sensor_file import read_sensors
+from model.calibration.responses import read_sensors
 from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold

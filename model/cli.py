@@ -4,12 +4,10 @@ import typer
 
 from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
-from model.commands.plate_cli import materials, plate_app, show
-from model.commands.table_cli import query, table_app
-from model.commands.table_files_cli import build, contrast_map, export, plot
+from model.commands.plate_cli import materials, plate_app, show, template
+from model.commands.table_cli import build, contrast_map, export, plot, query, table_app
 from model.commands.table_show_cli import show as show_table
 from model.commands.table_show_cli import verify
-from model.commands.template_cli import template
 from model.errors import InputError
 
 plate_app.command()(materials)

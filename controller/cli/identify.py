@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from model.commands.fitted_rig_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
+from model.commands.calibrate_cli import NO_FIT, check_rig_output, finish, write_fitted_rig
 from model.commands.options import JsonOption, progress_bar
 from model.errors import InputError
 

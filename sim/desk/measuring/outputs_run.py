@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from model.commands.fitted_rig_cli import check_rig_output
+from model.commands.calibrate_cli import check_rig_output
 from model.commands.options import next_line
 from model.config.document import read_document
 from model.config.editing import edited_text

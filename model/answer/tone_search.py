@@ -43,8 +43,7 @@ from model.arrays import (
     best_first,
     best_of,
 )
-from model.compiled.kernels import kernels, run
-from model.compiled.structures import (
+from model.compiled.kernels import (
     FOUND,
     FoundTones,
     GivenQuestion,
@@ -53,6 +52,8 @@ from model.compiled.structures import (
     Rules,
     TouchedPlates,
     WeightSearch,
+    kernels,
+    run,
 )
 from model.drive_modes import (
     LEVEL_MARGIN,

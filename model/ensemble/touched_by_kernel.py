@@ -8,8 +8,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from model.compiled.kernels import Kernels, kernels, run
-from model.compiled.structures import PlateDraws, PointGroups, Sensors, TouchedPlates, as_given
+from model.compiled.kernels import (
+    Kernels,
+    PlateDraws,
+    PointGroups,
+    Sensors,
+    TouchedPlates,
+    as_given,
+    kernels,
+    run,
+)
 from model.ensemble.attached_plate import THINNER, PlateOnEras
 from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
 from model.ensemble.draws import Drawing, Draws

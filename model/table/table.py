@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray, IntArray, Point
-from model.compiled.kernels import kernels, run
-from model.compiled.structures import GivenRaster
+from model.compiled.kernels import GivenRaster, kernels, run
 from model.drive_modes import highest_levels
 from model.ensemble.attached_plate import (
     AttachedPlate,

@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 
 from model.arrays import ComplexArray, IntArray
-from model.compiled.kernels import kernels, run
-from model.compiled.structures import ShapedTone, Shaping
+from model.compiled.kernels import ShapedTone, Shaping, kernels, run
 from model.transients.knots import (
     ENDING_KNOTS,
     ITERATIONS,

@@ -4,7 +4,7 @@ import ctypes
 from functools import cache
 from pathlib import Path
 
-from model.compiled.library_cache import compile_library, kept_library
+from model.compiled.kernels import compile_library, kept_library
 from model.errors import InputError
 
 ENGINE = "engine.so"

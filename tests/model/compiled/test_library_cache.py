@@ -11,15 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from model.compiled import library_cache
-from model.compiled.kernels import kernels, why_slow
-from model.compiled.library_cache import compile_library
+from model.compiled import kernels as library_cache
+from model.compiled.kernels import compile_library, kernels, why_slow
 from model.errors import InputError
 
 _PROGRAM = """
 import sys
 from pathlib import Path
-from model.compiled.library_cache import kept_library
+from model.compiled.kernels import kept_library
 found = kept_library("seven", [Path(sys.argv[1])], flags=(), what="seven")
 print(found.seven())
 """

@@ -120,7 +120,7 @@ def sim(
     from sim.process.early_exit import exit_on_signal
 
     with exit_on_signal():
-        from model.config.points import parse_point
+        from model.config.fields import parse_point
         from model.rig.file import load_rig
         from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
         from sim.faults.fault_window import FaultFile, load_faults
@@ -208,7 +208,7 @@ def _check_rate(rate: float, *, frequency_max: float) -> None:
 
 
 def _sensor(text: str) -> "Accelerometer":
-    from model.config.points import parse_point
+    from model.config.fields import parse_point
     from sim.plant.accelerometer import Accelerometer
 
     name, equals, position = text.partition("=")

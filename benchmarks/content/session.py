@@ -21,7 +21,7 @@ from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.play.intent import CLICK
 from model.answer.answer_report import Timing
-from model.config.shapes import Circle
+from model.config.fields import Circle
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.opening import Wire

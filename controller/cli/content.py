@@ -9,7 +9,7 @@ import typer
 
 from controller.cli.play import pattern_of
 from model.commands.options import JsonOption, QuietOption, print_report
-from model.config.points import parse_point
+from model.config.fields import parse_point
 from model.errors import InputError
 from model.quantities import counted, percent
 

@@ -183,7 +183,7 @@ def touch(
 
     from controller.cli.shown import show_status
     from controller.sources.capture import read_capture, replay_capture
-    from model.config.points import parse_point
+    from model.config.fields import parse_point
 
     if (at is None) == (replay is None):
         raise InputError("era touch must have either fingers, such as 0.10,0.05, or --replay FILE")
@@ -293,7 +293,7 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
 
 def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") -> None:
     """Refuse fingers beyond the plate, which the daemon would only reject and count."""
-    from model.config.points import in_metres
+    from model.config.fields import in_metres
 
     for x, y in positions:
         if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):

@@ -121,7 +121,7 @@ def identify(
     import time
 
     from controller.diagnosis.plate_measurement import observation_of
-    from model.config.points import parse_frequencies
+    from model.config.fields import parse_frequencies
     from model.diagnosis.other_meaning import check_meaning
     from model.identification import identification_report
     from model.identification.identify import identify as fit

@@ -7,7 +7,7 @@ import typer
 
 from controller.cli.daemon import Socket, connected
 from model.commands.options import JsonOption, print_report
-from model.config.points import parse_point
+from model.config.fields import parse_point
 from model.errors import InputError
 from model.quantities import percent
 

@@ -19,7 +19,7 @@ from controller.content.format import ContentFormat, too_much
 from controller.content.json_file import ContentSection, Entries, read_json, unknown_keys
 from controller.content.mixing import Segment, mixed
 from controller.content.pattern import Curve, Pattern, Transient
-from model.config.sections import Validation
+from model.config.fields import Validation
 from model.quantities import counted
 
 _EVENT = {

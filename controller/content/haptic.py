@@ -14,7 +14,7 @@ from controller.content.format import ContentFormat, too_much
 from controller.content.json_file import ContentSection, Entries, read_json, unknown_keys
 from controller.content.pattern import Pattern, Transient
 from model.config.document import KeyPath
-from model.config.sections import Validation
+from model.config.fields import Validation
 
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Time = Annotated[float, Field(ge=0)]

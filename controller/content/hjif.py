@@ -20,7 +20,7 @@ from controller.content.sharpness import MAX_HZ, MIN_HZ, sharpness_of
 from controller.content.wav import course_of
 from model.arrays import FloatArray
 from model.config.document import KeyPath
-from model.config.sections import Validation
+from model.config.fields import Validation
 from model.quantities import counted
 
 _VIBRATION = ("Other", "Acceleration", "Vibration", "Vibrotactile", "Vibrotactile Texture")

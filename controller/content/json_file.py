@@ -12,7 +12,7 @@ from pydantic import ConfigDict, GetCoreSchemaHandler
 
 from controller.content.format import MAX_POINTS, refusal
 from model.config.document import Document, KeyPath, decoded, key_name
-from model.config.sections import Section
+from model.config.fields import Section
 from model.quantities import counted
 
 _MAX_SIZE = 2 << 20  # bytes

@@ -26,8 +26,8 @@ from controller.sources.touch import (
 from drivers.by_hand.rig_check import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, read_document
-from model.config.kinds import CheckedFile, ConfigKind
-from model.config.sections import Validation
+from model.config.fields import Validation
+from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from model.identification.learned_file import was_learned

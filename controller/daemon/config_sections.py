@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, Strict
 
-from model.config.sections import Quantity, Section
-from model.config.units import LENGTH, LEVEL
+from model.config.fields import LENGTH, LEVEL, Quantity, Section
 from model.drive_modes import DRIVE_MODES
 from model.finger import STRONG_DB_SL
 from model.rig.key_types import Identifier

@@ -12,8 +12,7 @@ from controller.effects.effect import (
 )
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import TIME
+from model.config.fields import TIME, Quantity
 
 
 class Buzz(Effect):

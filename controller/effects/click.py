@@ -5,8 +5,7 @@ from typing import Annotated, ClassVar
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, SteadyRun
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import TIME
+from model.config.fields import TIME, Quantity
 
 
 class Click(Effect):

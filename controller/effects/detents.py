@@ -6,8 +6,7 @@ from typing import Annotated, ClassVar, Literal
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import LENGTH, TIME
+from model.config.fields import LENGTH, TIME, Quantity
 
 # A finger has passed a detent once it is this far [m] beyond it.
 _HYSTERESIS = 0.0005

@@ -7,8 +7,7 @@ from controller.effects.detents import Notches
 from controller.effects.effect import MIN_DURATION, Effect, EffectRun, EffectStimulus, NoStimulus
 from controller.effects.region import Region
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import ANGLE, TIME
+from model.config.fields import ANGLE, TIME, Quantity
 
 # A finger has passed a detent once it is this far [rad] beyond it, or [m] where that is more.
 _HYSTERESIS, _HYSTERESIS_LENGTH = 0.02, 0.0005

@@ -13,8 +13,7 @@ from controller.play.intent import Band, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray
-from model.config.sections import Quantity, Section
-from model.config.units import FREQUENCY, LEVEL
+from model.config.fields import FREQUENCY, LEVEL, Quantity, Section
 from model.finger import STRONG_DB_SL
 
 NEIGHBOURS: Literal["neighbours"] = "neighbours"

@@ -17,10 +17,8 @@ from controller.effects.layout import BUZZ, SurfaceLayout, default_effects
 from controller.effects.region import ON_MOVE, ON_RELEASE, USES, Region
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.config.document import Document, KeyPath, read_document
-from model.config.kinds import CheckedFile, ConfigKind
-from model.config.sections import Quantity, Section, Validation
-from model.config.shapes import ShapedSection
-from model.config.units import LEVEL
+from model.config.fields import LEVEL, Quantity, Section, ShapedSection, Validation
+from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from model.rig.key_types import Identifier

@@ -14,8 +14,7 @@ from controller.effects.effect import (
 )
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import TIME
+from model.config.fields import TIME, Quantity
 from model.finger import STRONG_DB_SL
 
 RAMP_STEP_DB = 2.0

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from controller.play.intent import Band
-from model.config.shapes import Shape
+from model.config.fields import Shape
 
 ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")
 """Keys of a region's effects."""

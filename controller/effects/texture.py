@@ -15,8 +15,7 @@ from controller.effects.effect import (
     NoStimulus,
 )
 from controller.sources.contacts import Contact
-from model.config.sections import Quantity
-from model.config.units import LEVEL, SPEED
+from model.config.fields import LEVEL, SPEED, Quantity
 
 # Speed is measured over this time [s]; panels report 60 to 200 times a second.
 _SPEED_WINDOW = 0.060

@@ -17,7 +17,7 @@ from typing import Literal, get_args, get_origin
 from annotated_types import Ge, Le, MaxLen, MinLen
 from pydantic.fields import FieldInfo
 
-from model.config.sections import Quantity, Section, quantities
+from model.config.fields import Quantity, Section, quantities
 
 HEAD = "| key | unit | default | limits | meaning |\n|---|---|---|---|---|"
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from key_tables import key_table
-from model.config.sections import Section
+from model.config.fields import Section
 from model.rig import sections
 from model.rig.era_section import EraSection
 from model.rig.exciter_section import ExciterSection

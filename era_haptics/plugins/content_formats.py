@@ -8,7 +8,7 @@ from controller.content.formats import read_content
 from controller.content.json_file import ContentSection, Entries, read_json
 from controller.content.pattern import Pattern, Transient
 from controller.content.points import pattern_of_points
-from model.config.sections import Validation
+from model.config.fields import Validation
 from model.errors import InputError
 
 __all__ = [

@@ -5,8 +5,7 @@ from controller.effects.kinds import effect_kind
 from controller.effects.region import Region
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact, ContactKey
-from model.config.sections import Quantity
-from model.config.units import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME
+from model.config.fields import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME, Quantity
 
 __all__ = [
     "ANGLE",

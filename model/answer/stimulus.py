@@ -30,7 +30,7 @@ from numbers import Real
 import numpy as np
 
 from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
-from model.config.points import in_metres
+from model.config.fields import in_metres
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS, STRONG_DB_SL

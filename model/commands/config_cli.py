@@ -22,7 +22,7 @@ def init(
 
     Write its schema for editors beside it.
     """
-    from model.config.kinds import kind_called
+    from model.config.file_kinds import kind_called
     from model.files.array_file import whole_or_nothing
 
     made = kind_called(kind)
@@ -55,7 +55,7 @@ def check(
     """
     from model.compiled.kernels import why_slow
     from model.config.document import ConfigError, read_document
-    from model.config.kinds import kind_of
+    from model.config.file_kinds import kind_of
 
     try:
         document = read_document(file)

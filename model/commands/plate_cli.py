@@ -23,7 +23,7 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.config.points import parse_frequencies, parse_pair
+from model.config.fields import parse_frequencies, parse_pair
 from model.errors import InputError
 from model.files.replacing import check_picture
 from model.quantities import counted

@@ -28,7 +28,7 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.config.points import parse_frequencies, parse_pair, parse_point
+from model.config.fields import parse_frequencies, parse_pair, parse_point
 from model.errors import InputError
 from model.files.replacing import (
     begins_with,

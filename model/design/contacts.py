@@ -11,16 +11,18 @@ from pydantic import ConfigDict, Field, Strict
 
 from model.arrays import FloatArray, IntArray, best_of, least_gap
 from model.config.document import read_document
-from model.config.sections import Quantity, Section, Validation
-from model.config.shapes import (
+from model.config.fields import (
+    LENGTH,
     Point,
     PointSection,
+    Quantity,
     Rectangle,
+    Section,
     Shape,
     ShapedSection,
+    Validation,
     box_of,
 )
-from model.config.units import LENGTH
 from model.errors import InputError
 from model.finger import MAX_CONTACTS, MAX_CONTENTS
 from model.rig.key_types import Identifier

@@ -5,7 +5,7 @@ from copy import deepcopy
 from typing import Any
 
 from model.arrays import FloatArray
-from model.config.sections import section_by_kind
+from model.config.fields import section_by_kind
 from model.design.problem import DesignProblem
 from model.rig.actuators import KINDS
 from model.rig.rig import Channel, Rig

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from model.config.document import Value
-from model.config.editing import data_text
+from model.config.document import Value, data_text
 from model.design.layout_keys import layout_keys
 from model.design.run import Design, RankedLayout
 from model.figures import save_figure

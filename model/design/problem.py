@@ -16,8 +16,7 @@ from pydantic import Field
 
 from model.arrays import FloatArray, IntArray, least_gap
 from model.config.document import read_document
-from model.config.sections import Section, Validation
-from model.config.shapes import PointSection
+from model.config.fields import PointSection, Section, Validation
 from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
 from model.errors import InputError

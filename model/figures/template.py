@@ -15,7 +15,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from model.config.units import LENGTH, quantity
+from model.config.fields import LENGTH, quantity
 from model.figures import save_figure
 from model.files.array_file import whole_or_nothing
 from model.rig.rig import Rig

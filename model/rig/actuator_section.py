@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field
 
-from model.config.sections import Section
+from model.config.fields import Section
 from model.rig.key_types import GAINS, Foot, GainRow, Identifier, Place
 from model.structure.actuators import Actuator
 from model.structure.plate import Plate

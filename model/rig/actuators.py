@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, TypeAlias
 
-from model.config.sections import ByKind
+from model.config.fields import ByKind
 from model.rig.actuator_section import ActuatorSection
 from model.rig.era_section import EraSection
 from model.rig.exciter_section import ExciterSection

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Set
 from typing import Any, NamedTuple
 
 from model.config.document import KeyPath, key_name
-from model.config.sections import Section, Validation, section_by_kind
+from model.config.fields import Section, Validation, section_by_kind
 from model.errors import InputError
 from model.rig.actuators import KINDS
 from model.rig.era_section import stiff_mount_problems

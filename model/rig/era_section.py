@@ -4,8 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal
 
-from model.config.sections import Quantity
-from model.config.units import DAMPING, LENGTH, MASS, RATIO, STIFFNESS
+from model.config.fields import DAMPING, LENGTH, MASS, RATIO, STIFFNESS, Quantity
 from model.rig.actuator_section import ActuatorSection
 from model.rig.key_types import gains_of, place_on
 from model.structure.attachments import Era, damping_from_ratio

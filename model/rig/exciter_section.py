@@ -10,8 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from model.config.sections import Quantity
-from model.config.units import (
+from model.config.fields import (
     DAMPING,
     FORCE_FACTOR,
     FREQUENCY,
@@ -23,6 +22,7 @@ from model.config.units import (
     RESISTANCE,
     STIFFNESS,
     VOLTAGE,
+    Quantity,
 )
 from model.rig.actuator_section import ActuatorSection
 from model.rig.key_types import gains_of, one_of, place_on

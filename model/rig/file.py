@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 
 from model.config.document import Document, parse_document, read_document
-from model.config.kinds import check_is_rig
-from model.config.sections import Validation
+from model.config.fields import Validation
+from model.config.file_kinds import check_is_rig
 from model.errors import InputError, expect_path, shown
 from model.rig.checks import check_across
 from model.rig.meshes import mesh_of

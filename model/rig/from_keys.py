@@ -11,10 +11,8 @@ from typing import Any
 
 from pydantic_core import to_jsonable_python
 
-from model.config.document import Document, parse_document
-from model.config.editing import data_text
-from model.config.sections import Section, Validation
-from model.config.units import LENGTH, quantity
+from model.config.document import Document, data_text, parse_document
+from model.config.fields import LENGTH, Section, Validation, quantity
 from model.errors import InputError, expect, expect_path
 from model.files.array_file import whole_or_nothing
 from model.files.replacing import check_ending

@@ -8,8 +8,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Strict
 
-from model.config.sections import Quantity
-from model.config.units import FREQUENCY, LENGTH
+from model.config.fields import FREQUENCY, LENGTH, Quantity
 from model.finger import THRESHOLDS
 from model.structure.attachments import Gain
 from model.structure.plate import Plate

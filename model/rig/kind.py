@@ -20,7 +20,7 @@ from urllib.parse import quote
 import numpy as np
 
 from model.config.document import ConfigError, ConfigProblem, Document
-from model.config.kinds import CheckedFile, ConfigKind
+from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.quantities import percent
 from model.rig.era_section import STIFF_MOUNT

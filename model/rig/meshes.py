@@ -2,8 +2,7 @@
 
 import re
 
-from model.config.sections import Quantity
-from model.config.units import LENGTH, RATIO, quantity
+from model.config.fields import LENGTH, RATIO, Quantity, quantity
 from model.errors import InputError
 from model.fem import MITC4, Mesh, element_of
 from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh

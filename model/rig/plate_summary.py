@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from model.config.sections import Quantity, quantities
+from model.config.fields import Quantity, quantities
 from model.rig.exciter_checks import exciters_of, sections_of
 from model.rig.exciter_section import ExciterSection
 from model.rig.rig import Rig

@@ -8,8 +8,7 @@ from typing import Any, TypeAlias
 
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from model.config.document import Document, KeyPath, parse_document
-from model.config.editing import edited_text
+from model.config.document import Document, KeyPath, edited_text, parse_document
 from model.errors import InputError
 from model.rig.actuators import KINDS
 from model.rig.file import rig_of

@@ -17,8 +17,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from model.config.sections import Quantity, Section
-from model.config.units import (
+from model.config.fields import (
     DAMPING,
     DENSITY,
     LENGTH,
@@ -32,6 +31,8 @@ from model.config.units import (
     STIFFNESS,
     TIME,
     Dimension,
+    Quantity,
+    Section,
 )
 from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.actuators import ActuatorOfAnyKind

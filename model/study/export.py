@@ -13,7 +13,7 @@ import numpy as np
 
 from model.answer.plan import query
 from model.arrays import Complex64Array
-from model.config.sections import Section, quantities
+from model.config.fields import Section, quantities
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows

@@ -105,7 +105,7 @@ def measure(
     calibrate, and for era rig identify --measured.
     """
     from model.calibration.responses import are_places, read_sensors
-    from model.config.points import parse_frequencies
+    from model.config.fields import parse_frequencies
     from model.files.replacing import check_ending, check_place
     from model.rig.file import load_rig
     from sim.desk.measuring.desk import Desk

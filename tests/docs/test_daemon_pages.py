@@ -14,7 +14,7 @@ from controller.daemon.config_sections import (
     TouchSection,
 )
 from controller.operation.states import DaemonState
-from model.config.sections import Section
+from model.config.fields import Section
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 

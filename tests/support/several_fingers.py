@@ -27,7 +27,7 @@ from drivers.playing.contents import Layer
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray
-from model.config.shapes import Rectangle
+from model.config.fields import Rectangle
 from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.table.build import build_table

@@ -15,7 +15,7 @@ from controller.effects.region import Region
 from controller.effects.texture import Texture
 from controller.play.intent import IntentSource
 from model.answer.answer_report import Timing
-from model.config.shapes import Rectangle
+from model.config.fields import Rectangle
 from model.finger import STRONG_DB_SL, Grid
 from model.rig.file import load_rig
 from model.rig.rig import Rig

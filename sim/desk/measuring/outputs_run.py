@@ -11,8 +11,7 @@ import typer
 
 from model.commands.calibrate_cli import check_rig_output
 from model.commands.options import next_line
-from model.config.document import read_document
-from model.config.editing import edited_text
+from model.config.document import edited_text, read_document
 from model.files.array_file import whole_or_nothing
 from model.rig.file import load_rig
 from registry.plugins import did_you_mean

@@ -31,8 +31,8 @@ from controller.effects.region import Region
 from controller.effects.texture import Texture
 from era_haptics.lab.cli import app
 from long_form import in_turn
-from model.config.kinds import KINDS
-from model.config.shapes import Circle, Rectangle
+from model.config.fields import Circle, Rectangle
+from model.config.file_kinds import KINDS
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
 from model.table.file import save_table

@@ -22,7 +22,7 @@ from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
 from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey
-from model.config.shapes import Rectangle
+from model.config.fields import Rectangle
 from only import phased, wants
 from several_fingers import playable, table
 

@@ -12,7 +12,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
-from model.config.shapes import Circle, Polygon, Rectangle
+from model.config.fields import Circle, Polygon, Rectangle
 
 CENTRE = (0.2, 0.1)
 KNOB = Region("knob", Circle(*CENTRE, 0.05), on_move="dial")

@@ -26,7 +26,7 @@ from controller.effects.ramp import Ramp
 from controller.effects.region import Region
 from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey
-from model.config.shapes import Circle, Polygon, Rectangle
+from model.config.fields import Circle, Polygon, Rectangle
 
 
 def finger(id: int, x: float = 0.05, y: float = 0.05, *, since: float = 0.0) -> Contact:

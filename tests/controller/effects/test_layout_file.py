@@ -10,7 +10,7 @@ from controller.effects.effect import Effect, TunedSection
 from controller.effects.layout_file import LayoutSection, RegionSection, load_layout
 from key_tables import key_rows
 from model.config.document import ConfigError
-from model.config.shapes import CircleSection, Rectangle, RectangleSection
+from model.config.fields import CircleSection, Rectangle, RectangleSection
 from model.rig.file import example_rig_path, load_rig
 
 EXAMPLE = Path(__file__).parents[3] / "controller" / "effects" / "example.yaml"

@@ -28,7 +28,7 @@ from long_form import shortly
 from magnets import Magnets, Outputs
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray
-from model.config.shapes import Circle
+from model.config.fields import Circle
 from model.rig.file import parse_rig
 from model.rig.rig import Rig
 from model.table.build import build_table

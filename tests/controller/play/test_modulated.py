@@ -19,7 +19,7 @@ from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Placement
-from model.config.shapes import Rectangle
+from model.config.fields import Rectangle
 from model.vibration import Tone
 from paper_table import smooth_rig
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, playable, table

@@ -11,7 +11,7 @@ from controller.effects.click import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
-from model.config.shapes import Rectangle
+from model.config.fields import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
 from virtual_loop import in_virtual_time
 

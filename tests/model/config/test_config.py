@@ -11,12 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml.comments import CommentedMap
 
-from model.config import units
-from model.config.document import ConfigError, parse_document, read_document
-from model.config.editing import data_text, edited_text
-from model.config.points import in_metres, parse_frequencies
-from model.config.sections import Quantity, Section, Validation
-from model.config.units import (
+from model.config import fields
+from model.config.document import ConfigError, data_text, edited_text, parse_document, read_document
+from model.config.fields import (
     DAMPING,
     DENSITY,
     FREQUENCY,
@@ -27,6 +24,11 @@ from model.config.units import (
     STIFFNESS,
     TEMPERATURE,
     Dimension,
+    Quantity,
+    Section,
+    Validation,
+    in_metres,
+    parse_frequencies,
     quantity,
     unit_scale,
 )
@@ -105,7 +107,7 @@ def test_validation_reports_no_more_than_the_first_problems(
     """Fifty of a thousand unknown keys are reported, and no suggestion made for the others."""
     suggested: list[str] = []
     monkeypatch.setattr(
-        "model.config.sections.did_you_mean", lambda name, known: suggested.append(name) or ""
+        "model.config.fields.did_you_mean", lambda name, known: suggested.append(name) or ""
     )
     text = "parts: {}\n" + "".join(f"key{number}: 1\n" for number in range(1000))
     found = problems(read(tmp_path, text))
@@ -286,7 +288,7 @@ def test_quantity_raises_input_error_only(text: str) -> None:
 def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
     """A rig of bare numbers does not pay for loading the unit library."""
     script = (
-        "import sys; from model.config.units import LENGTH, quantity; "
+        "import sys; from model.config.fields import LENGTH, quantity; "
         "quantity('0.3', LENGTH); quantity(2, LENGTH); print('pint' in sys.modules)"
     )
     done = subprocess.run(
@@ -299,7 +301,7 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
     ("dimension", "unit"),
     [
         (each, unit)
-        for each in vars(units).values()
+        for each in vars(fields).values()
         if isinstance(each, Dimension)
         for unit in each.factors
         if unit != each.unit
@@ -328,10 +330,10 @@ def test_temperature_counts_from_the_zero_of_its_unit(text: str, celsius: float)
         ("5 degC", Dimension("a temperature difference", "K", "5 K")),
         ("9 degF", Dimension("a temperature difference", "K", "5 K")),
         ("3 degC", LENGTH),
-        ("30 dBm", units.POWER),
-        ("3 dB", units.RATIO),
-        ("3 Np", units.LEVEL),
-        ("2 %", units.LEVEL),
+        ("30 dBm", fields.POWER),
+        ("3 dB", fields.RATIO),
+        ("3 Np", fields.LEVEL),
+        ("2 %", fields.LEVEL),
         ("20 dB", TEMPERATURE),
     ],
 )

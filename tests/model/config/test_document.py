@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model.config import document as reading
 from model.config.document import ConfigError, read_document
-from model.config.units import LENGTH, quantity
+from model.config.fields import LENGTH, quantity
 
 
 def write(folder: Path, content: str | bytes) -> Path:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import model
 import rig_page
-from model.config.sections import Section
+from model.config.fields import Section
 from model.rig import sections
 from model.rig.actuators import KINDS
 from model.rig.file import load_rig

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from model.config.points import parse_frequencies
+from model.config.fields import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid

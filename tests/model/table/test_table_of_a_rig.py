@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 import rig_page
 from key_tables import quantities
-from model.config.sections import Section
+from model.config.fields import Section
 from model.errors import InputError
 from model.finger import Grid
 from model.rig import sections

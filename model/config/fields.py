@@ -1,0 +1,765 @@
+"""Values with a unit, such as `12 in`, `1.5 mm` or `70 GPa`, and bare SI numbers.
+
+Sections of configuration files as pydantic models; all problems are reported at once.
+
+Positions, counts and frequency ranges as text of the command line.
+
+Shapes of regions on the plate, and how files state them.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from functools import cache, cached_property, partial
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Generic,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+)
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
+
+from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
+from model.errors import InputError
+from model.quantities import counted
+from registry.plugins import did_you_mean
+from registry.wording import reworded
+
+if TYPE_CHECKING:
+    import pint
+
+    from model.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A kind of value: its name with article, its SI unit, and an example to write.
+
+    factors: of common units, as pint has them: loading pint doubles a command's start. Any other
+    unit of the dimension is found by pint. A bare number of a unit with a zero of its own, such as
+    degC, counts from there, as other units with one do; elsewhere these are refused.
+    """
+
+    name: str
+    unit: str
+    example: str
+    factors: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    def key(self, name: str) -> str:
+        """The name of such a value with its unit, as in JSON: `stiffness_n_m`."""
+        unit = self.unit.lower().replace(" ", "").replace("/", "_").replace("^", "")
+        return f"{name}_{unit}".removesuffix("_")
+
+
+LENGTH = Dimension(
+    "a length",
+    "m",
+    "1.5 mm",
+    {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
+)
+MODULUS = Dimension("a modulus", "Pa", "70 GPa", {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"})
+DENSITY = Dimension("a density", "kg/m^3", "2700 kg/m^3", {"kg/m^3": "1"})
+STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m", {"N/m": "1", "kN/m": "1000", "N/mm": "1000"})
+LINE_STIFFNESS = Dimension("a stiffness per length", "N/m^2", "5 kN/m^2")
+DAMPING = Dimension("a damping", "N s/m", "2 N s/m", {"N s/m": "1"})
+MASS = Dimension("a mass", "kg", "5 g", {"kg": "1", "g": "0.001"})
+FORCE_FACTOR = Dimension("a force factor", "N/A", "3.6 N/A", {"N/A": "1", "T m": "1"})
+RESISTANCE = Dimension("a resistance", "ohm", "4 ohm", {"ohm": "1"})
+INDUCTANCE = Dimension("an inductance", "H", "0.1 mH", {"H": "1", "mH": "0.001"})
+POWER = Dimension("a power", "W", "3 W", {"W": "1", "mW": "0.001"})
+VOLTAGE = Dimension("a voltage", "V", "5 V", {"V": "1", "mV": "0.001"})
+LINE_MASS = Dimension("a mass per length", "kg/m", "0.05 kg/m", {"kg/m": "1", "g/m": "0.001"})
+FREQUENCY = Dimension("a frequency", "Hz", "250 Hz", {"Hz": "1", "kHz": "1000"})
+TIME = Dimension("a time", "s", "50 ms", {"s": "1", "ms": "0.001"})
+SPEED = Dimension("a speed", "m/s", "5 cm/s", {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"})
+ANGLE = Dimension(
+    "an angle", "rad", "15 deg", {"rad": "1", "deg": "0.01745329251994329576923690768"}
+)
+RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
+SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
+TEMPERATURE = Dimension("a temperature", "degC", "23 °C or 296 K", {"degC": "1", "°C": "1"})
+LEVEL = Dimension("a level", "dB", "14 dB", {"dB": "1"})
+RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
+
+# The number is split from its unit here and texts are short, so that nothing is evaluated: pint
+# by itself would compute `9**9**9 m`.
+_MAX_LENGTH = 40
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,2})?"
+_FACTOR = r"[A-Za-zµμΩ%°]+(?:(?:\^|\*\*)-?\d|[²³])?"
+_UNIT = rf"{_FACTOR}(?:(?:\s*[*/·]\s*|\s+){_FACTOR}){{0,4}}"
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
+
+
+def quantity(value: object, dimension: Dimension) -> float:
+    """The value in the dimension's SI unit; a bare number is one already.
+
+    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, anything
+    but a number, and NaN or infinity.
+    """
+    if isinstance(value, str):
+        # Word processors write other blanks, and a minus sign of their own.
+        result = _parse(" ".join(value.split()).replace("\N{MINUS SIGN}", "-"), dimension)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        result = _to_float(value, dimension)
+    else:
+        raise _refusal(value, dimension, f"is not {dimension.name}")
+    if not math.isfinite(result):
+        raise _refusal(value, dimension, "is not a finite number")
+    return result
+
+
+def _parse(text: str, dimension: Dimension) -> float:
+    """The value of a text `NUMBER [UNIT]`."""
+    match = _QUANTITY.fullmatch(text) if len(text) <= _MAX_LENGTH else None
+    if match is None:
+        raise _refusal(text, dimension, "is not a number with a unit")
+    number, unit = match.groups()
+    if unit is None:
+        return _to_float(number, dimension)
+    known = dimension.factors.get(unit)
+    factor, zero = (Decimal(known), 0) if known else unit_scale(text, unit, dimension)
+    return _to_float(Decimal(number) * factor + zero, dimension)
+
+
+def unit_scale(text: str, unit: str, dimension: Dimension) -> tuple[Decimal, Decimal]:
+    """The factor from a unit to the SI unit of a dimension, and what its 0 is there, by pint.
+
+    The base units must be the same, not just the dimension: revolutions per minute and rad/s have
+    the dimension of Hz. A unit whose 0 is not 0 of the SI unit, as of degC and K, is refused where
+    that has no zero of its own, and a logarithmic one, which has no factor, everywhere.
+    """
+    import pint
+
+    registry = _registry()
+    try:
+        given, own = (
+            registry.parse_units(each.replace("·", "*")) for each in (unit, dimension.unit)
+        )
+        factor, base = registry.get_base_units(given)
+        _, expected = registry.get_base_units(own)
+        zero, start = (
+            Decimal(str(registry.Quantity(Decimal(0), each).to_base_units().magnitude))
+            for each in (given, own)
+        )
+    except pint.UndefinedUnitError as error:
+        raise _refusal(text, dimension, f"has the unknown unit {unit}") from error
+    except TypeError as error:  # of Decimal, for a logarithm
+        raise _refusal(text, dimension, f"is not {dimension.name}") from error
+    except (pint.PintError, ArithmeticError, AttributeError, ValueError) as error:
+        raise _refusal(text, dimension, f"has the invalid unit {unit}") from error
+    if base != expected or (zero and not start):
+        raise _refusal(text, dimension, f"is not {dimension.name}")
+    return Decimal(str(factor)), zero - start
+
+
+@cache
+def _registry() -> "pint.UnitRegistry[Decimal]":
+    """Pint's units with decimal factors, so that 12 in is 0.3048 m and not 0.30479999999999996.
+
+    Made for the first unit that is not common, since it takes a tenth of a second.
+    """
+    import pint
+
+    return pint.UnitRegistry(non_int_type=Decimal)
+
+
+def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
+    """The nearest double; raises InputError for an integer that is too large."""
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise _refusal(value, dimension, "is not a finite number") from error
+
+
+def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
+    """The error for a value, with what to write instead."""
+    text = shown(value)
+    text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
+    bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
+    return InputError(f"{text} {why}; write {bare}, or for example {dimension.example}")
+
+
+def shown(value: object) -> str:
+    """A value as it is written in a file."""
+    if value is None:
+        return "nothing"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+class Section(BaseModel):
+    """A mapping in a configuration file: strict types, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+_MAX_NAME = 100  # characters; what is longer is no misspelt word
+
+SectionT = TypeVar("SectionT", bound=Section)
+PartT = TypeVar("PartT", bound=Section)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Annotation of a float field written with a unit or in SI; bounds in SI.
+
+    above and below exclude the bound, at_least and at_most include it. word: what may stand in
+    place of a number, and is kept as it is.
+    """
+
+    dimension: Dimension
+    above: float = -float("inf")
+    at_least: float = -float("inf")
+    at_most: float = float("inf")
+    below: float = float("inf")
+    word: str = ""
+
+    def read(self, value: object) -> float:
+        """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
+        result = quantity(value, self.dimension)
+        if self.above < result < self.below and self.at_least <= result <= self.at_most:
+            return result
+        limits = [
+            f"{words} {limit:g} {self.dimension.unit}".strip()
+            for words, limit in (
+                ("above", self.above),
+                ("at least", self.at_least),
+                ("at most", self.at_most),
+                ("below", self.below),
+            )
+            if abs(limit) != float("inf")
+        ]
+        bare = f"; a bare number is in {self.dimension.unit}" if self.dimension.unit else ""
+        raise ValueError(f"must be {' and '.join(limits)}, got {value}{bare}")
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._read_or_word)
+
+    def _read_or_word(self, value: object) -> float | str:
+        if self.word and value == self.word:
+            return self.word
+        try:
+            return self.read(value)
+        except ValueError as error:
+            raise ValueError(f"{error}; or {self.word}" if self.word else str(error)) from error
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: object) -> dict[str, Any]:
+        unit = self.dimension.unit or "no unit"
+        description = f"{self.dimension.name} [{unit}], for example {self.dimension.example}"
+        return {"type": ["number", "string"], "description": description}
+
+
+def quantities(field: FieldInfo) -> list[Quantity]:
+    """Every Quantity that a field's type carries, however deep."""
+
+    def within(annotation: Any, metadata: Any = ()) -> list[Quantity]:
+        found = [part for part in metadata if isinstance(part, Quantity)]
+        for part in get_args(annotation):
+            found += [part] if isinstance(part, Quantity) else within(part)
+        return found
+
+    return within(field.annotation, field.metadata)
+
+
+class ByKind:
+    """Annotation of a union of sections, one of which a mapping's `kind` chooses, or the first."""
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        sections = get_args(source)
+        return core_schema.no_info_plain_validator_function(
+            partial(_validated_by_kind, sections), metadata={"sections": sections}
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        sections = schema["metadata"]["sections"]
+        return {"anyOf": [handler(each.__pydantic_core_schema__) for each in sections]}
+
+
+def _validated_by_kind(sections: Sequence[type[Section]], value: Any) -> Section:
+    kinds = [kind for each in sections for kind in _kinds(each)]
+    given = value.get("kind", kinds[0]) if isinstance(value, dict) else kinds[0]
+    if given not in kinds:
+        expected = " or ".join(repr(kind) for kind in kinds)
+        error = InitErrorDetails(
+            type="literal_error", loc=("kind",), input=given, ctx={"expected": expected}
+        )
+        raise ValidationError.from_exception_data("kind", [error])
+    return section_by_kind(sections, value).model_validate(value)
+
+
+def _kinds(section: type[Section]) -> tuple[str, ...]:
+    return get_args(section.model_fields["kind"].annotation)
+
+
+def section_by_kind(sections: Sequence[type[PartT]], value: object) -> type[PartT]:
+    """The section whose `kind` a mapping has; the first of them for any other, or none."""
+    given = value.get("kind") if isinstance(value, dict) else None
+    return next((each for each in sections if given in _kinds(each)), sections[0])
+
+
+class Validation(Generic[SectionT]):
+    """Checks a document against its sections, and collects all problems."""
+
+    def __init__(self, document: Document, root: type[SectionT]) -> None:
+        """Find every key that is unknown, missing, or has a value that its section refuses."""
+        self._section: SectionT | None = None
+        self._document = document
+        self._problems: list[ConfigProblem] = []
+        try:
+            self._section = root.model_validate(document.data)
+        except ValidationError as error:
+            self._add_errors(error, root)
+
+    def part(self, path: KeyPath, section: type[PartT]) -> PartT | None:
+        """A section if it is valid on its own, for checks across sections; else None."""
+        try:
+            return section.model_validate(self._document.value(path))
+        except (KeyError, ValidationError):
+            return None
+
+    def nested(
+        self, path: KeyPath, section: type[PartT], *, without: str | None = None
+    ) -> PartT | None:
+        """Validate a section that its parent leaves open, without one of its keys."""
+        value = self.mapping(path)
+        try:
+            return section.model_validate({k: v for k, v in value.items() if k != without})
+        except ValidationError as error:
+            self._add_errors(error, section, below=path)
+            return None
+
+    def field(self, path: KeyPath, section: type[Section]) -> Any:
+        """One field of a section if it is valid on its own; else None."""
+        try:
+            return _field_reader(section, str(path[-1])).validate_python(self._document.value(path))
+        except (KeyError, ValidationError):
+            return None
+
+    def mapping(self, path: KeyPath) -> Mapping[str, Value]:
+        """A mapping of the file, unchecked; empty if missing."""
+        try:
+            value = self._document.value(path)
+        except KeyError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+    def add(self, path: KeyPath, message: str) -> None:
+        """Add a problem at a key."""
+        self._problems.append(self._document.problem(path, message))
+
+    def _add_errors(
+        self, error: ValidationError, section: type[Section], *, below: KeyPath = ()
+    ) -> None:
+        """Add the errors of a section below a path, as many as are reported and one more."""
+        for details in error.errors(include_url=False)[: MAX_PROBLEMS + 1]:
+            self._problems.append(_problem(self._document, section, details, below=below))
+
+    def finish(self) -> SectionT:
+        """Return the root section; raises ConfigError with all problems."""
+        if self._problems or self._section is None:
+            raise ConfigError(self._document.source, self._problems)
+        return self._section
+
+
+@cache
+def _field_reader(section: type[Section], name: str) -> TypeAdapter[Any]:
+    return TypeAdapter(
+        section.model_fields[name].rebuild_annotation(), config=ConfigDict(strict=True)
+    )
+
+
+def _problem(
+    document: Document, root: type[Section], details: ErrorDetails, *, below: KeyPath = ()
+) -> ConfigProblem:
+    """Convert a pydantic error of a section below a path."""
+    # pydantic marks an error in the key of a mapping by a last entry "[key]".
+    path = tuple(part for part in details["loc"] if part != "[key]")
+    given, context = details["input"], details.get("ctx", {})
+    bound = context.get("min_length", context.get("max_length", 0))
+    match details["type"]:
+        case "extra_forbidden":
+            message = _unknown_key(str(path[-1]), _section_at(root, path[:-1], document))
+        case "literal_error" | "enum":
+            message = _no_choice(details, context["expected"])
+        case kind if kind in _MESSAGES:
+            message = _MESSAGES[kind].format(
+                **context,
+                got=_shown(details),
+                quotes=_in_quotes(details),
+                entries=counted(bound, "entry", plural="entries"),
+                characters=counted(bound, "character"),
+                # where it is known to be too many, it is not counted
+                count=len(given) if isinstance(given, list | dict) else 0,
+            )
+        case _:
+            message = f"{reworded(details['msg'])}, got {_shown(details)}"
+    return document.problem((*below, *path), message)
+
+
+_WHOLE, _LIST = "must be a whole number, got {got}", "must be a list in brackets, got {got}"
+_MAPPING = "must be a mapping of `key: value` lines, got {got}"
+_MESSAGES = {
+    "missing": "missing; add it",
+    "value_error": "{error}",
+    **dict.fromkeys(("model_type", "dict_type"), _MAPPING),
+    **dict.fromkeys(("list_type", "tuple_type"), _LIST),
+    **dict.fromkeys(("int_type", "int_from_float"), _WHOLE),
+    "string_type": "must be text, got {got}{quotes}",
+    "greater_than_equal": "must be at least {ge}, got {got}",
+    "less_than_equal": "must be at most {le}, got {got}",
+    "string_too_short": "must not be empty; write text, or remove the key",
+    "string_too_long": "must have at most {characters}, got {got}",
+    "too_short": "must have at least {entries}, got {count}",
+    "too_long": "must have at most {entries}, got {count}",
+}
+"""Messages by pydantic's kinds of errors, of which it gives further values."""
+
+
+def _in_quotes(details: ErrorDetails) -> str:
+    """Remedy for text that YAML takes for a number or a boolean."""
+    given = details["input"]
+    return "" if given is None or isinstance(given, dict | list) else "; write it in quotes"
+
+
+def _no_choice(details: ErrorDetails, expected: str) -> str:
+    """Message for a value that is not among the choices, `'x', 'y' or 'z'` of pydantic."""
+    choices = expected.replace("'", "")
+    meant = did_you_mean(str(details["input"])[:_MAX_NAME], re.findall(r"'([^']+)'", expected))
+    return f"must be {choices}, got {_shown(details)}" + (f"; {meant.strip()}" if meant else "")
+
+
+def _shown(details: ErrorDetails) -> str:
+    text = shown(details["input"])
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def _unknown_key(key: str, section: type[Section]) -> str:
+    known = list(section.model_fields)
+    return f"unknown key; {did_you_mean(key, known)}known are {', '.join(known)}"
+
+
+def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[Section]:
+    """The section at a path, of several kinds that of the document."""
+    kind: Any = root
+    for number, part in enumerate(path, start=1):
+        if get_origin(kind) in (dict, list):
+            kind = get_args(kind)[-1]
+        else:
+            kind = kind.model_fields[part].annotation
+        while get_origin(kind) in (Annotated, Union, UnionType):
+            annotations = getattr(kind, "__metadata__", ())
+            kind = get_args(kind)[0]  # of a field that may be left out
+            if any(isinstance(each, ByKind) for each in annotations):
+                kind = section_by_kind(get_args(kind), document.value(path[:number]))
+    section: type[Section] = kind
+    return section
+
+
+# More is a typing error.
+MAX_FREQUENCIES = 2000
+
+
+def parse_point(text: str, *, what: str) -> tuple[float, float]:
+    """Position [m] from `X,Y`; what: the option, for the error."""
+    parts = text.split(",")
+    try:
+        x, y = (float(part) for part in parts)
+    except ValueError:
+        raise InputError(
+            f"{what} must be X,Y in metres without a unit, such as {what} 0.10,0.08, got {text!r}"
+        ) from None
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f"{what}: both coordinates must be finite, got {text!r}")
+    return x, y
+
+
+def in_metres(x: float, y: float, *, length: float, width: float) -> str:
+    """Remedy for a place off the plate that would be on it in cm or mm, else "".
+
+    length, width [m]: of the plate. Coordinates below 1 are not taken for another unit.
+    """
+    for unit, count in (("cm", 100), ("mm", 1000)):
+        sides = ((x, length), (y, width))
+        if all(at == 0 or 1 <= at <= count * side for at, side in sides):
+            return (
+                f"; positions are in metres: for {x:g} {unit}, {y:g} {unit} give "
+                f"{x / count:g},{y / count:g}"
+            )
+    return ""
+
+
+def parse_pair(text: str, *, what: str) -> tuple[int, int]:
+    """Two counts from `12x9`."""
+    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
+    if match is None:
+        raise InputError(f"{what} must be two numbers such as 12x9, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def parse_frequencies(text: str) -> "FloatArray":
+    """Frequencies (f,) [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
+
+    Raises InputError for anything else, and for a frequency given twice.
+    """
+    import numpy as np  # which other commands do without
+
+    try:
+        if ":" in text:
+            low, high, step = (float(part) for part in text.split(":"))
+            count = int((high - low) / step + 1e-9) + 1
+            if not (0 < low <= high and step > 0 and count <= MAX_FREQUENCIES):
+                raise ValueError
+            return np.asarray(low + step * np.arange(count))
+        values = np.array([float(part) for part in text.split(",")])
+    except (ValueError, OverflowError, ZeroDivisionError):
+        raise InputError(
+            f"--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
+            f"60:320:10, and at most {MAX_FREQUENCIES} frequencies, got {text!r}"
+        ) from None
+    distinct, counts = np.unique(values, return_counts=True)
+    if len(distinct) < len(values):
+        raise InputError(
+            f"--frequencies must be distinct, got {distinct[counts.argmax()]:g} Hz twice in "
+            f"{text[:40]!r}"
+        )
+    return values
+
+
+Point: TypeAlias = tuple[float, float]
+
+_CIRCLE_CORNERS = 60  # a multiple of 4
+_TOLERANCE = 1e-9  # m; a point this close to a side lies on it
+
+
+class Shape(Protocol):
+    """A part of the plate; lengths in metres, from the plate's south-west corner."""
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within or on the edge."""
+
+    @property
+    def centre(self) -> Point:
+        """Its centre of area."""
+
+    def corners(self) -> Sequence[Point]:
+        """Return its corners in order; those of a circle are many, four of them at its box."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return `shape` and its dimensions; every key has its unit."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle from its south-west corner (x, y), width along x and height along y."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within."""
+        return self.x <= x <= self.x + self.width and self.y <= y <= self.y + self.height
+
+    @property
+    def centre(self) -> Point:
+        """The centre of area."""
+        return (self.x + self.width / 2, self.y + self.height / 2)
+
+    def corners(self) -> Sequence[Point]:
+        """Return all four."""
+        east, north = self.x + self.width, self.y + self.height
+        return ((self.x, self.y), (east, self.y), (east, north), (self.x, north))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
+        return {
+            "shape": "rectangle",
+            "x_m": self.x,
+            "y_m": self.y,
+            "width_m": self.width,
+            "height_m": self.height,
+        }
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle around (x, y)."""
+
+    x: float
+    y: float
+    radius: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a point is within."""
+        return math.dist((x, y), (self.x, self.y)) <= self.radius
+
+    @property
+    def centre(self) -> Point:
+        """The centre."""
+        return (self.x, self.y)
+
+    def corners(self) -> Sequence[Point]:
+        """Return points around it, among them those farthest along x and y."""
+        angles = [2 * math.pi * number / _CIRCLE_CORNERS for number in range(_CIRCLE_CORNERS)]
+        return [
+            (self.x + self.radius * math.cos(angle), self.y + self.radius * math.sin(angle))
+            for angle in angles
+        ]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
+        return {"shape": "circle", "x_m": self.x, "y_m": self.y, "radius_m": self.radius}
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A polygon by its corners; crossing sides follow the even-odd rule."""
+
+    points: tuple[Point, ...]
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether a ray to the east crosses the sides an odd number of times."""
+        if not self._box.contains(x, y):
+            return False
+        is_within = False
+        for (x0, y0), (x1, y1) in zip(self.points, (*self.points[1:], self.points[0]), strict=True):
+            if _is_on_side(x, y, (x0, y0), (x1, y1)):
+                return True
+            if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
+                is_within = not is_within
+        return is_within
+
+    @cached_property
+    def _box(self) -> Rectangle:
+        """The bounding box: a fast test that most points fail."""
+        xs, ys = zip(*self.points, strict=True)
+        return Rectangle(
+            min(xs) - _TOLERANCE,
+            min(ys) - _TOLERANCE,
+            max(xs) - min(xs) + 2 * _TOLERANCE,
+            max(ys) - min(ys) + 2 * _TOLERANCE,
+        )
+
+    @property
+    def centre(self) -> Point:
+        """The centre of area, or the mean of the corners where sides cross out the area."""
+        following = (*self.points[1:], self.points[0])
+        cross = [
+            x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(self.points, following, strict=True)
+        ]
+        area = sum(cross) / 2
+        if abs(area) < _TOLERANCE:
+            xs, ys = zip(*self.points, strict=True)
+            return (sum(xs) / len(xs), sum(ys) / len(ys))
+        pairs = list(zip(self.points, following, cross, strict=True))
+        return (
+            sum((one[0] + other[0]) * each for one, other, each in pairs) / (6 * area),
+            sum((one[1] + other[1]) * each for one, other, each in pairs) / (6 * area),
+        )
+
+    def corners(self) -> Sequence[Point]:
+        """Return all corners."""
+        return self.points
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the API describes it."""
+        return {"shape": "polygon", "points_m": [list(point) for point in self.points]}
+
+
+def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:
+    """Whether a point lies on a side, within a nanometre."""
+    length = math.dist(start, end)
+    if length == 0:
+        return (x, y) == start
+    along = ((x - start[0]) * (end[0] - start[0]) + (y - start[1]) * (end[1] - start[1])) / length
+    across = ((x - start[0]) * (end[1] - start[1]) - (y - start[1]) * (end[0] - start[0])) / length
+    return abs(across) <= _TOLERANCE and -_TOLERANCE <= along <= length + _TOLERANCE
+
+
+_Length = Annotated[float, Quantity(LENGTH, at_least=-10, at_most=10)]
+PointSection = Annotated[tuple[_Length, _Length], Strict(strict=False)]  # a list in the file
+PolygonSection = Annotated[list[PointSection], Field(min_length=3, max_length=64)]
+
+
+class RectangleSection(Section):
+    """Two opposite corners."""
+
+    start: PointSection
+    end: PointSection
+
+
+class CircleSection(Section):
+    """A centre and a radius."""
+
+    at: PointSection
+    radius: Annotated[float, Quantity(LENGTH, above=0, at_most=10)]
+
+
+class ShapedSection(Section):
+    """A section of one shape."""
+
+    rectangle: RectangleSection | None = None
+    circle: CircleSection | None = None
+    polygon: PolygonSection | None = None
+
+    @property
+    def shape(self) -> Shape:
+        """That shape."""
+        if self.rectangle is not None:
+            (x0, y0), (x1, y1) = self.rectangle.start, self.rectangle.end
+            return Rectangle(min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0))
+        if self.circle is not None:
+            return Circle(*self.circle.at, self.circle.radius)
+        return Polygon(tuple(self.polygon or ()))
+
+    def shape_problem(self, sides: Point | None) -> tuple[tuple[str, ...], str] | None:
+        """Where and why it has not one shape, on a plate of these sides [m]; None if it has.
+
+        sides: None for any plate.
+        """
+        given = [name for name in ShapedSection.model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            known, found = ", ".join(ShapedSection.model_fields), " and ".join(given) or "none"
+            return (), f"must have one of {known}, got {found}"
+        (x0, y0), (x1, y1) = box_of(self.shape)
+        length, width = sides or (x1, y1)
+        d = _TOLERANCE
+        if sides is None or (min(x0, y0) >= -d and x1 <= length + d and y1 <= width + d):
+            return None
+        return (given[0],), (
+            f"must lie on the plate of {length:g} m by {width:g} m, got ({x0:g}, {y0:g}) to "
+            f"({x1:g}, {y1:g}) m; coordinates start at its south-west corner"
+        )
+
+
+def box_of(shape: Shape) -> tuple[Point, Point]:
+    """South-west and north-east corner of the box around a shape."""
+    xs, ys = zip(*shape.corners(), strict=True)
+    return (min(xs), min(ys)), (max(xs), max(ys))

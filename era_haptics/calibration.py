@@ -6,7 +6,7 @@ from era_haptics.arguments import expect_rig
 from model.calibration.calibrate import Calibration
 from model.calibration.calibrate import calibrate as fit
 from model.calibration.responses import read_measured, responses_of
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.errors import expect_path
 from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig

@@ -19,7 +19,7 @@ from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses, read_measured, responses_of
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig

@@ -20,8 +20,7 @@ from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.calibration.responses import Responses
-from model.diagnosis.kept_promises import judged_by_promises
-from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 

@@ -24,8 +24,7 @@ from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
-from model.diagnosis.kept_promises import judged_by_promises
-from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 

@@ -32,7 +32,7 @@ from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses, WiredSensor, read_sensors, write_responses
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate

@@ -21,7 +21,7 @@ from benchmarks.setting import use_one_thread
 from benchmarks.weekend.boards import ROOT
 from benchmarks.weekend.chain import FOLDER, measured
 from model.calibration.calibrate import calibrate
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import load_rig

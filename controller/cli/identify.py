@@ -122,7 +122,7 @@ def identify(
 
     from controller.diagnosis.plate_measurement import observation_of
     from model.config.fields import parse_frequencies
-    from model.diagnosis.other_meaning import check_meaning
+    from model.diagnosis.verdict import check_meaning
     from model.identification import identification_report
     from model.identification.identify import identify as fit
     from model.identification.measurement import DeviceSettings, measure_by_device
@@ -210,7 +210,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     import numpy as np
 
     from model.calibration.responses import read_measured, responses_of
-    from model.diagnosis.consistency import check_consistency
+    from model.diagnosis.verdict import check_consistency
     from model.identification.measurement import MeasuredPlate
 
     responses = responses_of(read_measured(path), rig)

@@ -76,8 +76,7 @@ def check(
     from dataclasses import replace
 
     from model.diagnosis import diagnosis_report
-    from model.diagnosis.kept_promises import judged_by_promises
-    from model.diagnosis.verdict import diagnose
+    from model.diagnosis.verdict import diagnose, judged_by_promises
 
     if (measured is None) == (url is None):
         raise InputError("give --url, of an amplifier with sensors, or --measured, a file")

@@ -138,7 +138,7 @@ def calibrate(
     from model.calibration.calibrate import calibrate as fit
     from model.calibration.responses import LEAST_SENSORS, read_measured, responses_of
     from model.config.document import read_document
-    from model.diagnosis.consistency import check_consistency
+    from model.diagnosis.verdict import check_consistency
     from model.rig.file import rig_of
 
     check_rig_output(output, rig_file, measured_file)

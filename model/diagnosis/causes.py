@@ -5,23 +5,89 @@ within its priors (`model.diagnosis.plate_match`).
 
 Not tried: two causes at once, plates that are not rectangles, further supports, and density, which
 cannot be distinguished from the others.
+
+What of a plate is beyond tolerances: masses, a finger, its thickness, or something unnamed.
+
+A plate is matched once more with form errors, each held by its tolerance (`KINDS` in
+`model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
+sides, Poisson's ratio, single modes. They explain what builders and rulers do, but for foreign mass
+in one place, above all near an edge: mass in the middles of cells does not have its field. What
+lies on the plate is therefore sought where it would explain most beside all of them, one after
+another, and named if it is beyond a tolerance. Of the rest each kind of form error is judged by its
+sum of squares, at equal shares of a stated false alarm, and a thickness at as much by itself. A
+plate that is thinner at one end moves more there, by as much as it is thinner: scales of sensors
+rise along it.
+
+Sensors at each other's places or noted from another side, by the responses that they read.
+
+A plate that is turned over is another one by a mirror, and no fit of its values makes up for it.
+Both are fitted as coarsely as wiring is first looked at (`model.diagnosis.plate_match`): shapes of
+boards as bought leave a quarter unexplained with the right side, nine tenths with another.
+
+Exciters whose glue is off: what comes through a spring between coil and plate.
+
+    g_f ~ G |z / (z + D(w_f))|
+
+g_f the gains with which a plate that fits explains a channel at its frequencies, D the dynamic
+stiffness of the exciter, z that of its glue: above the resonance of its magnet D falls, and the
+gain rises with frequency. A constant gain does not, nor does what its parts deviate by, which the
+fit has found. What all channels have in common is the amplifier's.
+
+Which side a board's grain runs along, by the shapes in which it responds.
+
+Boards are cut both ways, and a file that names the wrong side describes another board: no modulus
+makes up for it. Both are fitted as coarsely as wiring is first looked at, with a gain of each
+channel and frequency and a few moduli and stiffnesses (`model.diagnosis.plate_match.match_shapes`).
+Boards as bought leave a quarter of their response unexplained in this way, or less, and half to
+three quarters with their grain turned.
+
+Detection of dead channels and unusable sensors.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.optimize import linear_sum_assignment, minimize_scalar
+from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray, best_by, ranked_by
-from model.calibration.fit import Parameter, SensedPlate, modal_assurance, sensed_plate
-from model.diagnosis.plate_match import Match, match_plate
+from model.calibration.fit import (
+    Parameter,
+    SensedPlate,
+    modal_assurance,
+    plate_of,
+    project_gains,
+    projection_slopes,
+    responses_of,
+    row_rms,
+    sensed_plate,
+)
+from model.calibration.responses import Responses, check_enough_sensors, silent_sensors
+from model.diagnosis.plate_match import (
+    FALSE_ALARM,
+    MAX_FIT_ERROR,
+    Match,
+    ShapeMatch,
+    match_plate,
+    match_shapes,
+)
 from model.errors import InputError
+from model.finger import Grid
+from model.identification.derivatives import by_mass_at
+from model.identification.identify import solved_for
+from model.identification.least_squares import Linearization
 from model.identification.parameters import VALUE_UNITS
+from model.quantities import percent
 from model.rig.rig import Rig
 from model.spectral.mesh import stretched
 from model.structure.actuators import Actuator
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
+from model.structure.exciter import Exciter
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -230,3 +296,466 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     masses = tuple(replace(mass, x=mass.x * along_x, y=mass.y * along_y) for mass in rig.masses)
     mesh = stretched(rig.mesh, plate)
     return replace(rig, plate=plate, eras=eras, masses=masses, mesh=mesh)
+
+
+MAX_ERROR = 0.05
+"""Share of a response that form errors leave unexplained at most, if they explain the plate."""
+
+_NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit is weighted by
+_FIRST_NOISE = 0.02
+_SCANNED = Grid(32, 24)
+_MAX_LOADS = 2
+_HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
+_LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
+_LEAST_SHOWN = 1e-6  # of a variance
+_CLEAR = 40.0  # of half the sum of squares
+
+_THICKNESS = "thickness"
+_WORDS = {
+    "place": "places of ERAs",
+    "mode_shifts": "natural frequencies",
+    "sensor_scale": "scales of sensors",
+    "sensor_place": "places of sensors",
+    "foreign_mass": "distribution of mass",
+    "side": "length and width",
+    "poisson": "Poisson's ratio",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BeyondTolerances:
+    """What is not as written.
+
+    loads: what lies on the plate, masses or a finger; farthest: the form error that is least
+    likely, in words; deviation: its rms in standard deviations, 0 where none is too large; chance:
+    in how many of all plates as written one is as unlikely, at most; error: of the response,
+    unexplained; taper: how much thicker the plate is at the ends of x and of y than in the middle,
+    relative, None where that is not what is farthest.
+    """
+
+    loads: tuple[PointLoad | FingertipLoad, ...]
+    farthest: str
+    deviation: float
+    chance: float
+    error: float
+    taper: tuple[float, float] | None = None
+
+    @property
+    def kind(self) -> str:
+        """Its name in reports."""
+        if not self.loads:
+            return "unnamed" if self.taper is None else "thickness"
+        return "mass" if isinstance(self.loads[0], PointLoad) else "finger"
+
+
+def match_with_form(
+    plate: SensedPlate, observation: Responses, values: ComplexArray, drives: Sequence[int]
+) -> tuple[Match, BeyondTolerances | None]:
+    """Match values (f, e, s) of channels that drive ERAs with form errors, and with a load.
+
+    Return also what of the plate is beyond tolerances, None for nothing.
+    """
+
+    def matched(loads: Sequence[PointLoad | FingertipLoad], noise: float) -> Match:
+        rig = replace(plate.rig, masses=(*plate.rig.masses, *loads))  # type: ignore[arg-type]
+        sensed = plate_of(rig, observation, has_form=True)
+        return match_plate(sensed, values, drives=drives, model_error=noise)
+
+    noise = float(np.clip(matched((), _FIRST_NOISE).error, *_NOISE))
+    best = matched((), noise)
+    loads: list[PointLoad | FingertipLoad] = []
+    further, fitted = _loads(best, values, drives, noise)
+    while further and len(loads) < _MAX_LOADS:
+        tried = [(each, matched((*loads, each), noise)) for each in further]
+        load, found = best_by(tried, lambda each: -each[1].cost)
+        if found.cost > best.cost - _CLEAR:
+            break
+        best, loads = found, [*loads, load]
+        further, fitted = _loads(best, values, drives, noise)
+    mass = sum(each.mass for each in loads if isinstance(each, PointLoad))
+    is_heavy = mass >= _HEAVY * plate.rig.plate.mass
+    # A mass within tolerance is no fault, nor are form errors that would stand in for it.
+    named = tuple(each for each in loads if is_heavy or not isinstance(each, PointLoad))
+    if named:
+        return best, BeyondTolerances(named, "", 0.0, 1.0, best.error)
+    rises, slopes = _along_plate(best, observation.points, fitted)
+    farthest, deviation, chance = _farthest(best, rises)
+    if best.error <= MAX_ERROR and not deviation:
+        return best, None
+    taper = slopes if farthest == _THICKNESS else None
+    return best, BeyondTolerances((), farthest, deviation, chance, best.error, taper)
+
+
+def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
+    """The kind of form error that is least likely, its rms in standard deviations, its chance."""
+    space = match.plate.model.space
+    kinds = {words: match.x[space.of(kind)] for kind, words in _WORDS.items()}
+    kinds[_THICKNESS] = rises
+    found = [("", 0.0, 1.0)]
+    for words, own in kinds.items():
+        among = 1 if words == _THICKNESS else len(_WORDS)
+        chance = among * float(chdtrc(len(own), own @ own))
+        if chance < FALSE_ALARM:
+            found.append((words, float(np.sqrt((own**2).mean())), chance))
+    return best_by(found, lambda each: -each[2])
+
+
+def _along_plate(
+    match: Match, points: FloatArray, fitted: Linearization
+) -> tuple[FloatArray, tuple[float, float]]:
+    """What of the scales of sensors rises along the sides (2,), in standard deviations.
+
+    And the thickness that does this, relative, at the ends of x and of y. A fit holds scales back,
+    so that those of sound plates vary by less than they are, in the mean by as much.
+    """
+    space, plate = match.plate.model.space, match.plate.rig.plate
+    own = space.of("sensor_scale")[_searched(match)]
+    scales = match.x[space.groups["sensor_scale"]]
+    along = 2 * points / [plate.length, plate.width] - 1
+    basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
+    shown = np.eye(len(points)) - linalg.inv(fitted.information)[np.ix_(own, own)]
+    shown, rises = basis.T @ shown @ basis + _LEAST_SHOWN * np.eye(2), basis.T @ scales
+    thinner = basis @ linalg.solve(shown, rises) * space.std[space.groups["sensor_scale"]]
+    x, y = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
+    return linalg.solve(linalg.cholesky(shown, lower=True), rises), (float(x), float(y))
+
+
+def _searched(match: Match) -> NDArray[np.bool_]:
+    """Mask (p,) of the parameters that are searched beside free gains."""
+    space = match.plate.model.space
+    return space.uncertain & ~space.of("gain")
+
+
+def _loads(
+    match: Match, values: ComplexArray, drives: Sequence[int], noise: float
+) -> tuple[list[PointLoad | FingertipLoad], Linearization]:
+    """A mass and a finger where each would explain most, the latter if it is of a size that counts.
+
+    And the match beside which they were sought.
+    """
+    plate, of_eras = match.plate, list(drives)
+    model, mass = plate.model, plate.rig.plate.mass
+    tip = plate.rig.fingertip or Fingertip()
+    searched = _searched(match)
+    found, by_x = responses_of(model, match.x, searched)
+    points = _SCANNED.centres(plate.rig.plate)
+    by_mass = by_mass_at(model.at(match.x), points).transpose(3, 0, 2, 1)[:, :, of_eras]
+    found, by_x = found[:, of_eras], by_x[:, :, of_eras]
+    kept = np.isfinite(values) & ~match.outliers
+    weight = kept / (noise * row_rms(values, kept)[:, :, None])
+    _, left = project_gains(found, values, weight)
+
+    def real(slopes: ComplexArray) -> FloatArray:
+        """Derivatives (2 m, n) of all residuals."""
+        own = projection_slopes(found, slopes, values, weight)[1][:, kept].T
+        return np.concatenate([own.real, own.imag])
+
+    residual = np.concatenate([left[kept].real, left[kept].imag])
+    fitted = Linearization(match.x[searched], residual, real(by_x))
+    of_finger = -tip.dynamic_stiffness(model.omega) / model.omega**2
+    heaviest: list[PointLoad | FingertipLoad] = []
+    for number, size in fitted.further(real(mass * by_mass))[:1]:
+        x, y = points[number].tolist()
+        heaviest.append(PointLoad(x, y, mass=size * mass))
+    for number, size in fitted.further(real(of_finger[:, None, None] * by_mass))[:1]:
+        if size >= _LIGHT:
+            x, y = points[number].tolist()
+            heaviest.append(FingertipLoad(x, y, tip.multiplied(min(size, _FIRM))))
+    return heaviest, fitted
+
+
+_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of a sensor that is elsewhere
+_CLEARLY = 0.6  # of the error as written
+_MAX_ERROR = 0.45  # of a coarse fit of the right board, a fault beside
+_X, _Y, _FREQUENCY = "x", "y", "frequency"
+
+
+@dataclass(frozen=True)
+class ExchangedSensors:
+    """Pairs of a sensor and the one at whose place it is, which is elsewhere too."""
+
+    pairs: Sequence[tuple[str, str]]
+
+    label = "PLACES"
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        pairs = ", ".join(f"{name} at that of {place}" for name, place in self.pairs)
+        return (
+            f"sensors must be at their places, got responses that fit exchanged ones: {pairs}; "
+            "correct their positions or names"
+        )
+
+    def put_right(self, observation: Responses) -> Responses:
+        """The same responses, each sensor where it is."""
+        names, points = observation.sensors, observation.points.copy()
+        for name, place in self.pairs:
+            points[names.index(name)] = observation.points[names.index(place)]
+        return replace(observation, points=points)
+
+
+@dataclass(frozen=True)
+class ReversedAxes:
+    """Axes along which a measurement is noted the wrong way round.
+
+    axes: "x", "y" or both of the places, or "frequency"; error, error_as_written: shares of the
+    responses that coarse fits of either leave unexplained; is_wiring: whether exchanged channels
+    explain them as well.
+    """
+
+    axes: tuple[str, ...]
+    error: float
+    error_as_written: float
+    is_wiring: bool
+
+    label = "PLACES"
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        names = " and ".join(self.axes)
+        found = (
+            f"with {names} from the other end a coarse fit leaves {percent(self.error)} of the "
+            f"responses unexplained, as written {percent(self.error_as_written)}"
+        )
+        if self.axes == (_FREQUENCY,):
+            return f"frequencies must be those of their responses, got reversed ones: {found}"
+        wiring = ", or plug the channels as the rig has them" if self.is_wiring else ""
+        return (
+            f"places of sensors must be from the corner from which those of ERAs are, got ones "
+            f"mirrored in {names}: {found}; correct the positions of all{wiring}"
+        )
+
+    def put_right(self, observation: Responses, rig: Rig) -> Responses:
+        """The same responses, noted the other way round."""
+        size = np.array([rig.plate.length, rig.plate.width])
+        mirrored = size * [axis in self.axes for axis in (_X, _Y)]
+        step = -1 if _FREQUENCY in self.axes else 1
+        points, values = np.abs(mirrored - observation.points), observation.values[::step]
+        return replace(observation, points=points, values=values)
+
+
+def reversed_axes(
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+) -> ReversedAxes | None:
+    """Find the axes whose other direction is clearly the measured one, of a rig's own wiring.
+
+    shapes: of the observation, by the rig's plate. None where that is right to a fault.
+    """
+    as_written = shapes.error_as_wired
+    if not as_written > _MAX_ERROR:
+        return None
+    tried = []
+    for axes in ((_X,), (_Y,), (_X, _Y), (_FREQUENCY,)):
+        put_right = ReversedAxes(axes, 0.0, as_written, False).put_right(observation, plate.rig)
+        error = match_shapes(plate_of(plate.rig, put_right), put_right.values).error_as_wired
+        is_wiring = shapes.error * _CLEARLY < error
+        tried.append(ReversedAxes(axes, error, as_written, is_wiring))
+    found = best_by(tried, lambda each: -each.error)
+    return found if found.error < min(_MAX_ERROR, _CLEARLY * as_written) else None
+
+
+def exchanged_sensors(observation: Responses, model: ComplexArray) -> ExchangedSensors | None:
+    """Find the sensors that read what the model (f, e, s) has at another's place."""
+    values = observation.values
+    weight = np.isfinite(values) / row_rms(values)[:, :, None]
+    gains, _ = project_gains(model, values, weight)
+    measured = np.where(weight > 0, values * weight, 0j)
+    predicted = np.nan_to_num(gains)[:, :, None] * model / row_rms(values)[:, :, None]
+    coherence = _coherence(measured, predicted, weight > 0)
+    sensors, places = linear_sum_assignment(-(coherence**2))
+    names = observation.sensors
+    pairs = [
+        (names[sensor], names[place])
+        for sensor, place in zip(sensors, places, strict=True)
+        if coherence[sensor, sensor] < _OWN_PLACE
+        and coherence[place, place] < _OWN_PLACE  # else two are at one place, which is no exchange
+        and coherence[sensor, place] > _OTHER_PLACE
+    ]
+    return ExchangedSensors(pairs) if pairs else None
+
+
+def _coherence(
+    measured: ComplexArray, predicted: ComplexArray, used: NDArray[np.bool_]
+) -> FloatArray:
+    """Coherence (s, s) of each sensor's responses with the model's at each place."""
+    inner = np.abs(np.einsum("fes,fep->sp", measured, predicted.conj()))
+    own = (np.abs(measured) ** 2).sum(axis=(0, 1))
+    other = np.einsum("fes,fep->sp", used.astype(float), np.abs(predicted) ** 2)
+    return np.asarray(inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300)))
+
+
+_GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
+_RISES = 0.2  # of the logarithm of a gain over the frequencies
+_EXPLAINS = 0.6  # of the median deviation without glue
+_LEAST_CHANNELS = 3
+
+
+def behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> NDArray[np.bool_]:
+    """Mask (e,) of the channels whose exciters clearly act through a spring of glue.
+
+    values (f, e, s), NaN for channels to be skipped; drives (e,): number of the ERA of each.
+    """
+    kept = np.isfinite(values) & ~match.outliers
+    weight = kept / row_rms(values, kept)[:, :, None]
+    gains, _ = project_gains(match.responses[:, list(drives)], values, weight)
+    with np.errstate(divide="ignore"):
+        sizes = np.log(np.abs(gains))
+    sizes[~np.isfinite(sizes)] = np.nan
+    driven = np.isfinite(sizes).any(axis=0)
+    found = np.zeros(len(drives), dtype=bool)
+    if driven.sum() < _LEAST_CHANNELS:
+        return found
+    sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
+    omega = match.plate.model.omega
+    for channel in np.flatnonzero(driven).tolist():
+        era = match.rig.eras[drives[channel]]
+        if isinstance(era, Exciter):
+            others = driven & (np.arange(len(drives)) != channel)
+            own = sizes[:, channel] - np.nanmedian(sizes[:, others], axis=1)
+            found[channel] = _is_behind_glue(own, era.dynamic_stiffness(omega))
+    return found
+
+
+def _is_behind_glue(sizes: FloatArray, stiffness: ComplexArray) -> bool:
+    """Whether logarithms of gains (f,) rise as those of an exciter [N/m] behind a spring."""
+    shares = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
+    left = np.vstack([sizes, sizes - shares])
+    left -= np.nanmedian(left, axis=1, keepdims=True)
+    without, *behind = np.nanmedian(np.abs(left), axis=1).tolist()
+    best = int(np.argmin(behind))
+    rise = np.ptp(shares[best][np.isfinite(sizes)])
+    return bool(behind[best] < _EXPLAINS * without and rise > _RISES)
+
+
+@dataclass(frozen=True)
+class TurnedGrain:
+    """A board whose grain runs along the other side than in its rig.
+
+    rig: with its grain; along, as_written: the sides, `length` and `width`; error,
+    error_as_written: shares of the responses that the coarse fits of either leave unexplained.
+    """
+
+    rig: Rig
+    along: str
+    as_written: str
+    error: float
+    error_as_written: float
+
+    label = "GRAIN"
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        return (
+            f"plate.grain must be {self.along}, got {self.as_written}: with the grain along its "
+            f"{self.along} a coarse fit leaves {percent(self.error)} of the responses unexplained, "
+            f"along its {self.as_written} {percent(self.error_as_written)}; look at the veneer of "
+            "its faces, and correct the rig"
+        )
+
+
+def turned_grain(
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+) -> TurnedGrain | None:
+    """Find the board with its grain along the other side where that is clearly the measured one.
+
+    shapes: of the observation, by the rig's plate. None for a board without a grain.
+    """
+    rig = plate.rig
+    if rig.plate.material.orthotropy is None:
+        return None
+    turned = replace(rig.plate, material=rig.plate.material.turned())
+    other = replace(rig, plate=turned)
+    other = replace(other, mesh=solved_for(other, rig.limits.frequency_max).mesh)
+    sensed = plate_of(other, observation)
+    error = match_shapes(sensed, observation.values).error
+    if error > min(_MAX_ERROR, _CLEARLY * shapes.error):
+        return None
+    as_written = rig.grain
+    along = "length" if as_written == "width" else "width"
+    return TurnedGrain(other, along, as_written, error, shapes.error)
+
+
+_DEAD = 0.03  # of the response that the rig predicts
+_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
+_NO_SHAPE = 0.6  # MAC
+_SENSOR_SCALE = (0.7, 1.4)
+_MUTE = 0.1  # of the others' scale
+_UPSIDE_DOWN = -0.5
+
+
+@dataclass(frozen=True)
+class BadSensor:
+    """A sensor that is left out, by what it reads of what the others say, 0 for nothing."""
+
+    name: str
+    scale: float
+
+    @property
+    def is_mute(self) -> bool:
+        """Whether it hears next to nothing, so that no scale makes use of it."""
+        return abs(self.scale) < _MUTE
+
+    @property
+    def why(self) -> str:
+        """What is wrong with it."""
+        if self.scale < _UPSIDE_DOWN:
+            return f"is upside down (reads {self.scale:.2f} of what the others say): turn it over"
+        if self.is_mute and self.scale:
+            return (
+                f"reads {self.scale:.2f} of what the others say: check that it is where its line "
+                "says, and its cable"
+            )
+        return f"reads {self.scale:.2f} of what the others say" if self.scale else "reads nothing"
+
+
+def dead_channels(
+    plate: SensedPlate, observation: Responses, shapes: ShapeMatch | None = None
+) -> NDArray[np.bool_]:
+    """Mask (e,) of driven channels with a response far below the model's.
+
+    shapes: with these also of weak channels without the shape of an ERA, whose response is noise.
+    """
+    share = np.abs(observation.values / plate.responses())
+    dead = np.zeros(observation.values.shape[1], dtype=bool)
+    for channel in np.flatnonzero(observation.measured):
+        typical = np.nanmedian(share[:, channel])
+        dead[channel] = typical < _DEAD
+        if shapes is not None and typical < _FAINT:
+            mac = np.nanmedian(shapes.mac[:, channel], axis=0)
+            dead[channel] |= np.nanmax(mac) < _NO_SHAPE
+    return dead
+
+
+def usable_sensors(
+    observation: Responses, dead: NDArray[np.bool_]
+) -> tuple[Responses, tuple[BadSensor, ...]]:
+    """Remove sensors without a signal from any live channel; return them, too.
+
+    Raises InputError if too few are left.
+    """
+    values = observation.values[:, ~dead]
+    if not np.isfinite(values).any():
+        return observation, ()
+    silent = silent_sensors(replace(observation, values=values))
+    check_enough_sensors(~silent, observation)
+    mute = tuple(BadSensor(name, 0.0) for name in compress(observation.sensors, silent))
+    return observation.without(silent), mute
+
+
+def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[BadSensor]:
+    """Sensors with a scale unlike that of the others, if the plate fits."""
+    if match.median_error > MAX_FIT_ERROR:
+        return []
+    finite = np.isfinite(values) & np.isfinite(match.predicted) & ~match.outliers
+    model = np.where(finite, match.predicted, 0)
+    measured = np.where(finite, values, 0)
+    phase_factor = np.exp(-1j * np.angle((model.conj() * measured).sum(axis=2, keepdims=True)))
+    inner = (model.conj() * measured * phase_factor).real.sum(axis=(0, 1))
+    scale = inner / np.maximum((np.abs(model) ** 2).sum(axis=(0, 1)), 1e-300)
+    scale = scale / np.median(scale)
+    low, high = _SENSOR_SCALE
+    return [
+        BadSensor(name, float(value))
+        for name, value in zip(observation.sensors, scale, strict=True)
+        if not low <= value <= high
+    ]

@@ -4,13 +4,15 @@ from collections.abc import Sequence
 from typing import Any
 
 from model.arrays import best_of
-from model.diagnosis.beyond_tolerances import BeyondTolerances
-from model.diagnosis.causes import Explanation
-from model.diagnosis.exchanged_sensors import ExchangedSensors, ReversedAxes
-from model.diagnosis.grain_direction import TurnedGrain
+from model.diagnosis.causes import (
+    BeyondTolerances,
+    ExchangedSensors,
+    Explanation,
+    ReversedAxes,
+    TurnedGrain,
+)
 from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
-from model.diagnosis.resonance_meaning import MisreadResonance
-from model.diagnosis.verdict import ChannelState, ChannelVerdict, Verdict
+from model.diagnosis.verdict import ChannelState, ChannelVerdict, MisreadResonance, Verdict
 from model.identification.fit_report import value_rows
 from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad

@@ -10,7 +10,7 @@ import perturbed_plate
 from benchmarks.calibration.hidden_plates import gains_of, true_values
 from model.calibration.calibrate import Calibration, calibrate
 from model.calibration.responses import Responses
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.rig.rig import Rig
 from paper_plate import make_paper_rig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.calibration.calibrate import as_json, calibrate, change_rows, finding_rows
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.structure.attachments import PointLoad
 from paper_plate import make_paper_rig
 from perturbed_plate import measured, perturbed

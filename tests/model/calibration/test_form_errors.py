@@ -18,7 +18,7 @@ from benchmarks.calibration.hidden_plates import (
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.fit import sensed_plate
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.identification.form_errors import MASS_CELLS, reduced_modes
 from model.identification.parameters import KINDS
 from model.reduction.free_plate import solve_free_plate

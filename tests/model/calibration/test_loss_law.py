@@ -12,7 +12,7 @@ from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.fit import sensed_plate
 from model.calibration.responses import Responses
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.fem import Mesh, assemble
 from model.identification.derivatives import jacobian
 from model.identification.viscous_loss import viscous_difference

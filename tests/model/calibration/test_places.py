@@ -9,7 +9,7 @@ from benchmarks.calibration.hidden_plates import draw_plate, measure
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
-from model.diagnosis.consistency import check_consistency
+from model.diagnosis.verdict import check_consistency
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 

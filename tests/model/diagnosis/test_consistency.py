@@ -10,11 +10,9 @@ from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.responses import Responses
 from model.diagnosis import causes
-from model.diagnosis.assignment import phases_of_drive
-from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json
-from model.diagnosis.kept_promises import judged_by_promises
-from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.plate_match import phases_of_drive
+from model.diagnosis.verdict import Verdict, check_consistency, diagnose, judged_by_promises
 from model.errors import InputError
 from model.fem import Mesh
 from model.rig.rig import Rig

@@ -19,10 +19,9 @@ from model.calibration.calibrate import MAX_OUTLIERS
 from model.calibration.fit import sensed_plate, without_outliers
 from model.calibration.responses import Responses, read_measured, responses_of
 from model.diagnosis import causes
-from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
 from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
-from model.diagnosis.verdict import Verdict, diagnose
+from model.diagnosis.verdict import Verdict, check_consistency, diagnose
 from model.errors import InputError
 from model.fem import Mesh
 from model.rig.file import load_rig

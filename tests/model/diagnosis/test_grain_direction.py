@@ -10,11 +10,9 @@ import controller.cli.identify
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from model.calibration.responses import Responses, write_responses
-from model.diagnosis.assignment import ShapeMatch
-from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
-from model.diagnosis.other_meaning import check_meaning
-from model.diagnosis.verdict import diagnose
+from model.diagnosis.plate_match import ShapeMatch
+from model.diagnosis.verdict import check_consistency, check_meaning, diagnose
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate
 from model.rig.file import load_rig

@@ -10,9 +10,8 @@ from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses, write_responses
-from model.diagnosis.consistency import check_consistency
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
-from model.diagnosis.verdict import diagnose
+from model.diagnosis.verdict import check_consistency, diagnose
 from model.errors import InputError
 from model.rig.file import load_rig
 from model.rig.rig import Rig

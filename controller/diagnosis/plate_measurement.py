@@ -18,7 +18,7 @@ from drivers.opening import Lines
 from drivers.protocol.timing import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.calibration.responses import Responses
-from model.ensemble.delays import MAX_HELD
+from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
 from model.identification.measurement import MeasuredPlate, Measurement, Repeat
 from model.processes import Progress, unseen

@@ -7,7 +7,7 @@ each reading, of which every one differs.
 import logging
 from collections.abc import Callable, Mapping
 
-from model.ensemble.delays import EXACT_CLOCKS, MAX_HELD, ClockErrors
+from model.ensemble.draws import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads

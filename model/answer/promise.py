@@ -27,8 +27,13 @@ from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntAr
 from model.drive_modes import Forms
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import PROMISED_DRAWS, Drawing, over_fingertips, percentile
-from model.ensemble.touched_by_kernel import touch
-from model.ensemble.touched_plate import FingertipAmplitudes, LoadedContacts, TouchedPlate, outer
+from model.ensemble.touched_plate import (
+    FingertipAmplitudes,
+    LoadedContacts,
+    TouchedPlate,
+    outer,
+    touch,
+)
 from model.finger import decibels
 from model.table.raster import FingertipShapes
 from model.table.table import LocalizationTable, read_fingertips

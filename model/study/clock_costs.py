@@ -13,7 +13,7 @@ from model.answer.plan import answer, worst_of
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import FloatArray
 from model.drive_modes import UNRESTRICTED
-from model.ensemble.delays import ClockErrors
+from model.ensemble.draws import ClockErrors
 from model.finger import FINGERTIP_RADIUS
 from model.rig.rig import Rig
 from model.study.random_contacts import random_contacts

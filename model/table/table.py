@@ -25,11 +25,10 @@ from model.ensemble.attached_plate import (
     PlateOnEras,
     at_harmonics,
     attach,
+    with_places,
 )
-from model.ensemble.delays import EXACT_CLOCKS, ClockErrors
-from model.ensemble.draws import JUDGING_DRAWS, PROMISED_DRAWS
-from model.ensemble.places import with_places
-from model.ensemble.touched_by_kernel import touch
+from model.ensemble.draws import EXACT_CLOCKS, JUDGING_DRAWS, PROMISED_DRAWS, ClockErrors
+from model.ensemble.touched_plate import touch
 from model.errors import InputError
 from model.finger import (
     FINE_POINTS,

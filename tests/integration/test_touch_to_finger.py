@@ -20,7 +20,7 @@ from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
-from model.ensemble.delays import ClockErrors
+from model.ensemble.draws import ClockErrors
 from model.finger import (
     Grid,
     contrast_db,

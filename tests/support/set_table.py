@@ -18,7 +18,7 @@ from model.answer.plan import answer, prepare_answers, query
 from model.answer.promise import scaled
 from model.answer.stimulus import Contents, Finger, Placement, Stimulus, Stream, Tones, together
 from model.arrays import FloatArray
-from model.ensemble.delays import ClockErrors
+from model.ensemble.draws import ClockErrors
 from model.fem import Mesh
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era

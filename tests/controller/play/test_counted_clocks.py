@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from controller.play.counted_clocks import CountedClocks
-from model.ensemble.delays import EXACT_CLOCKS
+from model.ensemble.draws import EXACT_CLOCKS
 from model.rig.rig import Channel
 from paper_table import smooth_rig, smooth_table
 from registry import threads

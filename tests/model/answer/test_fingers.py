@@ -9,7 +9,7 @@ import pytest
 from model.answer.answer import Limits
 from model.answer.plan import answer, query
 from model.answer.stimulus import Finger, Placement, Stimulus, check_fingers, together
-from model.ensemble.delays import ClockErrors
+from model.ensemble.draws import ClockErrors
 from model.errors import InputError
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from only import only

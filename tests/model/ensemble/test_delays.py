@@ -13,8 +13,7 @@ from model.answer.plan import answer
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
-from model.ensemble.delays import EXACT_CLOCKS, ClockErrors, delayed
-from model.ensemble.draws import PROMISED_DRAWS, Drawing, draw
+from model.ensemble.draws import EXACT_CLOCKS, PROMISED_DRAWS, ClockErrors, Drawing, delayed, draw
 from model.errors import InputError
 from model.rig.rig import Channel
 from model.rig.uncertainty import Uncertainty

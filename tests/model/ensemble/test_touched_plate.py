@@ -10,8 +10,7 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.ensemble.attached_plate import MODELLED, PlateOnEras, attach, thickness_nodes
 from model.ensemble.draws import Drawing
-from model.ensemble.touched_by_kernel import touch
-from model.ensemble.touched_plate import TouchedPlate
+from model.ensemble.touched_plate import TouchedPlate, touch
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate

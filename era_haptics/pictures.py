@@ -12,9 +12,7 @@ from era_haptics.solved_plate import SolvedPlate
 from model.answer.answer import Answer
 from model.arrays import FloatArray
 from model.errors import InputError, expect, is_whole, shown
-from model.figures.contents_picture import contents_figure
-from model.figures.drawing import map_figure
-from model.figures.table_pictures import contrast_map_figure, layer_figure
+from model.figures import contents_figure, contrast_map_figure, layer_figure, map_figure
 from model.study.contrast_map import ContrastMap
 from model.table.table import LocalizationTable
 from sim.plant.excited_plate import LEVEL_WINDOW, Playback

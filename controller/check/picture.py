@@ -18,7 +18,7 @@ from controller.check.simulated_touch import Position, SimulatedTouch
 from controller.effects.layout import SurfaceLayout
 from model.answer.answer import OWN_CONTRAST_DB
 from model.arrays import FloatArray
-from model.figures.drawing import draw_eras, label_plate
+from model.figures import draw_eras, label_plate
 from model.table.table import LocalizationTable
 
 _LEVEL_EDGES = [-12.0, -6.0, -4.0, -2.0, 2.0, 4.0, 6.0, 12.0]  # dB

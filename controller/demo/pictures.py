@@ -12,9 +12,13 @@ from controller.demo.touch_row import TouchRow
 from model.answer.answer import Sensation
 from model.answer.stimulus import Finger
 from model.arrays import ranked_by
-from model.figures import save_figure
-from model.figures.contents_picture import contents_figure
-from model.figures.table_pictures import draw_fingertip, draw_level_scale, draw_levels
+from model.figures import (
+    contents_figure,
+    draw_fingertip,
+    draw_level_scale,
+    draw_levels,
+    save_figure,
+)
 from model.table.table import LocalizationTable
 
 MAX_PANELS = 6

@@ -167,8 +167,7 @@ def calibrate(
         else []
     )
     if picture is not None:
-        from model.figures import save_figure
-        from model.figures.measured import calibration_figure
+        from model.figures import calibration_figure, save_figure
 
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))

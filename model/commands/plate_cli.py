@@ -492,7 +492,7 @@ def template(
     Print at 100 %: the ruler on it must measure 100 mm.
     """
     from model.calibration.responses import read_places
-    from model.figures.template import Template, write_template
+    from model.figures import Template, write_template
     from model.rig.file import load_rig
 
     check_picture(output)

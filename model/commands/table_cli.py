@@ -293,8 +293,7 @@ def plot(
     as_json: JsonOption = False,
 ) -> None:
     """Draw weak cells, levels, contrast and an answer."""
-    from model.figures import save_figure
-    from model.figures.table_pictures import table_figures
+    from model.figures import save_figure, table_figures
     from model.study.overview import find_overview
     from model.table.file import load_table
 
@@ -409,8 +408,7 @@ def contrast_map(
 
         write_columns(output, found.columns)
     elif output is not None:
-        from model.figures import save_figure
-        from model.figures.table_pictures import contrast_map_figure
+        from model.figures import contrast_map_figure, save_figure
 
         save_figure(contrast_map_figure(table, found), output, inches=inches)
     words = [word for text in quiet for word in ("--quiet", text)]

@@ -289,8 +289,7 @@ def _verify_by_measuring(
         found = check_by_measuring(table, rig, settings, progress=progress)
     files = []
     if picture is not None:
-        from model.figures import save_figure
-        from model.figures.measured import promise_figure
+        from model.figures import promise_figure, save_figure
 
         save_figure(promise_figure(found), picture)
         files.append(str(picture))

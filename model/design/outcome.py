@@ -11,9 +11,7 @@ from matplotlib.figure import Figure
 from model.config.document import Value, data_text
 from model.design.layout_keys import layout_keys
 from model.design.run import Design, RankedLayout
-from model.figures import save_figure
-from model.figures.drawing import COLORS, draw_eras, label_plate
-from model.figures.template import Template, write_template
+from model.figures import COLORS, Template, draw_eras, label_plate, save_figure, write_template
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Columns, write_columns
 from model.structure.support import rigid_body_frequencies, static_loads

@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 
 from model.arrays import FloatArray, best_by, best_of, lattice
 from model.errors import InputError
-from model.figures.drawing import MapPanel, draw_eras, label_plate, maps_figure, raster
+from model.figures import MapPanel, draw_eras, label_plate, maps_figure, raster
 from model.files.csv_file import Columns
 from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate

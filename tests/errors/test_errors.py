@@ -93,7 +93,7 @@ QUICK = [
 """Those that `make test` lets write to a full disk: all replace files in the same way."""
 
 LONG = {
-    "table plot table.npz -o plots": "model.figures.table_pictures.table_figures",
+    "table plot table.npz -o plots": "model.figures.table_figures",
     "table show table.npz": "model.study.overview.find_overview",
     "table verify table.npz rig.yaml": "model.study.verify.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",

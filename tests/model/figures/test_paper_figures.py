@@ -8,12 +8,12 @@ from tables import claims, stiffness_study, tables
 
 from long_form import shortly
 from model.errors import InputError
-from model.figures.paper import SWEEP, PaperFigure, equal_area_points, paper_figures
-from model.figures.table_pictures import (
+from model.figures import (
     answer_figure,
     levels_figure,
     weak_cells_figure,
 )
+from model.figures.paper import SWEEP, PaperFigure, equal_area_points, paper_figures
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.layouts import FOUR_ERA_LAYOUTS, alike

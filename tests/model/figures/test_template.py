@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.cli.main import run
-from model.figures.template import Template, _pages
+from model.figures import Template, _pages
 from model.rig.file import load_rig
 from rig_files import write_rig
 

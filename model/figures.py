@@ -1,0 +1,813 @@
+"""Pictures of the plate as matplotlib figures.
+
+Fields over the plate with marks for ERAs and nulls.
+
+What was measured, beside the rig before and after a calibration and beside promises.
+
+Templates: the board in real size with the places of what is glued to it, to print and stick on.
+
+Lengths are millimetres. A template of the underside is mirrored left to right, its letters are not.
+
+Where each of several contents is felt, as a table predicts it: each has a colour of its own.
+
+Pictures of a table: weak cells, levels, contrast, and a pattern with its fingertips.
+"""
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain, product
+from math import ceil, prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from model.answer.answer import OWN_CONTRAST_DB, Answer, Layer, Sensation, verdict_shown
+from model.answer.plan import query
+from model.answer.stimulus import Placement
+from model.arrays import FloatArray, Point, lattice
+from model.calibration.calibrate import Calibration
+from model.config.fields import LENGTH, quantity
+from model.errors import InputError
+from model.files.array_file import whole_or_nothing
+from model.files.replacing import check_picture_name
+from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, Grid, sensation_level
+from model.rig.rig import Rig
+from model.structure.attachments import Source
+from model.structure.plate import Plate
+from model.study.contrast_map import ContrastMap
+from model.study.overview import Overview
+from model.study.promise_at_sensors import MeasuredVerification
+from model.study.weak_cells import WANTED_CONTRAST_DB, WeakCells
+from model.table.table import LocalizationTable
+from model.vibration import Excitation, G, PlateMap
+
+__all__ = [
+    "A4",
+    "ACTIVE_COLOR",
+    "BORDER",
+    "BRIGHTEST_DB_SL",
+    "Box",
+    "COLORS",
+    "CROSS",
+    "FELT_COLOR",
+    "GRAIN",
+    "LETTER",
+    "LINE",
+    "MM_PER_INCH",
+    "MapPanel",
+    "NOT_PRINTED",
+    "POINT",
+    "POINTS_ALONG",
+    "QUIET_COLOR",
+    "RESTING_COLOR",
+    "RULER",
+    "STRIP",
+    "Template",
+    "answer_figure",
+    "calibration_figure",
+    "contents_figure",
+    "contrast_figure",
+    "contrast_map_figure",
+    "draw_eras",
+    "draw_fingertip",
+    "draw_level_scale",
+    "draw_levels",
+    "label_plate",
+    "layer_figure",
+    "levels_figure",
+    "map_figure",
+    "maps_figure",
+    "promise_figure",
+    "raster",
+    "save_figure",
+    "table_figures",
+    "weak_cells_figure",
+    "write_template",
+]
+
+COLORS = "viridis"
+ACTIVE_COLOR = "#d62728"
+RESTING_COLOR = "#2ca02c"
+
+POINTS_ALONG = 97
+
+
+def raster(plate: Plate) -> tuple[int, int]:
+    """Numbers of evenly spaced points along x and y for drawing a field.
+
+    POINTS_ALONG the longer side: on the paper's plate 60 per shortest wave of its figures.
+    """
+    step = max(plate.length, plate.width) / (POINTS_ALONG - 1)
+    return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
+
+
+def draw_eras(
+    axes: Axes, eras: Sequence[Source], *, active: Collection[str], size: float = 9
+) -> None:
+    """Mark ERAs, red if driven and green if not; axes in centimetres, size in points."""
+    for era in eras:
+        color = ACTIVE_COLOR if era.name in active else RESTING_COLOR
+        place = (100 * era.x, 100 * era.y)
+        axes.plot(*place, "o", ms=size, color=color, mec="white", mew=1.5, clip_on=False)
+
+
+@dataclass(frozen=True)
+class MapPanel:
+    """One map of a figure with its title and the names of driven ERAs."""
+
+    title: str
+    plate_map: PlateMap
+    eras: Sequence[Source]
+    active: Collection[str]
+
+
+def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
+    """Maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs and nulls marked."""
+    rows = -(-len(panels) // columns)
+    width = 7.0 if columns == 1 else 3.6 * columns + 1
+    ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
+    height = rows * (0.8 * width / columns * ratio + 0.8) + (0.5 if caption else 0.1)
+    # A constrained layout would leave gaps between maps of fixed aspect.
+    figure = Figure(figsize=(width, height), layout="compressed")
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    maximum = max(float(panel.plate_map.peak.max()) for panel in panels) / G
+    for axes, panel in zip(grid.flat, panels, strict=True):
+        solved = panel.plate_map
+        colours = {"cmap": COLORS, "shading": "gouraud", "vmin": 0, "vmax": maximum}
+        image = axes.pcolormesh(100 * solved.x, 100 * solved.y, solved.peak / G, **colours)
+        label_plate(axes)
+        axes.plot(*(100 * solved.nulls.T), "x", color="red", ms=5, mew=1.2, clip_on=False)
+        draw_eras(axes, panel.eras, active=panel.active)
+        axes.set_title(panel.title)
+        axes.label_outer()
+    figure.colorbar(image, ax=grid, label="peak acceleration / g")
+    if caption:
+        figure.suptitle(caption)
+    return figure
+
+
+def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
+    """One map with its ERAs, nulls as red crosses and a colour bar in g."""
+    return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
+
+
+def label_plate(axes: Axes) -> None:
+    """Label axes in centimetres, of equal scale."""
+    axes.set_aspect("equal")
+    axes.set_xlabel("x / cm")
+    axes.set_ylabel("y / cm")
+
+
+_DPI = 150
+_UNDATED = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Metadata with which the same figure is the same bytes."""
+
+
+def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | None = None) -> None:
+    """Write a figure in the format of the name's ending, without a display.
+
+    inches: width and height, the figure's own for None. Raises InputError for an ending that is not
+    in PICTURE_ENDINGS, and OSError.
+    """
+    check_picture_name(path)
+    FigureCanvasAgg(figure)
+    if inches is not None:
+        figure.set_size_inches(inches)
+    ending = path.suffix.lower()
+    with whole_or_nothing(path) as stream, rc_context({"svg.hashsalt": "era"}):
+        figure.savefig(stream, dpi=_DPI, format=ending[1:], metadata=_UNDATED.get(ending))
+
+
+_ROWS = 2  # of sensors
+
+
+def calibration_figure(calibration: Calibration) -> Figure:
+    """Draw magnitudes over frequency, a panel for each of up to eight pairs of ERA and sensor."""
+    eras = [
+        number
+        for number, era in enumerate(calibration.rig.eras)
+        if era.name not in calibration.dead_eras
+        and np.isfinite(calibration.measured[:, number]).any()
+    ][:4]
+    sensors = np.linspace(0, len(calibration.sensors) - 1, _ROWS).round().astype(int)
+    figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
+    axes = figure.subplots(_ROWS, len(eras), sharex=True, sharey=True, squeeze=False)
+    size = 1e-6  # m, base displacement
+    for row, sensor in enumerate(sensors):
+        for column, era in enumerate(eras):
+            axis = axes[row, column]
+            for label, values, style in (
+                ("rig as it was", calibration.before, {"color": "0.6", "linewidth": 1.2}),
+                ("calibrated", calibration.after, {"color": "C0", "linewidth": 1.4}),
+                ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
+            ):
+                magnitude = size * np.abs(values[:, era, sensor])
+                axis.semilogy(calibration.frequencies, magnitude, label=label, **style)
+            axis.set_title(
+                f"{calibration.rig.eras[era].name} to {calibration.sensors[sensor]}", fontsize=9
+            )
+            axis.grid(True, which="both", alpha=0.2)
+    for axis in axes[-1]:
+        axis.set_xlabel("frequency / Hz")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("m/s² per µm of base")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=9)
+    return figure
+
+
+def promise_figure(found: MeasuredVerification) -> Figure:
+    """Draw measured over promised felt contrast; what is below the line breaks its promise."""
+    promised = np.array([each.promise.contrast_db for each in found.measured])
+    measured = np.array([each.contrast_db for each in found.measured])
+    quiet = np.array([len(each.promise.sensors) - 1 for each in found.measured])
+    figure = Figure(figsize=(5, 4.6), layout="constrained")
+    axes = figure.subplots()
+    both = np.concatenate([promised, measured])
+    ends = [float(both.min()) - 1, float(both.max()) + 1]
+    axes.plot(ends, ends, color="grey", linewidth=1)
+    for count, marker in zip(np.unique(quiet), "os^Dv", strict=False):
+        chosen = quiet == count
+        colors = np.where(measured[chosen] < promised[chosen], ACTIVE_COLOR, "black")
+        axes.scatter(
+            promised[chosen],
+            measured[chosen],
+            c=colors,
+            marker=marker,
+            s=18,
+            label=f"{count} quiet",
+        )
+    axes.legend(loc="upper left")
+    axes.set_xlabel("promised felt contrast, dB (nine of ten plates)")
+    axes.set_ylabel("measured, dB")
+    axes.set_title(f"{100 * found.kept_share:.0f} % of {len(promised)} promises kept")
+    return figure
+
+
+MM_PER_INCH = 25.4
+POINT = MM_PER_INCH / 72
+BORDER, STRIP = 12.0, 22.0
+"""Paper around the board [mm], and below it, with a ruler."""
+RULER = 100  # mm
+A4 = (210.0, 297.0), (297.0, 210.0)  # mm; upright and across
+NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
+CROSS = 6.0  # mm; half of it
+LETTER, LINE = 1.6, 3.2  # mm, of labels
+GRAIN = 40.0  # mm; length of the arrow
+
+Box = tuple[float, float, float, float]
+"""Least and greatest x, least and greatest y [mm]."""
+
+
+@dataclass(frozen=True)
+class Template:
+    """A board to be drawn in real size.
+
+    sensors: places [m] by name; is_below: as seen from below, where actuators are glued.
+    """
+
+    rig: Rig
+    sensors: Mapping[str, tuple[float, float]]
+    is_below: bool = True
+
+    @property
+    def board(self) -> tuple[float, float]:
+        """Length and width [mm]."""
+        return 1000 * self.rig.plate.length, 1000 * self.rig.plate.width
+
+    @property
+    def paper(self) -> Box:
+        """The board with its border."""
+        length, width = self.board
+        return -BORDER, max(length, RULER) + BORDER, -BORDER, width + BORDER
+
+    @property
+    def grain(self) -> tuple[float, float] | None:
+        """Its direction, of a board that has one."""
+        if self.rig.plate.material.orthotropy is None:
+            return None
+        return (0.0, 1.0) if self.rig.grain == "width" else (1.0, 0.0)
+
+    @property
+    def title(self) -> str:
+        """What is seen."""
+        length, width = self.board
+        side = "below, for the underside" if self.is_below else "above, for the touched side"
+        return f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
+
+    def label(self, name: str, at: tuple[float, float]) -> list[str]:
+        """Lines beside a place: its name, of an actuator its output, and where it is."""
+        channel = self.rig.wiring.get(name)
+        output = f", output {channel.number + 1}" if channel else ""
+        return [f"{name}{output}", f"{at[0]:.1f}, {at[1]:.1f}"]
+
+    def places(self) -> Iterator[tuple[str, tuple[float, float], float, str]]:
+        """Yield name, place and radius [mm], and the style of the circle, of all that is glued."""
+        for era in self.rig.eras:
+            yield era.name, (1000 * era.x, 1000 * era.y), 1000 * era.foot, "solid"
+        data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
+        driven = {era.name for era in self.rig.eras}
+        others = [data.get(kind, {}).items() for kind in ("eras", "masses", "supports")]
+        for name, keys in chain(*others):
+            if "at" in keys and name not in driven:
+                x, y, foot = (
+                    1000 * quantity(k, LENGTH) for k in (*keys["at"], keys.get("foot", 0))
+                )
+                yield name, (x, y), foot, "dashed"
+        for name, (x, y) in self.sensors.items():
+            yield name, (1000 * x, 1000 * y), 0.0, "dotted"
+
+
+def write_template(path: Path, template: Template) -> int:
+    """Write one sheet in real size, or A4 pages to be joined in a PDF; return their number.
+
+    Raises InputError for an ending that no picture has, and OSError.
+    """
+    if path.suffix.lower() != ".pdf":
+        save_figure(_page(template, template.paper, name="", edge=0.0), path)
+        return 1
+    pages = [*_pages(template)]
+    # The same bytes for the same rig.
+    with whole_or_nothing(path) as stream, PdfPages(stream, metadata={"CreationDate": None}) as pdf:
+        for page in pages:
+            pdf.savefig(page)
+    return len(pages)
+
+
+def _pages(template: Template) -> Iterator[Figure]:
+    """Yield A4 pages of the way round that takes fewer of them, from the top left on."""
+    low, high, bottom, top = template.paper
+    sizes = [(width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP) for width, height in A4]
+    counts = [
+        (ceil((high - low) / width), ceil((top - bottom) / height)) for width, height in sizes
+    ]
+    pages, (across, down) = min(zip(counts, sizes, strict=True), key=lambda each: prod(each[0]))
+    columns, rows = pages
+    for row, column in product(range(rows), range(columns)):
+        upper = top - row * down
+        # Columns are counted as they lie, whichever way x runs.
+        left = high - (column + 1) * across if template.is_below else low + column * across
+        name = f"; row {row + 1} of {rows}, column {column + 1} of {columns}: join at the frame"
+        box = left, left + across, upper - down, upper
+        yield _page(template, box, name=name, edge=NOT_PRINTED)
+
+
+def _page(template: Template, box: Box, *, name: str, edge: float) -> Figure:
+    """Draw a box of the board and the strip below it, within a white edge [mm]."""
+    low, high, bottom, top = box
+    width, height = high - low + 2 * edge, top - bottom + edge + STRIP
+    figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
+    area = edge / width, STRIP / height, (high - low) / width, (top - bottom) / height
+    axes = figure.add_axes(area)
+    _draw(axes, template, box)
+    if name:
+        axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, fill=False, lw=0.3))
+    strip = figure.add_axes((0, 0, 1, STRIP / height), xlim=(0, width), ylim=(0, STRIP))
+    strip.set_axis_off()
+    for tick in range(0, RULER + 1, 10):
+        strip.plot([BORDER + tick] * 2, [12, 17 if tick % 50 == 0 else 15], c="black", lw=0.5)
+    strip.plot([BORDER, BORDER + RULER], [12, 12], c="black", lw=0.5, gid="ruler")
+    strip.text(BORDER, 7, template.title, size=8)
+    strip.text(BORDER, 3, f"{RULER} mm on paper, or print again at 100 %{name}", size=8)
+    return figure
+
+
+def _draw(axes: Axes, template: Template, box: Box) -> None:
+    """Draw what of the board lies in a box, which fills the axes."""
+    low, high, bottom, top = box
+    length, width = template.board
+    axes.set(xlim=(high, low) if template.is_below else (low, high), ylim=(bottom, top))
+    axes.set_axis_off()
+    axes.add_patch(Rectangle((0, 0), length, width, fill=False, lw=0.7, gid="board"))
+    axes.plot([0, length], [width / 2] * 2, [length / 2] * 2, [0, width], c="0.8", lw=0.3, ls="-.")
+    for name, (x, y), radius, style in template.places():
+        mark, size = ("x", 6.0) if style == "dotted" else ("+", 2 * CROSS / POINT)
+        axes.plot(x, y, mark, c="black", ms=size, mew=0.4)
+        if radius:
+            axes.add_patch(Circle((x, y), radius, fill=False, lw=0.7, ls=style, gid=name))
+        lines = template.label(name, (x, y))
+        (right, up), away = _beside((x, y), radius, lines, template, box)
+        axes.annotate(
+            "\n".join(lines),
+            (x, y),
+            (right * away / POINT, up * away / POINT),
+            textcoords="offset points",
+            size=7,
+            ha="left" if right > 0 else "right",
+            va="bottom" if up > 0 else "top",
+            annotation_clip=True,
+        )
+    if template.grain:  # an arrow at the lower end of what is seen of the board
+        dx, dy = (GRAIN / 2 * each for each in template.grain)
+        x, y = (max(low, 0) + min(high, length)) / 2, max(bottom, 0) + CROSS + dy
+        arrow = {"arrowstyle": "<->", "lw": 0.7, "color": "0.6"}
+        axes.annotate("", (x - dx, y - dy), (x + dx, y + dy), arrowprops=arrow)
+        axes.annotate("grain", (x, y), (3, 3), textcoords="offset points", size=8, color="0.6")
+    axes.text(-5, -8, "0, 0", size=8, ha="center", clip_on=True)
+    pointing: dict[str, Any] = {"arrowprops": {"arrowstyle": "<-", "lw": 0.5}}
+    for name, start, end in (("x", (0, -4), (16, -4)), ("y", (-4, 0), (-4, 16))):
+        axes.annotate(
+            name, start, end, size=8, va="center", ha="center", annotation_clip=True, **pointing
+        )
+
+
+def _beside(
+    at: tuple[float, float], radius: float, lines: Sequence[str], template: Template, box: Box
+) -> tuple[tuple[int, int], float]:
+    """Where a label is: rightwards and upwards on paper, 1 or -1; its distance [mm].
+
+    On the side of the board's middle, unless a frame is there.
+    """
+    (x, y), (low, high, bottom, top) = at, box
+    across = -1 if template.is_below else 1
+    wide, tall = LETTER * max(map(len, lines)), LINE * len(lines)
+    away = 2 + 0.75 * radius  # mm, beyond the circle
+    right = across if x < template.board[0] / 2 else -across
+    ways = [*product((right, -right), (1, -1))]
+    free = [
+        (to_right, up)
+        for to_right, up in ways
+        if low < x + across * to_right * (away + wide) < high
+        and bottom < y + up * (away + tall) < top
+    ]
+    return (free or ways)[0], away
+
+
+CONTENTS_PICTURE_COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")
+"""Of contents, in order."""
+
+BRIGHTEST_DB_SL = 30.0
+"""Level from which a colour is at its brightest; the threshold of feeling is black."""
+
+_GREY = 0.62
+_RADIUS = 100 * FINGERTIP_RADIUS  # cm
+
+
+def contents_figure(
+    table: LocalizationTable, contents: Sequence[Layer], fingers: Sequence[Sensation]
+) -> Figure:
+    """Draw a panel with all contents, and one for each, as the table predicts them.
+
+    Beside every finger its verdict, and level and contrast as they are given.
+    """
+    count = len(contents)
+    levels = np.array([_levels(table, each) for each in contents])
+    width = 8.4 * (1 + 1 / count)
+    height = 8.4 * table.plate.width / table.plate.length + 1.0
+    figure = Figure(figsize=(width, height), layout="constrained")
+    panels = figure.subplot_mosaic(
+        [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
+    )
+    _contents_picture_draw(panels["all"], table, levels, CONTENTS_PICTURE_COLORS, fingers)
+    panels["all"].set_title(
+        "Coloured where a finger feels its own content, grey where contents mix", fontsize=13
+    )
+    for finger in fingers:
+        _label_finger(panels["all"], finger, contents)
+    for number, layer in enumerate(contents):
+        axes = panels[f"{number}"]
+        _contents_picture_draw(
+            axes,
+            table,
+            levels[[number]],
+            [CONTENTS_PICTURE_COLORS[number % len(CONTENTS_PICTURE_COLORS)]],
+            fingers,
+        )
+        axes.set_title(f"{_frequency(layer)} alone", fontsize=11)
+        axes.set_axis_off()
+    return figure
+
+
+def _frequency(layer: Layer) -> str:
+    """The frequency of a content, which has one where there are several."""
+    return "several frequencies" if layer.frequency is None else f"{layer.frequency:g} Hz"
+
+
+def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
+    """Level [dB SL] of a content over the raster of the plate."""
+    plate = table.plate
+    nx, ny = raster(plate)
+    points = lattice(np.linspace(0, plate.length, nx), np.linspace(0, plate.width, ny))
+    amplitudes = table.amplitudes(content.excitation, points)
+    return sensation_level(*amplitudes, table.threshold).reshape(ny, nx)
+
+
+def _contents_picture_draw(
+    axes: Axes,
+    table: LocalizationTable,
+    levels: FloatArray,
+    colors: Sequence[str],
+    fingers: Sequence[Sensation],
+) -> None:
+    """Draw fingers, and the loudest content in its colour, paler the less it is above others."""
+    plate = table.plate
+    powers = 10 ** (levels / 10)
+    own = powers.max(axis=0)
+    with np.errstate(divide="ignore"):
+        contrast = 10 * np.log10(own / (powers.sum(axis=0) - own))
+    purity = np.clip(contrast / OWN_CONTRAST_DB, 0, 1)[:, :, None]
+    light = np.clip(10 * np.log10(own) / BRIGHTEST_DB_SL, 0, 1)[:, :, None]
+    color = np.array([to_rgb(each) for each in colors])[powers.argmax(axis=0) % len(colors)]
+    axes.imshow(
+        light * (purity * color + (1 - purity) * _GREY),
+        origin="lower",
+        extent=(0.0, 100 * plate.length, 0.0, 100 * plate.width),
+        interpolation="bilinear",
+    )
+    places = [(100 * era.x, 100 * era.y) for era in table.eras]
+    axes.plot(*zip(*places, strict=True), "o", ms=8, color="0.9", mec="black", clip_on=False)
+    label_plate(axes)
+    for finger in fingers:
+        place = 100 * finger.finger.at[0], 100 * finger.finger.at[1]
+        for width, hue in ((5.5, "white"), (2.6, _color_of(finger))):
+            axes.add_patch(Circle(place, _RADIUS, fill=False, ec=hue, lw=width, clip_on=False))
+
+
+def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> None:
+    """Write verdict, level and contrast beside a finger, on the side towards the middle."""
+    words = verdict_shown(finger.verdict, is_foreign_felt=finger.is_foreign_felt)
+    lines = [str(words)]
+    if finger.layer is not None:
+        lines = [f"{_frequency(contents[finger.layer])}, {words}"]
+        figures = {"SL": finger.level_db_sl, "above the others": finger.contrast_db}
+        lines += [
+            f"{each:.0f} dB {what}"
+            for what, each in figures.items()
+            if each is not None and math.isfinite(each)
+        ]
+    x, y = (100 * value for value in finger.finger.at)
+    is_high = y > sum(axes.get_ylim()) / 2
+    axes.annotate(
+        "\n".join(lines),
+        (x, y - _RADIUS if is_high else y + _RADIUS),
+        xytext=(0, -10 if is_high else 10),
+        textcoords="offset points",
+        ha="center",
+        va="top" if is_high else "bottom",
+        fontsize=11,
+        color=_color_of(finger),
+        bbox={"fc": "black", "ec": "none", "alpha": 0.75, "boxstyle": "round"},
+    )
+
+
+def _color_of(finger: Sensation) -> str:
+    """Of its content, white without one."""
+    return (
+        "white"
+        if finger.layer is None
+        else CONTENTS_PICTURE_COLORS[finger.layer % len(CONTENTS_PICTURE_COLORS)]
+    )
+
+
+_CONTRAST = "promised felt contrast / dB"
+
+# Fingers of the example, in shares of the plate.
+_EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
+
+
+def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tuple[str, Figure]]:
+    """Draw all pictures, with names."""
+    yield "weak_cells", weak_cells_figure(table, overview.cells)
+    yield "levels", levels_figure(table)
+    yield "contrast", contrast_figure(table, overview)
+    yield "answer", answer_figure(table)
+
+
+def weak_cells_figure(table: LocalizationTable, weak: WeakCells) -> Figure:
+    """Draw contrast from each cell to the median other finger and to one in ten."""
+    panels = {
+        "median other finger": weak.median_db,
+        "one other finger in ten (tenth percentile)": weak.tenth_db,
+    }
+    figure = _cells_figure(
+        table, weak.grid, panels, label=_CONTRAST, crossed=(~weak.feasible, weak.weak)
+    )
+    figure.suptitle(
+        f"Mode {table.drive_mode}: felt contrast from each cell to one other finger\n"
+        f"(crosses: below {WANTED_CONTRAST_DB:g} dB; dots: ERAs)"
+    )
+    return figure
+
+
+def levels_figure(table: LocalizationTable) -> Figure:
+    """Draw the highest level of any pattern of one or two ERAs at each cell."""
+    levels = table.available_level_db_sl
+    title = (
+        f"Highest level of one or two ERAs at full stroke\n(crosses: dead, below {FELT_DB_SL:g} "
+        "dB SL)"
+    )
+    dead = levels < FELT_DB_SL
+    return _cells_figure(table, table.grid, {title: levels}, label="level / dB SL", crossed=(dead,))
+
+
+def contrast_figure(table: LocalizationTable, overview: Overview) -> Figure:
+    """Draw the distribution of contrast over contact sets of 1, 2 and 3 other fingers."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for others, (promised, _) in enumerate(overview.contrasts, start=1):
+        contrasts = np.sort(promised)
+        share = 1 - np.arange(len(contrasts)) / max(1, len(contrasts))
+        label = f"{others} other{'s' if others > 1 else ''}"
+        if len(contrasts):
+            label += f": median {np.median(contrasts):.1f} dB"
+        axes.step(contrasts, 100 * share, where="pre", label=label)
+    axes.axvline(WANTED_CONTRAST_DB, color="0.5", ls=":", lw=1)
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, 100)
+    axes.set_xlabel(_CONTRAST)
+    axes.set_ylabel("contact sets with at least this contrast / %")
+    axes.grid(color="0.9")
+    figure.legend(loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    axes.set_title(f"Mode {table.drive_mode}: contact sets at least 5 cm apart")
+    return figure
+
+
+def contrast_map_figure(table: LocalizationTable, found: ContrastMap) -> Figure:
+    """Draw promised contrast of every place to quiet fingers, drive modes side by side."""
+    grid = Grid(len(found.x), len(found.y))
+    figure = _cells_figure(table, grid, found.promised_db, label=_CONTRAST)
+    for axes in figure.axes[: len(found.promised_db)]:
+        for finger in found.quiet:
+            draw_fingertip(axes, finger, felt=False)
+    return figure
+
+
+def _cells_figure(
+    table: LocalizationTable,
+    grid: Grid,
+    panels: Mapping[str, FloatArray],
+    *,
+    label: str,
+    crossed: Sequence[NDArray[np.bool_]] = (),
+) -> Figure:
+    """Draw values of cells, panels side by side on one scale; white without a value, and ERAs.
+
+    crossed: of each panel the cells with crosses.
+    """
+    count = len(panels)
+    figure = Figure(figsize=(5.2 * count + 1.5, 4.8), layout="compressed")
+    known = np.concatenate([values[np.isfinite(values)] for values in panels.values()])
+    limits = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    x = np.linspace(0, 100 * table.plate.length, grid.nx + 1)
+    y = np.linspace(0, 100 * table.plate.width, grid.ny + 1)
+    drawn = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    for axes, (title, values) in zip(drawn, panels.items(), strict=True):
+        shown = np.ma.masked_invalid(values.reshape(grid.ny, grid.nx))
+        image = axes.pcolormesh(x, y, shown, cmap=COLORS, vmin=limits[0], vmax=limits[1])
+        axes.add_patch(Rectangle((0, 0), x[-1], y[-1], fill=False, ec="0.4", clip_on=False))
+        draw_eras(axes, table.eras, active=[era.name for era in table.eras])
+        label_plate(axes)
+        axes.set_title(title)
+        axes.label_outer()
+    for axes, cells in zip(drawn, crossed, strict=False):
+        marked = 100 * grid.centres(table.plate)[cells]
+        axes.plot(*marked.T, "x", color="white", ms=6, mew=1.5)
+    figure.colorbar(image, ax=list(drawn), label=label)
+    return figure
+
+
+def answer_figure(table: LocalizationTable) -> Figure:
+    """Draw sensation levels and fingers for an example query."""
+    plate = table.plate
+    target, *quiet = ((u * plate.length, v * plate.width) for u, v in _EXAMPLE)
+    answer = None
+    with suppress(InputError):  # small plate
+        answer = query(table, Placement((target,), tuple(quiet)))
+    if answer is None or not answer.is_reached:  # weak rig
+        figure = Figure(figsize=(6.6, 5))
+        figure.suptitle("The table has no answer to the three fingers of this picture")
+        return figure
+    figure, felt = layer_figure(table, answer, 0), answer.fingers[0]
+    figure.axes[0].set_title(
+        f"Felt contrast {felt.promised_contrast_db:.0f} dB promised, "
+        f"{felt.contrast_db:.0f} dB nominal\n"
+        f"{_in_words(table, answer.layers[0])}",
+        fontsize=10,
+        pad=20,
+    )
+    return figure
+
+
+def layer_figure(table: LocalizationTable, answer: Answer, number: int) -> Figure:
+    """Draw the level of a layer of an answer over the plate, the fingers and what is promised."""
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    axes, layer = figure.subplots(), answer.layers[number]
+    axes.set_axis_off()
+    draw_levels(axes, table, layer.excitation)
+    for finger, each in enumerate(answer.fingers):
+        is_felt = finger in layer.fingers
+        level = each.level_db_sl if is_felt else None
+        draw_fingertip(axes, each.finger.at, felt=is_felt, level_db_sl=level)
+    promised = answer.fingers[layer.fingers[0]].promised_contrast_db
+    if promised is not None:
+        axes.set_title(
+            f"contrast at least {promised:.0f} dB on nine of ten plates", fontsize=11, pad=20
+        )
+    draw_level_scale(figure, [axes], shrink=0.8)
+    return figure
+
+
+def _in_words(table: LocalizationTable, layer: Layer) -> str:
+    """Format up to twelve tones, two per line."""
+    tones = [
+        f"{name} {tone['frequency_hz']:g} Hz, level {tone['level']:.3f} at {tone['phase_deg']:.0f}°"
+        for name, tone in table.drive_of(layer.excitation).items()
+    ]
+    return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
+
+
+_COLORS = "magma"
+_SCALE = Normalize(-10.0, 30.0)
+"""From barely perceptible to more than strong [dB SL]."""
+
+FELT_COLOR, QUIET_COLOR = "#6dff9c", "#9fdcff"
+
+_SIDE = 121  # points along a side; nulls are narrow
+
+
+def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) -> None:
+    """Draw the sensation level [dB SL] over the plate, and the ERAs; axes in centimetres."""
+    x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
+    amplitudes = table.amplitudes(excitation, lattice(x, y))
+    level = sensation_level(*amplitudes, table.threshold).reshape(_SIDE, _SIDE)
+    axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
+    axes.set_aspect("equal")
+    draw_eras(axes, table.eras, active=excitation.keys())
+    frequencies = {tone.frequency for tone in excitation.values()}
+    for era in table.eras:
+        if tone := excitation.get(era.name):
+            axes.annotate(
+                era.name if len(frequencies) == 1 else f"{era.name} {tone.frequency:g} Hz",
+                (100 * era.x, 100 * era.y),
+                xytext=(0, 9 if era.y > table.plate.width / 2 else -16),
+                textcoords="offset points",
+                ha="left" if era.x < table.plate.length / 2 else "right",
+                fontsize=9,
+                path_effects=[withStroke(linewidth=2.5, foreground="white", alpha=0.75)],
+            )
+    if len(frequencies) == 1:
+        axes.text(
+            *(0.5, -0.02, f"{frequencies.pop():g} Hz"),  # between the names of corner ERAs
+            transform=axes.transAxes,
+            ha="center",
+            va="top",
+            fontsize=9,
+        )
+
+
+def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:
+    """Draw the colour scale of `draw_levels` beside axes, shrunk to a share of their height."""
+    figure.colorbar(
+        ScalarMappable(_SCALE, _COLORS),
+        ax=list(axes),
+        label="level above detection threshold / dB SL",
+        extend="both",
+        shrink=shrink,
+    )
+
+
+def draw_fingertip(
+    axes: Axes, place: Point, *, felt: bool, level_db_sl: float | None = None
+) -> None:
+    """Draw a target or quiet fingertip at x, y [m], with its level [dB SL]."""
+    x, y = 100 * place[0], 100 * place[1]
+    outline = [withStroke(linewidth=2.5, foreground="black", alpha=0.75)]
+    color = FELT_COLOR if felt else QUIET_COLOR
+    axes.add_patch(
+        Circle(
+            (x, y),
+            100 * FINGERTIP_RADIUS,
+            fill=False,
+            color=color,
+            lw=2.4 if felt else 1.6,
+            path_effects=outline,
+        )
+    )
+    text = "felt" if felt else "quiet"
+    if level_db_sl is not None:
+        text += f"\n{round(level_db_sl)} dB SL"
+    axes.annotate(
+        text,
+        (x, y),
+        xytext=(0, -25 if y > 5 else 25),
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=8.5,
+        color=color,
+        fontweight="bold" if felt else "normal",
+        path_effects=outline,
+    )

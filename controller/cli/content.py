@@ -65,7 +65,7 @@ def check(
     from controller.check.content_check import check_content, least_promise
     from model.answer.answer import MIN_CONTRAST_DB
     from model.commands.options import Stopwatch
-    from model.files.replacing import check_picture
+    from model.files.array_file import check_picture
     from model.table.file import load_table
 
     if picture is not None:

@@ -98,7 +98,7 @@ def _simulate(
     from scipy.signal import resample
 
     from controller.check.content_check import play_content
-    from model.files.replacing import begins_with, check_ending, check_place, check_replaceable
+    from model.files.array_file import begins_with, check_ending, check_place, check_replaceable
     from model.finger import STRONG_DB_SL, fingertip_weights
     from model.table.file import load_table
 

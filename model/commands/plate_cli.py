@@ -25,7 +25,7 @@ from model.commands.options import (
 )
 from model.config.fields import parse_frequencies, parse_pair
 from model.errors import InputError
-from model.files.replacing import check_picture
+from model.files.array_file import check_picture
 from model.quantities import counted
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")

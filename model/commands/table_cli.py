@@ -30,7 +30,7 @@ from model.commands.options import (
 )
 from model.config.fields import parse_frequencies, parse_pair, parse_point
 from model.errors import InputError
-from model.files.replacing import (
+from model.files.array_file import (
     begins_with,
     check_ending,
     check_picture,

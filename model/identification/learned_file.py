@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import InputError
-from model.files.array_file import UNREADABLE, read_arrays, write_arrays
-from model.files.replacing import begins_with
+from model.files.array_file import UNREADABLE, begins_with, read_arrays, write_arrays
 from model.identification.settled import State
 
 _VERSION = 2

@@ -14,8 +14,7 @@ from pydantic_core import to_jsonable_python
 from model.config.document import Document, data_text, parse_document
 from model.config.fields import LENGTH, Section, Validation, quantity
 from model.errors import InputError, expect, expect_path
-from model.files.array_file import whole_or_nothing
-from model.files.replacing import check_ending
+from model.files.array_file import check_ending, whole_or_nothing
 from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig

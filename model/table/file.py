@@ -18,8 +18,7 @@ from pydantic_core import to_jsonable_python
 
 from model.drive_modes import checked_mode
 from model.errors import InputError, expect, expect_path
-from model.files.array_file import UNREADABLE, digest_of, read_arrays, write_arrays
-from model.files.replacing import begins_with
+from model.files.array_file import UNREADABLE, begins_with, digest_of, read_arrays, write_arrays
 from model.finger import Grid, check_has_threshold
 from model.rig.meshes import parse_mesh
 from model.rig.rig import PHYSICS, Rig, differences

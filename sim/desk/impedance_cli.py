@@ -107,7 +107,7 @@ def impedance(
     something heavy, and weighed: print the keys of a rig's exciter, each with the interval that
     holds nine of ten.
     """
-    from model.files.replacing import check_ending, check_place
+    from model.files.array_file import check_ending, check_place
     from sim.desk.measuring.impedance import NAMES, Bench, exciter_values, fitted
     from sim.desk.measuring.impedance_run import (
         LINES,

@@ -15,7 +15,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.files.replacing import begins_with
+from model.files.array_file import begins_with
 from model.files.uff import (
     ACCELERATION,
     TIME,

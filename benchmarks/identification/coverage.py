@@ -10,8 +10,7 @@ from model.identification.derivatives import jacobian
 from model.identification.forward import Sensor
 from model.identification.identify import Identification
 from model.identification.parameters import KINDS
-from model.identification.posterior import relevant
-from model.identification.stages import Setting
+from model.identification.stages import Setting, relevant
 
 _WITHIN = 1.96
 _REGION = 5.991  # of two normal numbers

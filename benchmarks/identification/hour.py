@@ -29,9 +29,9 @@ from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.finger import fingertip_points, fingertip_weights
 from model.identification.forward import RestingFinger, Sensor
 from model.identification.identify import identify
-from model.identification.in_service import LivePlate, PatternReport, PlateEstimate
-from model.identification.measurement import Measurement
-from model.identification.settled import SettledPattern
+from model.identification.learned_plate import LivePlate, PatternReport, PlateEstimate
+from model.identification.least_squares import Measurement
+from model.identification.settled_patterns import SettledPattern
 from model.rig.file import load_rig
 from model.structure.attachments import Fingertip
 from model.table.following import table_following

@@ -14,7 +14,7 @@ from model.errors import InputError
 from model.finger import fingertip_points, fingertip_weights
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
-from model.identification.measurement import Measurement
+from model.identification.least_squares import Measurement
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 

@@ -19,7 +19,7 @@ from model.errors import InputError
 
 if TYPE_CHECKING:
     from model.config.document import Document
-    from model.identification.measurement import MeasuredPlate
+    from model.identification.least_squares import MeasuredPlate
     from model.rig.rig import Rig
 
 _NOT_EXPLAINED = (
@@ -123,10 +123,10 @@ def identify(
     from controller.diagnosis.plate_measurement import observation_of
     from model.config.fields import parse_frequencies
     from model.diagnosis.verdict import check_meaning
-    from model.identification import identification_report
+    from model.identification import identify as identification_report
+    from model.identification.identify import expected_contrast
     from model.identification.identify import identify as fit
-    from model.identification.measurement import DeviceSettings, measure_by_device
-    from model.identification.promise import expected_contrast
+    from model.identification.least_squares import DeviceSettings, measure_by_device
     from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
@@ -211,7 +211,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
 
     from model.calibration.responses import read_measured, responses_of
     from model.diagnosis.verdict import check_consistency
-    from model.identification.measurement import MeasuredPlate
+    from model.identification.least_squares import MeasuredPlate
 
     responses = responses_of(read_measured(path), rig)
     screened = check_consistency(rig, responses)

@@ -19,7 +19,7 @@ from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.calibration.responses import Responses
-    from model.identification.measurement import MeasuredPlate
+    from model.identification.least_squares import MeasuredPlate
     from model.rig.rig import Rig
 
 rig_app = typer.Typer(no_args_is_help=True, help="Check and identify a rig.")

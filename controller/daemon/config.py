@@ -30,7 +30,7 @@ from model.config.fields import Validation
 from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
-from model.identification.learned_file import was_learned
+from model.identification.learned_plate import was_learned
 from model.rig.file import rig_of
 from model.rig.kind import clock_costs, gain_notes, whole_url
 from model.rig.rig import Rig

@@ -20,7 +20,7 @@ from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.calibration.responses import Responses
 from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
-from model.identification.measurement import MeasuredPlate, Measurement, Repeat
+from model.identification.least_squares import MeasuredPlate, Measurement, Repeat
 from model.processes import Progress, unseen
 from model.rig.rig import Rig
 from model.vibration import Tone

@@ -31,9 +31,8 @@ from controller.learning.messages import (
 from model.answer.plan import prepare_answers
 from model.errors import InputError
 from model.files.array_file import remove_partial
-from model.identification.in_service import PlateEstimate
-from model.identification.learned_table import LearnedTable
-from model.identification.settled import SettledPattern
+from model.identification.learned_plate import LearnedTable, PlateEstimate
+from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.following import table_following

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
 from controller.process.child import child_command, ended
-from model.identification.settled import SettledPattern
+from model.identification.settled_patterns import SettledPattern
 from registry import threads
 from registry.plugins import failure_text
 from registry.threads import Backoff

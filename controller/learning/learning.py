@@ -28,7 +28,7 @@ from controller.play.observer import Observers, PlayReport
 from controller.sources.contacts import Change, Contact
 from drivers.errors import CommandError, DriverError
 from model.answer.answer_report import Timing
-from model.identification.settled import SettledPattern
+from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from model.identification.forward import Sensor
-from model.identification.settled import SettledPattern
+from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 

@@ -21,7 +21,7 @@ from drivers.errors import DriverError, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.sensors import Reading, finish_reading, start_reading
 from model.identification.forward import RestingFinger
-from model.identification.settled import SettledPattern
+from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from registry import threads
 

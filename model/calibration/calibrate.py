@@ -35,10 +35,9 @@ from model.calibration.fit import (
 from model.calibration.responses import LEAST_SENSORS, Responses, Screening, check_enough_sensors
 from model.errors import InputError
 from model.files.csv_file import as_frame
-from model.identification.fit_report import quality_rows, value_rows
-from model.identification.form_errors import MASS_CELLS
-from model.identification.held_out import SHARE, relative_rms
-from model.identification.parameters import KINDS
+from model.identification.identify import quality_rows, value_rows
+from model.identification.parameters import KINDS, MASS_CELLS
+from model.identification.stages import SHARE, relative_rms
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig

@@ -44,12 +44,18 @@ from scipy.optimize import nnls
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.calibration.responses import Responses
 from model.identification.derivatives import jacobian
-from model.identification.form_errors import reduced_modes
-from model.identification.forward import ForwardModel, Sensor
+from model.identification.forward import ForwardModel, Sensor, viscous_difference
 from model.identification.least_squares import Minimum, search
-from model.identification.parameters import FORM, KINDS, MAX_GUESSED, VALUE_UNITS, space_by_sheets
-from model.identification.values import Values, rig_with
-from model.identification.viscous_loss import viscous_difference
+from model.identification.parameters import (
+    FORM,
+    KINDS,
+    MAX_GUESSED,
+    VALUE_UNITS,
+    Values,
+    reduced_modes,
+    rig_with,
+    space_by_sheets,
+)
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 

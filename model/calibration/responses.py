@@ -47,7 +47,7 @@ from model.files.uff import (
     write_universal,
 )
 from model.identification.forward import Sensor
-from model.identification.measurement import Measurement
+from model.identification.least_squares import Measurement
 from model.rig.rig import Rig
 from model.structure.actuators import Actuator
 from model.structure.plate import Plate

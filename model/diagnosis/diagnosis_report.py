@@ -13,7 +13,7 @@ from model.diagnosis.causes import (
 )
 from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
 from model.diagnosis.verdict import ChannelState, ChannelVerdict, MisreadResonance, Verdict
-from model.identification.fit_report import value_rows
+from model.identification.identify import value_rows
 from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verify import MIN_KEPT_SHARE

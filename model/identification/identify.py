@@ -1,26 +1,48 @@
-"""Identification of a rig by responses measured in place."""
+"""Identification of a rig by responses measured in place.
+
+The contrast that an identified rig gives, on plates within its uncertainty solved exactly.
+
+The report of a fit, the same whatever was fitted to: values, uncertainty, held-out check.
+
+Report of an identification, as text and as JSON.
+"""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from model.answer.plan import query
+from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import FloatArray
+from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
-from model.identification.advice import unknowns
-from model.identification.grain import fit_board
-from model.identification.held_out import SHARE, HeldOutPaths, hold_out
-from model.identification.measurement import Measurement
-from model.identification.parameters import Space
-from model.identification.posterior import Posterior
-from model.identification.stages import FittedModel, Setting, chi2
-from model.identification.values import Values, rig_with
+from model.identification.least_squares import Measurement
+from model.identification.parameters import KINDS, MAX_GUESSED, Space, Values, rig_with
+from model.identification.stages import (
+    SHARE,
+    FittedModel,
+    HeldOutPaths,
+    Posterior,
+    Setting,
+    chi2,
+    fit_board,
+    hold_out,
+    unknowns,
+)
 from model.processes import Progress, unseen
+from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable
+from model.study.exact_plates import draw_plates, felt_on
+from model.study.random_contacts import MIN_DISTANCE, random_contacts
+from model.table.build import build_table
 
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
@@ -181,3 +203,273 @@ def _wrong_gains(names: list[str], logarithms: FloatArray, space: Space, whose: 
         if abs(one.real) > max(_LEAST_GAIN, _GAIN_STDS * gain)
         or abs(one.imag) > max(_LEAST_PHASE, _GAIN_STDS * phase)
     ]
+
+
+_PLATES = 60
+_MARGIN = 0.013  # m, of fingers from the edges
+
+
+@dataclass(frozen=True)
+class ExpectedContrast:
+    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts.
+
+    before, after: what half of the plates like the identified one give with the answers of the rig
+    as written and as identified; promised: what nine of ten give with the latter.
+    """
+
+    quiet: int
+    before: float
+    after: float
+    promised: float
+
+
+def expected_contrast(
+    found: Identification, *, frequencies: FloatArray | None = None, sets: int = 12
+) -> list[ExpectedContrast]:
+    """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
+
+    frequencies (f,) [Hz]: of the tables, by default those of any. Nothing is promised, an empty
+    list, where chi² is beyond what explains a measurement or too few sensors were there.
+    """
+    if not found.is_explained or found.held_out is None:
+        return []
+    written, identified = (
+        build_table(rig, frequencies=frequencies, drive_mode="phased")
+        for rig in (found.before, found.rig)
+    )
+    expected, plate = [], identified.plate
+    shorter = min(plate.length, plate.width)
+    margin = min(_MARGIN, shorter / 4)
+    for quiet in (1, 2, 3):
+        rng = np.random.default_rng([found.seed, quiet])
+        apart = min(MIN_DISTANCE, shorter / (2 * (quiet + 1)))
+        rows = []
+        for _ in range(sets):
+            places = random_contacts(rng, quiet + 1, plate, margin=margin, apart=apart)
+            placed = Placement(places[:1], places[1:])
+            plates = draw_plates(
+                rng,
+                identified.uncertainty,
+                count=_PLATES,
+                of=identified,
+                contact_count=quiet + 1,
+            )
+            each = []
+            for table in (written, identified):
+                drive = query(table, placed, MIN_LEVEL_DB_SL).layers[0].excitation
+                contrast = felt_on(identified, placed, drive, plates).contrast
+                assert contrast is not None  # noqa: S101  there are quiet fingers
+                each.append(20 * np.log10(contrast))
+            before, after = each
+            rows.append((np.median(before), np.median(after), np.percentile(after, PERCENTILE)))
+        expected.append(ExpectedContrast(quiet, *np.median(rows, axis=0).tolist()))
+    return expected
+
+
+def value_rows(changes: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Table of values: name, before, and after with its standard error, as texts with units."""
+    width = max((len(name) for name, _, _ in changes), default=0)
+    return [f"{name:{width}}  {before} -> {after}" for name, before, after in changes]
+
+
+def quality_rows(
+    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
+) -> list[str]:
+    """Lines of the uncertainty that the new rig states, and of the prediction of what was left out.
+
+    held_out: what was; error: of its prediction, relative to the response, None where too little
+    was measured to leave any out; beside: what else is known of the fit's errors.
+    """
+    found = (
+        f"{held_out} predicted within {percent(error)} of the response"
+        if error is not None
+        else "too few sensors to leave any out"
+    )
+    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
+
+
+_MISTAKEN = 0.01  # unexplained, beyond which a plate is not quite the rig's
+_LYING = 4.0  # standard errors
+_SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
+
+_ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase", "supports")
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A parameter: its value less the rig's, standard error, standard deviation before; unit.
+
+    Per cent are those of the rig's value; places of a mass count from the middle of the plate. key:
+    the unit in words.
+    """
+
+    name: str
+    kind: str
+    difference: float
+    error: float
+    before: float
+    unit: str
+    key: str
+
+
+def estimates(found: Identification) -> list[ParameterEstimate]:
+    """All parameters that were uncertain."""
+    space, posterior = found.posterior.space, found.posterior
+    kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
+    rows = []
+    for number, name in enumerate(space.names):
+        if not space.std[number]:
+            continue
+        kind = kinds[number]
+        is_place = kind == "masses" and (number - space.groups[kind].start) % 3
+        known = KINDS["place" if is_place else kind]
+        std, error = float(space.std[number]), float(posterior.std[number])
+        difference = std * float(posterior.x[number])
+        if known.unit == "%":  # of logarithms of factors
+            std, error = math.expm1(std), math.exp(difference) * error
+            difference = math.expm1(difference)
+        difference, error, std = (known.per_unit * each for each in (difference, error, std))
+        rows.append(ParameterEstimate(name, kind, difference, error, std, known.unit, known.key))
+    return rows
+
+
+@dataclass(frozen=True)
+class ClockEstimate:
+    """By which an amplifier's clock is late against the first one's, as the plate shows it [us].
+
+    error: standard one; stated: rms of both, as they and their lines state.
+    """
+
+    amplifier: str
+    delay_us: float
+    error_us: float
+    stated_us: float
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether what is stated explains it, but for one in 16 000 that are true."""
+        return abs(self.delay_us) <= _LYING * math.hypot(self.error_us, self.stated_us)
+
+
+def clock_estimates(found: Identification) -> list[ClockEstimate]:
+    """Clocks of all amplifiers but the first, by name, whose clocks are held to its own."""
+    stated = found.fitted.problem.measurement.clock_errors
+    first, *others = sorted(stated) or [""]
+    part = found.posterior.space.groups["delay"]
+    rows = zip([first, *others], found.values.delays, found.posterior.std[part], strict=False)
+    estimated = [
+        ClockEstimate(name, 1e6 * delay, 1e6 * error, 1e6 * math.hypot(stated[first], stated[name]))
+        for name, delay, error in rows
+        if name != first
+    ]
+    return [each for each in estimated if math.isfinite(each.stated_us)]
+
+
+def clock_rows(found: Identification) -> list[str]:
+    """Lines of clocks that are off, which the rig's gains take off, and of those that lie."""
+    rows = []
+    for each in clock_estimates(found):
+        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
+        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
+        if not each.is_believed:
+            rows.append(
+                f"amplifier {each.amplifier} or the first one must be within "
+                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
+                "or its output is late otherwise than that of its product"
+            )
+    return rows
+
+
+def parameter_rows(found: Identification) -> list[str]:
+    """Table of what a rig file states, and of all else that differs from it significantly.
+
+    By how much, those of the plate first and then ERA by ERA.
+    """
+    places = {era.name: place for place, era in enumerate(found.rig.eras)}
+    rows = []
+    for each in estimates(found):
+        if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error:
+            unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
+            after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
+            if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
+                after = "not identified"
+            rows.append((each.name, f"± {each.before:.2g}{unit}", after))
+    return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))
+
+
+def fit_rows(found: Identification) -> list[str]:
+    """Lines of how well the model explains the measurement."""
+    held, known = found.held_out, found.rig.uncertainty
+    verdict = "explains" if found.chi2 <= MAX_CHI2 else "does not explain"
+    rows = [f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
+    material = found.rig.plate.material
+    if material.orthotropy != found.before.plate.material.orthotropy:
+        moduli = ", ".join(f"{key} {each / 1e9:.4g}" for key, each in material.moduli.items())
+        rows.append(f"the board's grain was found, too: {moduli} GPa")
+    if not found.is_known_well:
+        rows.append(
+            f"not known well enough: modes are {found.mode_shift:.1f} standard deviations from "
+            f"those of the rig's plate (at most {MAX_MODE_SHIFT:g})"
+        )
+    if held is None:
+        return [*rows, *quality_rows(known, beside="nothing is promised")]
+    rows += quality_rows(
+        known,
+        held_out="every fifth path",
+        error=held.total,
+        beside=f"the model leaves {percent(held.unexplained)} unexplained",
+    )
+    if held.unexplained > _MISTAKEN:
+        rows.append(
+            "the plate differs from the rig by more than its parameters, such as in thickness from "
+            "end to end; errors of values and answers allow for that"
+        )
+    return rows
+
+
+def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
+    """Lines of the contrast to expect before and after, and of what is promised."""
+    if not expected:
+        return ["contrast: nothing is promised"]
+    rows = ["contrast on plates like this one, median over random fingers:"]
+    for each in expected:
+        rows.append(
+            f"  {each.quiet} quiet: as written {each.before:.1f} dB, identified {each.after:.1f} "
+            f"dB; nine of ten plates {each.promised:.1f} dB"
+        )
+    return rows
+
+
+def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict[str, Any]:
+    """All results for programs, units in the keys or beside the values."""
+    return {
+        "explained": found.is_explained,
+        "chi2": found.chi2,
+        "known_well": found.is_known_well,
+        "mode_shift": found.mode_shift,
+        "held_out_error": None if found.held_out is None else found.held_out.total,
+        "unexplained_error": None if found.held_out is None else found.held_out.unexplained,
+        "parameters": [
+            {
+                "name": each.name,
+                "unit": each.key,
+                "difference": each.difference,
+                "standard_error": each.error,
+                "standard_deviation_before": each.before,
+            }
+            for each in estimates(found)
+        ],
+        "clocks": [
+            {**asdict(each), "is_believed": each.is_believed} for each in clock_estimates(found)
+        ],
+        "uncertainty": asdict(found.rig.uncertainty),
+        "expected_contrast": [
+            {
+                "quiet": each.quiet,
+                "before_db": each.before,
+                "after_db": each.after,
+                "promised_db": each.promised,
+            }
+            for each in expected
+        ],
+    }

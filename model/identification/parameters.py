@@ -1,21 +1,95 @@
-"""The vector of parameters x, in prior standard deviations, and the values that it stands for."""
+"""The vector of parameters x, in prior standard deviations, and the values that it stands for.
+
+What makes a plate not quite the one of its rig, in a few dozen coordinates.
+
+A rig file has no words for a cable glued to the plate, or sides that are not cut to size. Left out,
+such form errors bias what is fitted by far more than noise does, and no residual shows by how much.
+They change the stiffness and the mass between the modes of the free plate, and so their shapes.
+
+What a vector of parameters says of a rig: springs, places, masses, losses, gains.
+
+Shapes and truncated sums at attachments and sensors, and their changes by their places.
+"""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import FloatArray
-from model.identification.form_errors import MASS_CELLS
+from model.arrays import ComplexArray, FloatArray, IntArray
+from model.fem import Mesh, element_slopes
+from model.finger import Grid
+from model.reduction.free_modes import FreeModes
+from model.reduction.free_plate import TERMS, FreePlate
+from model.reduction.place_slopes import place_slopes
+from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
-from model.structure.attachments import damping_from_ratio
+from model.spectral.shape_stiffness import stiffness_slopes
+from model.structure.actuators import Actuator
+from model.structure.attachments import Gain, PointLoad, damping_from_ratio, footprints_of
+from model.structure.exciter import Exciter
 from model.structure.feet_and_frames import FEET_DEVIATE
-from model.structure.plate import MAX_LOSS_EXPONENT
+from model.structure.modal_elasticity import Dispersion
+from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FACTOR, Plate
+
+MASS_CELLS = Grid(8, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModes:
+    """A plate's modes and residual vectors at all that is attached, as if no others were truncated.
+
+    cells (c, r): shapes where foreign mass may lie; stiffening (3, r, r): derivatives of the
+    stiffness between them by length and width (relative), and by Poisson's ratio [rad²/s²].
+    """
+
+    plate: ReducedPlate
+    cells: FloatArray
+    stiffening: FloatArray
+
+    @property
+    def eigenvalues(self) -> FloatArray:
+        """omega² (r,) [rad²/s²]."""
+        return np.asarray(self.plate.omega**2)
+
+    @property
+    def losses(self) -> FloatArray:
+        """Their imaginary part beside the plate's own loss factor (r,)."""
+        return self.plate.losses
+
+    @property
+    def dispersion(self) -> Dispersion | None:
+        """How they change with frequency, None where they do not."""
+        return self.plate.dispersion
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points or footprints [m], (n, r)."""
+        return self.plate.at(points)
+
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums over truncated modes: zero, (TERMS, n, m)."""
+        return np.zeros((TERMS, len(points), len(others)))
+
+
+def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
+    """Reduce a rig's free plate to coordinates in which it may have form errors."""
+    plate = rig.plate
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
+    cells = MASS_CELLS.centres(plate)
+    unknowns = reduced.unknowns()
+    if isinstance(free.mesh, Mesh):
+        stiffening = element_slopes(plate, free.mesh, unknowns[0])
+    else:
+        degrees = free.mesh.nx, free.mesh.ny
+        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
+        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
+    return ReducedModes(reduced, reduced.at(cells), stiffening)
+
 
 MODE_SHIFTS = 12
 """Of so many of the lowest elastic modes eigenvalue and loss factor may differ from the model's."""
@@ -100,7 +174,7 @@ KINDS = {
     "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
     "poisson": Kind(0.015, "", "", 1.0),
-    # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.viscous_loss`).
+    # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.forward`).
     "loss_law": Kind(1.0, "", "", 1.0),
 }
 """Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead.
@@ -409,3 +483,262 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
         elif space.std[number] * (space.upper[number] - x[number]) < _AT_EDGE:
             moved[number] -= by
     return np.where(space.uncertain, moved, x)
+
+
+_LEAST_MASS = 1e-5  # kg; less is none
+_GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """A rig's plate with n ERAs, m additional masses and k fingers, in units of the model.
+
+    thickness, modulus: factors; loss_factor at LOSS_FREQUENCY, loss_exponent; stiffness [N/m],
+    damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs, bolts of exciters their
+    coils; magnet_mass, force_factor (n,): of exciters, factors; supports (q,): of the stiffness of
+    each foot, factors; masses (m, 3): kg and x,
+    y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
+    loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
+    beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
+    (n,): of the drives, by which they lag; delays [s]: of the clocks of amplifiers, in the order of
+    their names, to the first; none where they agree. Of a plate with form errors, else empty:
+    sensor_scales (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs;
+    foreign_mass (c,): in cells, as shares of the plate's and none in all; stretch (3,): of length
+    and width, relative,
+    and what is added to Poisson's ratio. loss_law: 0 for losses that are hysteretic, 1 for viscous
+    ones.
+    """
+
+    thickness: float
+    modulus: float
+    loss_factor: float
+    loss_exponent: float
+    stiffness: FloatArray
+    damping: FloatArray
+    bolt_mass: FloatArray
+    magnet_mass: FloatArray
+    force_factor: FloatArray
+    supports: FloatArray
+    places: FloatArray
+    masses: FloatArray
+    mode_shifts: FloatArray
+    mode_losses: FloatArray
+    drive_gains: ComplexArray
+    sensor_gains: ComplexArray
+    fingers: FloatArray
+    inertia: FloatArray
+    drag: FloatArray
+    delays: FloatArray
+    sensor_scales: FloatArray
+    sensor_places: FloatArray
+    foreign_mass: FloatArray
+    stretch: FloatArray
+    loss_law: float
+
+    @classmethod
+    def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
+        """Those of parameters x (p,)."""
+
+        def own(kind: str) -> FloatArray:
+            return space.values(x, kind)
+
+        plate, n = rig.plate, len(rig.eras)
+        k, c, m = (
+            np.array([getattr(era, era.fields[kind]) for era in rig.eras])
+            for kind in ("stiffness", "damping", "bolt_mass")
+        )
+        at = np.array([(era.x, era.y) for era in rig.eras])
+        sides = np.array([plate.length, plate.width])
+        masses = own("masses").reshape(-1, 3)
+        masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
+        cells = own("foreign_mass")
+        loss = plate.loss_factor * np.exp(own("loss")[0]) + own("loss_added")[0]
+        return cls(
+            thickness=float(np.exp(own("thickness")[0])),
+            modulus=float(np.exp(own("modulus")[0])),
+            loss_factor=float(np.clip(loss, 0.0, MAX_LOSS_FACTOR)),
+            loss_exponent=float(plate.loss_exponent + own("loss_exponent")[0]),
+            stiffness=k * np.exp(own("stiffness")),
+            damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
+            bolt_mass=m + own("bolt_mass"),
+            magnet_mass=np.exp(np.append(own("magnet_mass"), np.zeros(n))[:n]),
+            force_factor=np.exp(np.append(own("force_factor"), np.zeros(n))[:n]),
+            supports=np.exp(own("supports")),
+            places=at + own("place").reshape(n, 2),
+            masses=masses,
+            mode_shifts=own("mode_shifts"),
+            mode_losses=own("mode_losses"),
+            drive_gains=np.exp(own("gain") + 1j * own("phase")),
+            sensor_gains=np.exp(own("sensor_gain") + 1j * own("sensor_phase")),
+            fingers=own("fingers").reshape(-1, 4),
+            inertia=own("inertia"),
+            drag=own("drag"),
+            delays=own("delay"),
+            sensor_scales=1 + own("sensor_scale"),
+            sensor_places=own("sensor_place").reshape(-1, 2),
+            foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
+            stretch=np.append(own("side") / sides[: len(own("side"))], own("poisson")),
+            loss_law=float(own("loss_law").sum()),
+        )
+
+    def sources(self, rig: Rig) -> tuple[Actuator, ...]:
+        """The rig's ERAs with their values, where the rig has them and without gains."""
+        found: list[Actuator] = []
+        for number, era in enumerate(rig.eras):
+            new = {
+                "stiffness": self.stiffness[number],
+                "damping": max(self.damping[number], 0.0),
+                "bolt_mass": max(self.bolt_mass[number], 0.0),
+            }
+            for kind in era.fields.keys() - new:
+                new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
+            fields: dict[str, Any] = {era.fields[kind]: float(value) for kind, value in new.items()}
+            if isinstance(era, Exciter):
+                largest = era.largest_force_factor(fields["magnet_mass"])
+                fields["force_factor"] = min(fields["force_factor"], largest)
+            found.append(replace(era, gains=(), **fields))
+        return tuple(found)
+
+    def lag(self, frequencies: FloatArray) -> ComplexArray:
+        """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
+
+        1 / (1 - inertia f² + i drag f), f in kilohertz: of an actuator with a resonance at
+        1 / sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
+        """
+        f = 1e-3 * np.asarray(frequencies)[:, None]
+        return np.asarray(1 / (1 - self.inertia * f**2 + 1j * self.drag * f))
+
+
+def plate_with(plate: Plate, values: Values) -> Plate:
+    """The plate with identified thickness, modulus, losses and modes."""
+    count = max(len(plate.mode_deviations), len(values.mode_shifts))
+    deviations = np.zeros((count, 2))
+    deviations[: len(plate.mode_deviations)] = np.reshape(plate.mode_deviations, (-1, 2))
+    deviations[: len(values.mode_shifts)] += np.column_stack(
+        [values.mode_shifts, values.mode_losses]
+    )
+    return replace(
+        plate.scaled(modulus=values.modulus, thickness=values.thickness),
+        loss_factor=values.loss_factor,
+        loss_exponent=values.loss_exponent,
+        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
+    )
+
+
+def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
+    """The rig with identified values; additional masses come after its own."""
+    places = np.clip(values.places, 0, [rig.plate.length, rig.plate.width])
+    eras = tuple(
+        replace(
+            era,
+            x=float(places[number, 0]),
+            y=float(places[number, 1]),
+            gains=_gains(rig, values, number),
+        )
+        for number, era in enumerate(values.sources(rig))
+    )
+    masses = list(rig.masses)
+    for foot, factor in zip(rig.feet, values.supports.tolist(), strict=True):
+        masses[foot] = replace(masses[foot], stiffness=factor * masses[foot].stiffness)
+    return replace(
+        rig,
+        plate=plate_with(rig.plate, values),
+        laminate=rig.laminate
+        and rig.laminate.scaled(modulus=values.modulus, thickness=values.thickness),
+        eras=eras,
+        masses=(*masses, *additional_masses(values)),
+        uncertainty=uncertainty,
+    )
+
+
+def additional_masses(values: Values) -> Sequence[PointLoad]:
+    """The masses that were found on the plate, without those that weigh nothing."""
+    return [
+        PointLoad(float(x), float(y), mass=float(mass))
+        for mass, x, y in values.masses
+        if mass > _LEAST_MASS
+    ]
+
+
+def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
+    """Measured gains times what was identified; of an ERA without any at one frequency.
+
+    Over the rig's frequencies where the drive lags, and where the clock of its amplifier does.
+    """
+    era = rig.eras[number]
+    lags, delay = values.inertia[number] or values.drag[number], _delay(era.name, rig, values)
+    if values.drive_gains[number] == 1 and not (lags or delay):
+        return era.gains
+    before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
+    if lags or (delay and not era.gains):
+        low, high = rig.limits.frequency_min, rig.limits.frequency_max
+        count = 1 + int(np.ceil((high - low) / _GAIN_STEP))
+        before = tuple((float(f), 1.0, 0.0) for f in np.linspace(low, high, count))
+    f = np.array([f for f, *_ in before])
+    late = np.exp(-2j * np.pi * f * delay)
+    factors = values.drive_gains[number] * values.lag(f)[:, number] * late
+    return tuple(
+        (f, magnitude * float(abs(factor)), turned + float(np.angle(factor)))
+        for (f, magnitude, turned), factor in zip(before, factors.tolist(), strict=True)
+    )
+
+
+def _delay(era: str, rig: Rig, values: Values) -> float:
+    """By which an ERA is late with its amplifier's clock [s]."""
+    if not len(values.delays):
+        return 0.0
+    names = sorted({channel.amplifier for channel in rig.wiring.values()})
+    return float(values.delays[names.index(rig.wiring[era].amplifier)])
+
+
+Modes: TypeAlias = FreeModes | ReducedModes
+
+
+@dataclass(frozen=True, eq=False)
+class AttachmentPoints:
+    """Points of attachment and observation, a of them, of which v may move along x and y.
+
+    footprints (a, 3) [m]; shapes (a, r); truncated (TERMS, a, a): sums over truncated modes;
+    shape_slopes (2 v, r), truncated_slopes (TERMS, 2 v, a): their derivatives by the place of the
+    first, x and y of one point after the other [1/m].
+    """
+
+    footprints: FloatArray
+    shapes: FloatArray
+    truncated: FloatArray
+    shape_slopes: FloatArray
+    truncated_slopes: FloatArray
+
+    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
+        """The same for other footprints (a, 3), by the slopes of the shapes alone."""
+        off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
+        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
+        shapes = self.shapes.copy()
+        shapes[movable] += (off * slopes).sum(axis=1)
+        return replace(self, footprints=footprints, shapes=shapes)
+
+
+def places_of(
+    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
+) -> AttachmentPoints:
+    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
+
+    movable (v,): numbers of those that may move.
+    """
+    moving, shapes = footprints[movable], modes.shapes_at(footprints)
+    truncated = modes.truncated_terms(footprints, footprints)
+    if not len(movable):
+        none = np.zeros((len(truncated), 0, len(footprints)))
+        return AttachmentPoints(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
+
+    def field(points: FloatArray) -> FloatArray:
+        return modes.truncated_terms(points, footprints).swapaxes(0, 1)
+
+    by_place = place_slopes(field, moving, sides)
+    return AttachmentPoints(
+        footprints,
+        shapes,
+        truncated,
+        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
+        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
+    )

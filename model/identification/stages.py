@@ -3,28 +3,61 @@
 Springs, damping, thickness and gains first, with a noise that hides the rest, from several
 thicknesses; then one additional mass, sought where it would explain most; then everything with the
 noise as measured. A second mass only where the first leaves something that it explains.
+
+Covariance of identified parameters, and what it leaves unknown of what answers depend on.
+
+The scale of mass, springs and dampers together changes no response to a moving base, that of all
+drives no contrast. What counts is each natural frequency, each spring and damper relative to the
+plate's mass, each gain relative to the others, and for levels all gains together: a response tells
+only their product with those of the sensors.
+
+How well a fit predicts paths that it was not shown: every fifth one, five times over.
+
+A path is from an ERA to a sensor, and what it shows is shown by the reverse one as well. Paths tell
+how far the fields are off that are not measured; tones left out would tell whether a resonance was
+seen, which the covariance knows. What counts against a model is the part of the error that neither
+noise nor the uncertainty of the parameters explains. In that part fits to different paths disagree
+in parameters, too, by more than their covariance says (a jackknife over groups: B. Efron, The
+Jackknife, the Bootstrap and Other Resampling Plans, SIAM 1982, ch. 3).
+
+What a measurement has not shown, and the tone and the sensor that would show it.
+
+What a measurement tells of a board's grain: its modulus across, and that of shear.
+
+A board of a kind has moduli that differ by 10 % and more from another, each by itself, and its
+lowest modes shift accordingly. Shifts m (k,) that a fit finds, in standard deviations s of what
+modes may shift beside, with their covariance C, are explained by logarithms d of the factors on
+moduli, of a prior variance D: to first order
+
+    d = (J^T (1 - C) J + D^-1)^-1 J^T m,   J = (v^T dK v / lambda) / s,
+
+where the first column, all ones, stands for a modulus that is fitted anew.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
 
-from model.arrays import NEARLY, FloatArray, best_by, ranked_by
+from model.arrays import NEARLY, ComplexArray, FloatArray, best_by, best_of, ranked_by
 from model.finger import Grid
-from model.identification.derivatives import by_mass_at
+from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.least_squares import (
     IdentificationProblem,
     Linearization,
+    Measurement,
     solve,
 )
-from model.identification.measurement import Measurement
-from model.identification.parameters import MODE_SHIFTS, Space, inwards, space_of
-from model.identification.values import plate_with
+from model.identification.parameters import KINDS, MODE_SHIFTS, Space, inwards, plate_with, space_of
+from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
+from model.rig.uncertainty import Uncertainty
+from model.spectral.shape_stiffness import grain_slopes
 from model.structure.modal_elasticity import lowest_elastic
 from model.structure.plate import Plate
 
@@ -216,3 +249,354 @@ def _another_mass(setting: Setting, found: FittedModel) -> FittedModel:
     x = np.insert(found.best.x, at, np.zeros(3))
     starts = _with_mass(raised, x, number=before)
     return _in_full(IdentificationProblem(model, setting.measurement), starts)
+
+
+_THEORY = {
+    "frequency": KINDS["mode_shifts"].theory / 2,
+    "stiffness": KINDS["stiffness"].theory,
+    "damping": KINDS["damping_each"].theory,
+    "place": KINDS["place"].theory,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Normal distribution of x (p,) with a covariance (p, p)."""
+
+    space: Space
+    x: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, space: Space, best: Linearization) -> "Posterior":
+        """That about the most likely parameters: (J^T J + 1)^-1, known ones without variance."""
+        free = np.flatnonzero(space.uncertain)
+        covariance = np.zeros((space.size, space.size))
+        covariance[np.ix_(free, free)] = linalg.inv(best.information[np.ix_(free, free)])
+        return cls(space, best.x, covariance)
+
+    def within(self, space: Space) -> "Posterior":
+        """The same in a space with further parameters, which are 0 and without variance."""
+        own = [space.index(name) for name in self.space.names]
+        x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+        x[own] = self.x
+        covariance[np.ix_(own, own)] = self.covariance
+        return Posterior(space, x, covariance)
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviation of each parameter in its unit (p,)."""
+        return np.asarray(self.space.std * np.sqrt(np.diagonal(self.covariance)))
+
+    def std_of(self, combinations: FloatArray) -> FloatArray:
+        """Standard deviations of linear combinations (m, p) of parameters in their units, (m,)."""
+        scaled = combinations * self.space.std
+        return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, self.covariance, scaled)))
+
+    def stds(self) -> dict[str, FloatArray]:
+        """Standard deviations of what answers depend on, with those of the theory, by kind."""
+        own = {kind: self.std_of(rows) for kind, rows in relevant(self.space).items()}
+        own["place"] = self.std[self.space.groups["place"]]
+        return {
+            kind: np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
+            for kind, std in own.items()
+        }
+
+    def uncertainty(
+        self, before: Uncertainty, *, gain: float, phase_deg: float, field: float
+    ) -> Uncertainty:
+        """What a rig states of itself after it was identified.
+
+        before: its own, of which fingers and harmonics stay; its common_gain, which no fit narrows,
+        counts beside what is unknown of the gains' mean. gain, phase_deg: how far drives repeat;
+        field: what the model leaves unexplained of fields, relative.
+        """
+        mean = _rows(self.space, "gain").mean(axis=0, keepdims=True)
+        rms = {kind: _rms(std) for kind, std in self.stds().items()}
+        damping = max(rms["damping"], rms["loss"])
+        return Uncertainty.clipped(
+            gain=math.hypot(rms["gain"], gain),
+            phase_deg=math.hypot(math.degrees(rms["phase"]), phase_deg),
+            **Uncertainty.of_frequency(rms["frequency"]),
+            stiffness=rms["stiffness"],
+            damping=math.exp(damping),
+            fingertip=before.fingertip,
+            common_gain=math.hypot(before.common_gain, self.std_of(mean)[0]),
+            field=field,
+            place=rms["place"],
+            harmonic=before.harmonic,
+            supports=_rms(self.std[self.space.groups["supports"]]),
+        )
+
+
+def relevant(space: Space) -> dict[str, FloatArray]:
+    """Combinations (m, p) of the parameters that answers depend on, by name."""
+    mass = _rows(space, "thickness")
+    by_rigidity = mass + _rows(space, "modulus") / 2
+    gain, phase = _rows(space, "gain"), _rows(space, "phase")
+    damping = _rows(space, "damping_each") + _rows(space, "damping") - mass
+    factor = space.groups["force_factor"]
+    if factor.stop > factor.start:
+        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        damping = damping[space.std[factor] == 0]
+        gain = gain + _rows(space, "force_factor")
+    return {
+        "frequency": by_rigidity + _rows(space, "mode_shifts") / 2,
+        "stiffness": _rows(space, "stiffness") - mass,
+        "damping": damping,
+        "loss": _rows(space, "loss") + _rows(space, "mode_losses"),
+        "gain": gain - gain.mean(axis=0),
+        "phase": phase - phase.mean(axis=0),
+    }
+
+
+def _rows(space: Space, kind: str) -> FloatArray:
+    """One row for each parameter of a kind, (m, p)."""
+    return np.eye(space.size)[space.groups[kind]]
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
+
+
+SHARE = 5
+"""One in so many is held out."""
+
+_EVALUATIONS = 8
+_PREDICTED = 0.1  # of the rms at a tone: standard error of a prediction that can be held against it
+_LEAST_VALUES = 16
+# Of standard deviations: what no path tells is wrong in all fits alike.
+_IN_COMMON = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPaths:
+    """Errors of prediction, root mean square relative to the responses at a tone.
+
+    total: without what noise explains; unexplained: without what noise and the uncertain parameters
+    explain together; disagreement: covariance (p, p) of parameters x beside that of their fit.
+    """
+
+    total: float
+    unexplained: float
+    disagreement: FloatArray
+
+
+def hold_out(fitted: FittedModel, *, progress: Progress = unseen) -> HeldOutPaths | None:
+    """Predict paths from a fit to the others; None where these do not tell enough of them."""
+    measurement, model = fitted.problem.measurement, fitted.problem.model
+    folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % SHARE
+    squares, variance = np.full((2, *measurement.values.shape), np.nan)
+    free, fits = np.flatnonzero(fitted.space.uncertain), []
+    noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
+    for fold in range(SHARE):
+        progress(1 + fold, 1 + SHARE)
+        unseen = measurement.known & (folds == fold)
+        if not unseen.any():
+            continue
+        if (unseen == measurement.known).all():
+            return None
+        shown = IdentificationProblem(model, measurement.part(folds != fold))
+        found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
+        fits.append(found.x)
+        plate = model.at(found.x)
+        error = (plate.responses - measurement.values)[unseen]
+        squares[unseen] = np.abs(error) ** 2 - 2 * noise * measurement.std[unseen] ** 2
+        J = jacobian(plate)[unseen][:, free]
+        covariance = linalg.inv(found.information[np.ix_(free, free)])
+        variance[unseen] = ((J @ covariance) * J.conj()).sum(axis=1).real
+    mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
+    predicted = variance < _PREDICTED**2 * mean_square
+    if predicted.sum() < _LEAST_VALUES:
+        return None
+
+    total, unexplained = (
+        relative_rms(parts[predicted], mean_square[predicted])
+        for parts in (squares, squares - variance)
+    )
+    share = (unexplained / total) ** 2 if unexplained else 0.0
+    off = np.array(fits) - np.mean(fits, axis=0)
+    jackknife = (1 - 1 / len(fits)) * off.T @ off
+    return HeldOutPaths(total, unexplained, share * _IN_COMMON**2 * jackknife)
+
+
+def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
+    """Root mean square of errors, each relative to the rms of its responses, by their squares.
+
+    None where what is taken from squares, such as noise, exceeds them; infinite where all are NaN.
+    """
+    share = squares / mean_squares
+    known = share[np.isfinite(share)]
+    return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
+
+
+UNKNOWN = 0.5
+"""Share of its standard deviation before, beyond which a measurement has not shown something.
+
+Of that of a plate that was not measured, where the rig states less: answers need no more.
+"""
+
+SUSPENSION_FELT = 120.0
+"""Hz; above it fields change by less than 5 % with a suspension that is 20 % off."""
+
+_STEP = 20.0  # Hz between the tones that are considered
+_NOISE = 0.01
+_SHARES = (0.13, 0.5, 0.87)  # of the sides, where further sensors are considered
+
+
+@dataclass(frozen=True)
+class UnknownQuantity:
+    """Something that was not identified: its name and standard deviations before and after.
+
+    Advised: an ERA and a frequency [Hz] to play, and a sensor at an ERA or at x, y [m].
+    """
+
+    name: str
+    before: float
+    after: float
+    era: str
+    frequency: float
+    sensor: Sensor
+
+    def __str__(self) -> str:
+        sensor = self.sensor
+        place = f"ERA {sensor.era}" if sensor.era else f"({sensor.x:.3g}, {sensor.y:.3g}) m"
+        return (
+            f"{self.name}: known to {100 * self.after:.2g} %, before {100 * self.before:.2g} %; "
+            f"play ERA {self.era} at {self.frequency:.0f} Hz and measure at {place}"
+        )
+
+
+def unknowns(setting: Setting, fitted: FittedModel, posterior: Posterior) -> list[UnknownQuantity]:
+    """All that answers depend on and the measurement has not shown, with what would show it."""
+    space, found = posterior.space, []
+    prior = replace(posterior, covariance=np.diag(space.uncertain.astype(float)))
+    built = replace(prior, space=space.as_built)
+    for kind, rows in relevant(space).items():
+        before, after = prior.std_of(rows), posterior.std_of(rows)
+        unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * built.std_of(rows)))
+        if kind == "stiffness" and setting.measurement.frequencies[0] > SUSPENSION_FELT:
+            excites = ["force_factor" in era.fields for era in setting.rig.eras]
+            unknown = unknown[~np.array(excites)[unknown]]
+        # Of losses and frequencies of single modes only those count that no tone has shown.
+        if not len(unknown) or (kind in ("frequency", "loss") and len(unknown) < len(rows)):
+            continue
+        worst = unknown[best_of(after[unknown])]
+        name = kind if kind in ("frequency", "loss") else _name(rows[worst], space.names)
+        best = _best(setting, fitted, posterior, rows[worst])
+        found.append(UnknownQuantity(name, float(before[worst]), float(after[worst]), *best))
+    return found
+
+
+def _name(row: FloatArray, names: tuple[str, ...]) -> str:
+    return names[best_of(np.abs(row))]
+
+
+def _best(
+    setting: Setting, fitted: FittedModel, posterior: Posterior, row: FloatArray
+) -> tuple[str, float, Sensor]:
+    """ERA, frequency and sensor whose response would tell most of a combination (p,)."""
+    rig, model = setting.rig, fitted.problem.model
+    plate, limits = rig.plate, rig.limits
+    measured = {sensor.era for sensor in model.sensors}
+    more = [Sensor(f"ERA {era.name}", era.name) for era in rig.eras if era.name not in measured]
+    more += [
+        Sensor(f"{x:g} {y:g}", x=x * plate.length, y=y * plate.width)
+        for x in _SHARES
+        for y in _SHARES
+    ]
+    sensors = [*model.sensors, *more]
+    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _STEP)
+    wider = replace(setting.model(model.mass_count, more=more), frequencies=tones, free=model.free)
+    space = wider.space
+    own = [space.index(name) for name in posterior.space.names]
+    known, combination, unknown = posterior.within(space), np.zeros(space.size), space.std > 0
+    combination[own], unknown[own] = row, False
+    covariance = known.covariance + np.diag(unknown.astype(float))
+    at = wider.at(known.x)
+    scale = _NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
+    direction = covariance @ (combination * space.std)
+    gains = _gains(jacobian(at) / scale[..., None], covariance, direction)
+    f, s, e = np.unravel_index(best_of(gains.ravel()), gains.shape)
+    return rig.eras[e].name, float(tones[f]), sensors[s]
+
+
+def _gains(J: ComplexArray, covariance: FloatArray, direction: FloatArray) -> FloatArray:
+    """Decrease of a combination's variance by each response measured on its own, (f, s, e)."""
+    total = np.zeros(J.shape[:3])
+    for part in (J.real, J.imag):
+        variance = ((part @ covariance) * part).sum(axis=-1)
+        total += (part @ direction) ** 2 / (1 + variance)
+    return total
+
+
+_PRIOR = 0.15  # of the logarithms: of a board by its kind
+_LEAST = 3e-3  # of a change that is worth another fit
+_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
+_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
+_GRAIN_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
+
+
+def fit_board(setting: Setting) -> tuple[Setting, FittedModel]:
+    """The most likely parameters of a measurement, and the board in whose grain they are.
+
+    Of a plate without a grain those of `fit_in_stages`.
+    """
+    if setting.rig.plate.material.orthotropy is None:
+        return setting, fit_in_stages(setting)
+    found = []
+    for start in _STARTS:
+        found += _fits_from(_with_grain(setting, start, 1.0))
+        if any(_is_good(fitted) for _, fitted in found):
+            break
+    return best_by(found, lambda each: -each[1].best.cost)
+
+
+def _fits_from(setting: Setting) -> list[tuple[Setting, FittedModel]]:
+    """Fits one after the other, each in the grain that the one before shows."""
+    found = [(setting, fit_in_stages(setting))]
+    for _ in range(_ROUNDS):
+        setting, fitted = found[-1]
+        across, shear = _grain_shown(setting, fitted)
+        if max(abs(across), abs(shear)) < _LEAST:
+            break
+        other = _with_grain(setting, math.exp(across), math.exp(shear))
+        found.append((other, fit_in_stages(other)))
+    return found
+
+
+def _is_good(fitted: FittedModel) -> bool:
+    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
+    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
+    return chi2(fitted) <= _GRAIN_GOOD and float((shifts**2).mean()) <= _GRAIN_GOOD
+
+
+def _grain_shown(setting: Setting, fitted: FittedModel) -> tuple[float, float]:
+    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
+    shifts = fitted.space.of("mode_shifts")
+    count = int(shifts.sum())
+    posterior = Posterior.of(fitted.space, fitted.best)
+    shown = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
+    J = _slopes(setting.free, count) / KINDS["mode_shifts"].std
+    information = J.T @ shown @ J + np.eye(3) / _PRIOR**2
+    _, across, shear = np.linalg.solve(information, J.T @ posterior.x[shifts]).tolist()
+    return across, shear
+
+
+def _with_grain(setting: Setting, across: float, shear: float) -> Setting:
+    """The setting of a board with other moduli across and of shear, by factors."""
+    rig, of = setting.rig, setting.rig.plate.material.shares
+    shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
+    plate = replace(rig.plate, material=replace(rig.plate.material, orthotropy=shares))
+    free = solve_free_plate(plate, setting.free.mesh, frequency_max=setting.free.frequency_max)
+    return replace(setting, rig=replace(rig, plate=plate), free=free)
+
+
+def _slopes(free: FreePlate, count: int) -> FloatArray:
+    """Derivatives of the logarithms of the lowest eigenvalues by those of three moduli (k, 3)."""
+    modes, mesh = free.modes, free.mesh
+    lowest = lowest_elastic(modes.eigenvalues, count)
+    shapes = [each[:, lowest] for each in modes.unknowns(np.empty((0, 3)))]
+    by_grain = grain_slopes(free.plate, (mesh.nx, mesh.ny), shapes)
+    relative = by_grain / modes.eigenvalues[lowest]
+    return np.column_stack([np.ones(len(lowest)), *relative])

@@ -18,7 +18,7 @@ from drivers.judge.watching import capture
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.design.area import area_of
 from model.errors import InputError
-from model.identification.learned_file import load_learned
+from model.identification.learned_plate import load_learned
 from model.rig.file import example_rig_path, load_rig
 from model.table.file import load_table
 from sim.desk.measuring.desk import Desk

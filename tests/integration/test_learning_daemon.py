@@ -21,7 +21,7 @@ from controller.demo.touch_row import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from daemon_bench import daemon_at, far_end, ready
-from model.identification.learned_file import load_learned
+from model.identification.learned_plate import load_learned
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 from model.table.build import build_table

@@ -9,7 +9,7 @@ from benchmarks.identification.hidden import LENGTH, WIDTH, Hidden, finger_stiff
 from benchmarks.identification.thin_plate import Mounted
 from benchmarks.setting import random_contacts
 from model.identification.forward import RestingFinger
-from model.identification.settled import SettledPattern
+from model.identification.settled_patterns import SettledPattern
 from model.structure.attachments import Fingertip
 
 FREQUENCIES = np.linspace(40.0, 500.0, 27)

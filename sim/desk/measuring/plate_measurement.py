@@ -8,7 +8,7 @@ import numpy as np
 from model.arrays import FloatArray, best_first
 from model.calibration.responses import read_sensors
 from model.identification.forward import Sensor
-from model.identification.measurement import (
+from model.identification.least_squares import (
     DeviceSettings,
     MeasuredPlate,
     Measurement,

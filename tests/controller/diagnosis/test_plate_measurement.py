@@ -25,7 +25,7 @@ from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
-from model.identification.measurement import MeasuredPlate
+from model.identification.least_squares import MeasuredPlate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad

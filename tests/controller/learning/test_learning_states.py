@@ -35,8 +35,8 @@ from drivers.playing.contents import Layer, Tone
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.identification.forward import Sensor
-from model.identification.learned_table import LearnedTable
-from model.identification.settled import SettledPattern
+from model.identification.learned_plate import LearnedTable
+from model.identification.settled_patterns import SettledPattern
 from model.table.table import LocalizationTable
 from paper_plate import make_paper_rig
 from small_table import small_table

@@ -19,8 +19,7 @@ from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.calibration.fit import sensed_plate
 from model.diagnosis.verdict import check_consistency
-from model.identification.form_errors import MASS_CELLS, reduced_modes
-from model.identification.parameters import KINDS
+from model.identification.parameters import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig

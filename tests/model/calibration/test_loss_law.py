@@ -15,7 +15,7 @@ from model.calibration.responses import Responses
 from model.diagnosis.verdict import check_consistency
 from model.fem import Mesh, assemble
 from model.identification.derivatives import jacobian
-from model.identification.viscous_loss import viscous_difference
+from model.identification.forward import viscous_difference
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 

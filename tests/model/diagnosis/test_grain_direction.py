@@ -14,7 +14,7 @@ from model.diagnosis.diagnosis_report import as_json, verdict_rows
 from model.diagnosis.plate_match import ShapeMatch
 from model.diagnosis.verdict import check_consistency, check_meaning, diagnose
 from model.errors import InputError
-from model.identification.measurement import MeasuredPlate
+from model.identification.least_squares import MeasuredPlate
 from model.rig.file import load_rig
 from model.rig.rig import Rig
 

@@ -6,8 +6,8 @@ import pytest
 from benchmarks.identification.hidden import Hidden, draw
 from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
-from model.identification.in_service import PlateEstimate
-from model.identification.measurement import Measurement
+from model.identification.learned_plate import PlateEstimate
+from model.identification.least_squares import Measurement
 from model.rig.file import example_rig_path, load_rig
 from settled_patterns import FREQUENCIES
 

@@ -8,9 +8,14 @@ import pytest
 
 from benchmarks.identification.hidden import draw
 from model.identification.forward import ForwardModel, Sensor
-from model.identification.identification_report import as_json, clock_estimates, clock_rows
-from model.identification.identify import Identification, identify
-from model.identification.measurement import Measurement
+from model.identification.identify import (
+    Identification,
+    as_json,
+    clock_estimates,
+    clock_rows,
+    identify,
+)
+from model.identification.least_squares import Measurement
 from model.identification.parameters import space_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig

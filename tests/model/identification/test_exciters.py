@@ -12,9 +12,8 @@ from model.config.document import parse_document
 from model.fem import ELEMENTS, Mesh, assemble
 from model.identification.derivatives import jacobian
 from model.identification.forward import SENSOR_FOOT, ForwardModel, Sensor
-from model.identification.identification_report import parameter_rows
-from model.identification.identify import identify
-from model.identification.measurement import Measurement
+from model.identification.identify import identify, parameter_rows
+from model.identification.least_squares import Measurement
 from model.identification.parameters import space_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import rig_of

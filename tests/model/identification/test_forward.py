@@ -8,8 +8,15 @@ import pytest
 from model.arrays import ComplexArray, FloatArray
 from model.identification.derivatives import by_mass_at, jacobian
 from model.identification.forward import ForwardModel, RestingFinger, Sensor
-from model.identification.parameters import FINGER_PARTS, Space, inwards, space_by_sheets, space_of
-from model.identification.values import Values, rig_with
+from model.identification.parameters import (
+    FINGER_PARTS,
+    Space,
+    Values,
+    inwards,
+    rig_with,
+    space_by_sheets,
+    space_of,
+)
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import example_rig_path, load_rig
 from model.rig.meshes import mesh_of

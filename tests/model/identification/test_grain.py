@@ -7,9 +7,8 @@ import pytest
 
 from model.config.document import parse_document
 from model.identification.forward import Sensor
-from model.identification.identification_report import fit_rows
-from model.identification.identify import identify
-from model.identification.measurement import Measurement
+from model.identification.identify import fit_rows, identify
+from model.identification.least_squares import Measurement
 from model.reduction.free_plate import solve_free_plate
 from model.rig.file import rig_of
 from model.rig.rewritten import rewritten_text

@@ -13,10 +13,15 @@ from model.config.document import read_document
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.identification.forward import Sensor
-from model.identification.identification_report import as_json, fit_rows
-from model.identification.identify import MAX_CHI2, Identification, identify
-from model.identification.measurement import Measurement, Repeat
-from model.identification.promise import expected_contrast
+from model.identification.identify import (
+    MAX_CHI2,
+    Identification,
+    as_json,
+    expected_contrast,
+    fit_rows,
+    identify,
+)
+from model.identification.least_squares import Measurement, Repeat
 from model.rig.file import example_rig_path, load_rig
 from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.identification.hidden import Hidden, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
-from model.identification.in_service import LivePlate, PlateEstimate
+from model.identification.learned_plate import LivePlate, PlateEstimate
 from settled_patterns import played, settled_patterns
 
 NE = 2  # number of that ERA

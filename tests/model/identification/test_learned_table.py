@@ -8,9 +8,8 @@ import pytest
 
 from benchmarks.identification.hidden import Hidden
 from model.errors import InputError
-from model.identification import learned_table
-from model.identification.in_service import PlateEstimate
-from model.identification.learned_table import LearnedTable
+from model.identification import learned_plate
+from model.identification.learned_plate import LearnedTable, PlateEstimate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.table.build import build_table
@@ -80,7 +79,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
         raise InputError("thickness must be within 10 %, got 20 %")
 
     with monkeypatch.context() as patch:
-        patch.setattr(learned_table, "table_following", refused)
+        patch.setattr(learned_plate, "table_following", refused)
         with pytest.raises(InputError, match="thickness"):
             learned.take(second)
     assert learned.live.known is state

@@ -8,11 +8,13 @@ import pytest
 
 from benchmarks.identification.hidden import draw
 from model.arrays import FloatArray
-from model.identification.changes import WINDOW, Alarm, Observation
 from model.identification.forward import Sensor
-from model.identification.in_service import LivePlate, PlateEstimate
-from model.identification.settled import (
+from model.identification.learned_plate import LivePlate, PlateEstimate
+from model.identification.settled_patterns import (
+    WINDOW,
+    Alarm,
     NoiseLevel,
+    Observation,
     PatternModel,
     SettledPattern,
     State,

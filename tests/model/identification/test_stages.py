@@ -8,7 +8,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, draw
 from long_form import shortly
 from model.identification.forward import Sensor
-from model.identification.measurement import Measurement
+from model.identification.least_squares import Measurement
 from model.identification.stages import (
     FittedModel,
     Setting,

@@ -19,7 +19,7 @@ from model.calibration.responses import WiredSensor, read_sensors
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.identification.identify import identify
-from model.identification.measurement import MeasuredPlate
+from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
 from sim.desk.measuring.desk import Desk

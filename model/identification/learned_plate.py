@@ -3,28 +3,54 @@
 The parameters of an identification drift; an update moves them together with the fingers of its
 pattern, which are dropped afterwards. Where innovations are unlikely the state goes back to where
 they began, since an update smears a jump over all parameters, and is held until the patterns since
-then are explained together by one change (`model.identification.changes`). Such a change is
+then are explained together by one change (`model.identification.settled_patterns`). Such a change is
 followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
 counts as changed, until patterns are those of the plate as it was.
+
+The file of a learned plate: parameters and covariance, beside the table that they correct.
+
+A table that learns its plate: settled patterns in, corrected answers out.
+
+Answers follow the plate as it is known after each pattern. From an alarm on they wait for its
+explanation. Where the plate has changed in a way that its parameters do not follow they become
+those of the plate as last known, with errors as wide as those of a plate that nobody measured,
+until it is again as it was.
 """
 
+import hashlib
+import json
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Self
 
 import numpy as np
 
 from model.arrays import FloatArray
-from model.identification.changes import PLACES, Alarm, Observation, PlateChange, explain
+from model.errors import InputError
+from model.files.array_file import UNREADABLE, begins_with, read_arrays, write_arrays
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.identify import solved_for
-from model.identification.parameters import KINDS, MODE_SHIFTS, space_of
-from model.identification.settled import NoiseLevel, PatternModel, SettledPattern, State, update
-from model.identification.values import Values, rig_with
+from model.identification.parameters import KINDS, MODE_SHIFTS, Values, rig_with, space_of
+from model.identification.settled_patterns import (
+    PLACES,
+    Alarm,
+    NoiseLevel,
+    Observation,
+    PatternModel,
+    PlateChange,
+    SettledPattern,
+    State,
+    explain,
+    update,
+)
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.structure.modal_elasticity import lowest_elastic
+from model.table.following import table_following
+from model.table.table import LocalizationTable
 
 _EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained
@@ -187,3 +213,196 @@ def widest(uncertainty: Uncertainty) -> Uncertainty:
             for each in fields(Uncertainty)
         }
     )
+
+
+_VERSION = 2
+_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
+_MAX_BYTES = 1 << 24
+
+
+class OtherPlate(InputError):
+    """A learned plate of another table, or of other parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPlate:
+    """A state of parameters by name, counted from a rig; table, base: fingerprints of both.
+
+    change: how the plate has changed since in a way that its parameters do not follow, or nothing.
+    """
+
+    table: str
+    base: str
+    names: tuple[str, ...]
+    state: State
+    change: str = ""
+
+
+def save_learned(learned: LearnedPlate, file: Path) -> None:
+    """Write a learned plate, atomically; raises OSError."""
+    header = {
+        "version": _VERSION,
+        "table": learned.table,
+        "base": learned.base,
+        "names": learned.names,
+        "change": learned.change,
+    }
+    text = json.dumps(header)
+    x, covariance = learned.state.x, learned.state.covariance
+    write_arrays(
+        file,
+        {
+            "header": np.frombuffer(text.encode(), dtype=np.uint8),
+            "x": x,
+            "covariance": covariance,
+            "digest": np.frombuffer(_digest(text, x, covariance), dtype=np.uint8),
+        },
+    )
+
+
+def load_learned(file: Path, *, table: str) -> LearnedPlate:
+    """Read a learned plate of a table by its fingerprint.
+
+    Raises InputError for a damaged file or another version, OtherPlate for another table.
+    """
+    try:
+        arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
+        text, x, covariance = arrays["header"].tobytes().decode(), arrays["x"], arrays["covariance"]
+        if arrays["digest"].tobytes() != _digest(text, x, covariance):
+            raise ValueError("digest must be that of the content")
+        header = json.loads(text)
+        version, names = header["version"], tuple(header["names"])
+        found = LearnedPlate(
+            header["table"],
+            header["base"],
+            names,
+            State(x, covariance),
+            str(header["change"]),
+        )
+    except (*UNREADABLE, KeyError, TypeError) as error:
+        why = (isinstance(error, OSError) and error.strerror) or error
+        raise InputError(
+            f"{file}: must be a learned plate: {why}; remove the file to learn anew"
+        ) from error
+    p = len(names)
+    if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
+        raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
+    if found.table != table:
+        raise OtherPlate(
+            f"{file}: must be learned for this table, got one of another rig; remove the file to "
+            "learn anew"
+        )
+    return found
+
+
+def was_learned(file: Path) -> bool:
+    """Whether a file is a learned plate of any version, or may have been before it was damaged."""
+    if not begins_with(file, b"PK"):
+        return False
+    try:
+        with zipfile.ZipFile(file) as members:
+            return "covariance.npy" in members.namelist()
+    except zipfile.BadZipFile:
+        return True
+
+
+def _digest(text: str, x: np.ndarray, covariance: np.ndarray) -> bytes:
+    return hashlib.sha256(text.encode() + x.tobytes() + covariance.tobytes()).digest()
+
+
+@dataclass(frozen=True, eq=False)
+class LearningStep:
+    """What a pattern has led to: its report, and the table from now on, None for the same."""
+
+    report: PatternReport
+    table: LocalizationTable | None
+
+
+class LearnedTable:
+    """A table in service, corrected by what its plate shows.
+
+    table: of the rig as known when service began, never changed; file: where what is learned is
+    kept, None for nowhere.
+    """
+
+    def __init__(
+        self, table: LocalizationTable, known: PlateEstimate, *, file: Path | None = None
+    ) -> None:
+        self._table, self._file = table, file
+        self.live = LivePlate(known)
+        self.current = table
+        """The table as corrected so far."""
+
+    @classmethod
+    def resumed(cls, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> Self:
+        """A table with what was learned of it before, if its file is there.
+
+        Raises InputError for another kind of file, OtherPlate for one of another table or of other
+        parameters.
+        """
+        if not file.exists():
+            return cls(table, known, file=file)
+        learned = load_learned(file, table=table.fingerprint)
+        space = known.model.space
+        if learned.names != space.names or learned.base != known.before.fingerprint:
+            raise OtherPlate(
+                f"{file}: parameters must be those of this rig and its sensors; remove the file to "
+                "learn anew"
+            )
+        known = replace(known, state=learned.state, time=None, change=learned.change)
+        resumed = cls(table, known, file=file)
+        resumed.current = resumed._followed()
+        return resumed
+
+    @property
+    def change(self) -> str:
+        """How the plate has changed in a way that its parameters do not follow, or nothing."""
+        return self.live.known.change
+
+    def take(self, pattern: SettledPattern) -> LearningStep:
+        """Take a settled pattern, and correct the table by it.
+
+        Raises InputError or another ValueError for a pattern that leads to no plate that a table
+        can follow; the state then is that before, and what was suspect of it is forgotten.
+        """
+        if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
+            raise InputError("readings must be finite and not all 0, got others")
+        before = self.live.known
+        try:
+            report = self.live.take(pattern)
+            state, change = self.live.known.state, self.live.known.change
+            if not np.isfinite(state.x).all() or not np.isfinite(state.covariance).all():
+                raise InputError("parameters must be finite after a pattern, got others")
+            if state is before.state and bool(change) == bool(before.change):
+                return LearningStep(report, None)
+            self.current = self._followed()
+        except Exception:
+            self.live = LivePlate(before)
+            raise
+        return LearningStep(report, self.current)
+
+    def _followed(self) -> LocalizationTable:
+        """The table for the plate as it is known now."""
+        return table_following(
+            self._table, self.cautious_rig if self.change else self.live.known.rig
+        )
+
+    def save(self) -> None:
+        """Write what was learned, atomically, and whether the plate has changed since."""
+        if self._file is None:
+            return
+        known = self.live.known
+        learned = LearnedPlate(
+            self._table.fingerprint,
+            known.before.fingerprint,
+            known.model.space.names,
+            known.state,
+            known.change,
+        )
+        save_learned(learned, self._file)
+
+    @property
+    def cautious_rig(self) -> Rig:
+        """The rig as last known, with the errors of a plate that was not measured."""
+        rig = self.live.known.rig
+        return replace(rig, uncertainty=widest(rig.uncertainty))

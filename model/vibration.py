@@ -33,8 +33,7 @@ from model.fem import RIGID_BODY_MODES, Mesh, assemble, simply_supported_modes
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted
-from model.reduction.free_modes import SpectralModes
-from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.reduction.free_plate import FreePlate, SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.meshes import mesh_of
 from model.rig.rig import Rig

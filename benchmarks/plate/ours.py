@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from benchmarks.plate.problem import DAMPING, STIFFNESS, STROKE, Case
 from model.arrays import ComplexArray, FloatArray
-from model.reduction import truncation
+from model.reduction import free_plate
 from model.reduction.free_plate import solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral import functions
@@ -48,7 +48,7 @@ def eras_at(case: Case, shares: FloatArray) -> list[Era]:
 
 def forget() -> None:
     """Forget what is kept from one plate to the next: integrals of one dimension, weights."""
-    for module in (functions, truncation):
+    for module in (functions, free_plate):
         for kept in vars(module).values():
             if hasattr(kept, "cache_clear"):
                 kept.cache_clear()

@@ -23,10 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.fem import Mesh, element_slopes
 from model.finger import Grid
-from model.reduction.free_modes import FreeModes
-from model.reduction.free_plate import TERMS, FreePlate
-from model.reduction.place_slopes import place_slopes
-from model.reduction.reduced_plate import ReducedPlate, reduce_free_plate
+from model.reduction.free_plate import TERMS, FreeModes, FreePlate
+from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
 from model.spectral.shape_stiffness import stiffness_slopes

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from model.config.document import ConfigError
-from model.reduction.free_modes import SpectralModes
-from model.reduction.free_plate import solve_free_plate
+from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_free_plate, reduce_plate
 from model.rig.file import example_rig_path, load_rig, parse_rig
 from model.rig.rig import Rig

@@ -8,9 +8,13 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.fem import ELEMENTS, Mesh, assemble
-from model.reduction.place_slopes import place_slopes
-from model.reduction.reduced_plate import SupportedModes, reduce_plate, supported_modes
-from model.reduction.truncation import truncation_weights
+from model.reduction.free_plate import truncation_weights
+from model.reduction.reduced_plate import (
+    SupportedModes,
+    place_slopes,
+    reduce_plate,
+    supported_modes,
+)
 from model.rig.rig import Rig
 from model.structure.attachments import Era, damping_from_ratio, footprints_of
 from model.structure.plate import Plate

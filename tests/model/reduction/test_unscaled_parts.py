@@ -13,7 +13,7 @@ from model.fem import Mesh, PlateMatrices, assemble
 from model.finger import Grid
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.parameters import space_of
-from model.reduction import free_modes
+from model.reduction import free_plate
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig
 from model.rig.uncertainty import Uncertainty
@@ -50,7 +50,7 @@ def assemble_framed(plate: Plate, mesh: Mesh) -> PlateMatrices:
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
     """The paper's rig with a frame, in finite elements."""
-    monkeypatch.setattr(free_modes, "assemble", assemble_framed)
+    monkeypatch.setattr(free_plate, "assemble", assemble_framed)
     plain = make_paper_rig(24, 18)
     own = {each.name: getattr(plain.plate, each.name) for each in fields(plain.plate)}
     return replace(plain, plate=Framed(**own, frame_mass=FRAME))

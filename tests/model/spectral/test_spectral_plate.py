@@ -10,8 +10,7 @@ from scipy import linalg
 from long_form import in_turn
 from model.errors import InputError
 from model.fem import Q5, Mesh
-from model.reduction.free_modes import SpectralModes
-from model.reduction.free_plate import solve_free_plate
+from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.rig.meshes import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.functions import CLASSES

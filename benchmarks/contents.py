@@ -65,7 +65,7 @@ def main() -> None:
     import numpy as np
 
     from benchmarks.promise.cases import IDENTIFIED
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.table.build import build_table
 
     sets = [(k, options.fingers - k) for k in range(1, 5)] if options.fingers else SETS

@@ -82,7 +82,7 @@ def _line(row: Row, sets: int) -> str:
     from benchmarks.identification.plates import FREQUENCIES
     from model.answer.plan import query
     from model.answer.stimulus import Placement
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.table.build import build_table
 
     rig = load_rig(RIG.parent / f"{row.rig}.yaml")

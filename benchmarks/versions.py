@@ -64,8 +64,8 @@ def _tables() -> "Iterator[tuple[str, str, Rig, LocalizationTable]]":
     """Names of plates, their uncertainty in words, rigs with it, and their tables."""
     import numpy as np
 
-    from model.rig.file import load_rig
-    from model.rig.uncertainty import Uncertainty
+    from model.rig.rig import Uncertainty
+    from model.rig.rig_file import load_rig
     from model.table.build import build_table
 
     known = replace(Uncertainty.none(), gain=0.01, phase_deg=1.0)

@@ -43,12 +43,12 @@ from model.design.run import RankedLayout as RankedLayout
 from model.errors import InputError as InputError
 from model.finger import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes
-from model.rig.file import example_rig_path as example_rig_path
-from model.rig.file import load_rig as load_rig
-from model.rig.from_keys import rig as rig
-from model.rig.from_keys import save_rig as save_rig
 from model.rig.rig import Rig as Rig
-from model.rig.uncertainty import Uncertainty as Uncertainty
+from model.rig.rig import Uncertainty as Uncertainty
+from model.rig.rig_file import example_rig_path as example_rig_path
+from model.rig.rig_file import load_rig as load_rig
+from model.rig.rig_writing import rig as rig
+from model.rig.rig_writing import save_rig as save_rig
 from model.structure.attachments import Fingertip as Fingertip
 from model.study.contrast_map import ContrastMap as ContrastMap
 from model.table.file import load_table as load_table

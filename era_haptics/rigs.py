@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from model.rig.era_section import EraSection
-from model.rig.exciter_section import ExciterSection
-from model.rig.from_keys import checked_keys
+from model.rig.actuator_keys import EraSection, ExciterSection
+from model.rig.rig_writing import checked_keys
 from model.rig.sections import PlateSection
 
 

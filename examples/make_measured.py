@@ -18,8 +18,8 @@ import numpy as np
 from model.arrays import FloatArray
 from model.calibration.responses import Responses, write_responses_csv, write_responses_uff
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Term

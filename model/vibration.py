@@ -35,8 +35,8 @@ from model.processes import Progress, unseen
 from model.quantities import counted
 from model.reduction.free_plate import FreePlate, SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
-from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.rig.rig_file import mesh_of
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import PointLoad, Source, footprints_of

@@ -121,7 +121,7 @@ def sim(
 
     with exit_on_signal():
         from model.config.fields import parse_point
-        from model.rig.file import load_rig
+        from model.rig.rig_file import load_rig
         from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
         from sim.faults.fault_window import FaultFile, load_faults
         from sim.firmware.processes import find_firmware

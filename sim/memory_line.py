@@ -21,8 +21,8 @@ from drivers.urls import AmplifierUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.serial_line.host import SerialWire
 from model.errors import InputError
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time

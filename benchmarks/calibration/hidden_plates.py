@@ -25,8 +25,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.calibration.fit import project_gains, row_rms, sensed_plate
 from model.calibration.responses import Responses, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.structure.attachments import Era, PointLoad
 
 MESH = (6, 5)  # within 0.1 % of converged, with strips

@@ -21,8 +21,8 @@ from model.calibration.calibrate import calibrate
 from model.calibration.responses import Responses, read_measured, responses_of
 from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 _CHUNK = 20  # plates
 _NORMAL = 1.645  # standard errors either side: 90 %

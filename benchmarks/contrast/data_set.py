@@ -13,8 +13,8 @@ from pathlib import Path
 from model.answer.stimulus import Placement
 from model.arrays import Point
 from model.config.document import parse_document
-from model.rig.file import rig_of
 from model.rig.rig import Rig
+from model.rig.rig_file import rig_of
 
 VERSION = 1
 CHECKSUM = "ba4469e87f93685903c0d2095d9dc62f2ae3a56c617015744030eaefa7fc4ada"

@@ -32,7 +32,7 @@ from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.study.exact_plates import Plates, accelerations_on, draw_plates, touched
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips

@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.desk.errors import Error
 from benchmarks.desk.session import Desk
 from benchmarks.desk_plate.truth import Actuator
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 _AT_BOLT = 5e-3  # m; an additional mass nearer than that is told from the bolt by nothing
 

@@ -79,7 +79,7 @@ def desk_plate(
     from benchmarks.desk_plate.sensing import Converters
     from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
     from model.calibration.responses import read_sensors
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from sim.desk.libjack import JackClient
 
     rig = load_rig(rig_file)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.rig.meshes import parse_mesh
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
 

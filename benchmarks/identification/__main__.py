@@ -38,7 +38,7 @@ def main() -> None:
     from benchmarks.identification.hidden import FAMILY, draw
     from benchmarks.identification.plates import FREQUENCIES, outcome
     from benchmarks.identification.tables import PAGE, contrasts, fits, kept_or_refused, promises
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
 
     rig = load_rig(RIG)
     written = {loaded: table_of(rig, FREQUENCIES, loaded=loaded) for loaded in (False, True)}

@@ -11,8 +11,7 @@ from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import Complex64Array
 from model.ensemble.attached_plate import AttachedPlate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import LOSS_FREQUENCY
 from model.table.build import build_table

@@ -21,8 +21,8 @@ from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.calibration.responses import Responses
 from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 FREQUENCIES = np.linspace(45.0, 495.0, 16)
 SENSORS = np.array(

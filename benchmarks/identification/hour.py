@@ -32,7 +32,7 @@ from model.identification.identify import identify
 from model.identification.learned_plate import LivePlate, PatternReport, PlateEstimate
 from model.identification.least_squares import Measurement
 from model.identification.settled_patterns import SettledPattern
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from model.structure.attachments import Fingertip
 from model.table.following import table_following
 from model.table.table import LocalizationTable

@@ -25,8 +25,8 @@ from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses
 from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 TONES = np.arange(91.0, 300.0, 20.0)
 CONTACTS = (0.1, 0.2, 0.3, 0.4, 0.5)

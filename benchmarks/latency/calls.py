@@ -21,8 +21,8 @@ from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.wires.serial_line.host import SerialWire
 from model.answer.answer_report import Timing
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.build import cached_table
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier

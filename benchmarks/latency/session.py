@@ -20,8 +20,8 @@ from controller.api.async_client import AsyncClient
 from controller.api.client_protocol import Unreachable
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DAEMON = (sys.executable, "-m", "controller.cli", "daemon")

@@ -9,8 +9,8 @@ from benchmarks.layers.elasticity import strip_frequencies, wave_number
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
 from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of

@@ -13,8 +13,8 @@ from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from drivers.protocol.table import QUANTITIES
 from model.finger import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
-from model.rig.file import load_rig
 from model.rig.rig import Channel, Rig
+from model.rig.rig_file import load_rig
 from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.transients.base_motion import raised_cosine

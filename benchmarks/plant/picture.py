@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.transients.base_motion import raised_cosine
 from sim.plant.plant import Plant

@@ -6,7 +6,7 @@ from benchmarks.plate.problem import DAMPING, STIFFNESS, STROKE, Case
 from model.arrays import ComplexArray, FloatArray
 from model.reduction import free_plate
 from model.reduction.free_plate import solve_free_plate
-from model.rig.meshes import mesh_of
+from model.rig.rig_file import mesh_of
 from model.spectral import functions
 from model.structure.attachments import Era
 

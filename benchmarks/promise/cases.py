@@ -9,9 +9,8 @@ import numpy as np
 
 from model.answer.plan import answer
 from model.answer.stimulus import ANY_BAND, Finger, Stimulus
-from model.rig.file import load_rig
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 

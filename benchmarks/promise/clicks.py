@@ -45,7 +45,7 @@ def main() -> None:
     import numpy as np
 
     from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.table.build import build_table
 
     print("| rig | uncertainty | promised [dB] | kept | beyond nine of ten [dB] |")

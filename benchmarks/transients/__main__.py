@@ -30,7 +30,7 @@ def main() -> None:
     from benchmarks.transients.bench import Bench, print_columns
     from benchmarks.transients.cases import find_cases
     from benchmarks.transients.picture import draw
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
 
     rng = np.random.default_rng(options.seed)
     rig = load_rig(RIG)

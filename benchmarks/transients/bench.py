@@ -21,8 +21,7 @@ from model.answer.stimulus import Placement
 from model.arrays import ComplexArray
 from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped

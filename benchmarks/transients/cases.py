@@ -15,8 +15,7 @@ from model.finger import (
     fingertip_points,
 )
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.transients.base_motion import Envelopes
 from model.vibration import Excitation, Tone
 

@@ -65,7 +65,7 @@ class Board:
     @property
     def rig(self) -> "Rig":
         """Its rig, from where magnets stay within their excursion; raises ConfigError."""
-        from model.rig.file import load_rig
+        from model.rig.rig_file import load_rig
         from model.transients.excursions import excursions_of
 
         rig = load_rig(ROOT / "examples" / "weekend" / "rig.yaml")

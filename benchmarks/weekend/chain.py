@@ -36,9 +36,8 @@ from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.file import load_rig
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import load_rig
 from model.structure.attachments import PointLoad, fingertip_loads
 from model.structure.exciter import Exciter
 from model.table.build import build_table

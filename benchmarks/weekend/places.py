@@ -24,7 +24,7 @@ from model.calibration.calibrate import calibrate
 from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 
 PAGE = ROOT / "docs" / "how-to" / "calibration.md"
 FREQUENCIES = np.arange(95.0, 296.0, 10.0)

@@ -50,8 +50,8 @@ from controller.api.methods import StatusResult
 from model.arrays import FloatArray
 from model.calibration.responses import WiredSensor
 from model.finger import fingertips_on
-from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
+from model.rig.rig_writing import rewritten_text
 
 RESULTS = ROOT / "out" / "weekend_through_jack.json"
 MESH = "13x11 Legendre"

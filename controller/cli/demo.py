@@ -66,7 +66,7 @@ def demo(
     from controller.demo.pictures import write_pictures
     from controller.demo.run import WIRES, Scene, check_page, example_scenes, run_demo, run_live
     from controller.sources.capture import read_capture
-    from model.rig.file import example_rig_path, load_rig
+    from model.rig.rig_file import example_rig_path, load_rig
     from model.table.build import cached_table
 
     if wire not in WIRES:

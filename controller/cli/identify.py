@@ -238,7 +238,7 @@ def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
     from controller.daemon.config import daemon_config_of, file_of, is_daemon_document
     from controller.process.socket_lock import SocketLock
     from model.config.document import read_document
-    from model.rig.file import rig_of
+    from model.rig.rig_file import rig_of
 
     document = read_document(path)
     if not is_daemon_document(document):

@@ -135,7 +135,7 @@ def _measured(
 def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Responses]":
     """Read what was measured from a file."""
     from model.calibration.responses import read_measured, responses_of
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
     return rig, responses_of(read_measured(measured), rig)

@@ -31,9 +31,9 @@ from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from model.identification.learned_plate import was_learned
-from model.rig.file import rig_of
-from model.rig.kind import clock_costs, gain_notes, whole_url
 from model.rig.rig import Rig
+from model.rig.rig_file import rig_of
+from model.rig.rig_summary import clock_costs, gain_notes, whole_url
 from model.structure.support import check_supported
 
 API_SOURCES = "api"

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, Strict
 from model.config.fields import LENGTH, LEVEL, Quantity, Section
 from model.drive_modes import DRIVE_MODES
 from model.finger import STRONG_DB_SL
-from model.rig.key_types import Identifier
+from model.rig.actuator_keys import Identifier
 
 MAX_LAYOUTS = 64
 

@@ -29,8 +29,8 @@ from controller.sources.capture import RecordedDatagram, read_capture, replay_ca
 from controller.sources.tuio import RESTART_PAUSE
 from drivers.errors import LinkError
 from model.errors import InputError
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from registry import threads

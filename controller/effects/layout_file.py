@@ -21,7 +21,7 @@ from model.config.fields import LEVEL, Quantity, Section, ShapedSection, Validat
 from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
-from model.rig.key_types import Identifier
+from model.rig.actuator_keys import Identifier
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean
 

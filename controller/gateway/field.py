@@ -21,8 +21,8 @@ from controller.api.schema import PlayedTone
 from model.arrays import ComplexArray, lattice
 from model.finger import detection_threshold
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import parse_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 
 _COLUMNS = 64  # grid points along the longer side; several per bending wavelength
 _MAX_FREQUENCIES = 64  # in the cache

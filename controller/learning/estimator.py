@@ -33,8 +33,7 @@ from model.errors import InputError
 from model.files.array_file import remove_partial
 from model.identification.learned_plate import LearnedTable, PlateEstimate
 from model.identification.settled_patterns import SettledPattern
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.table.following import table_following
 from model.table.table import LocalizationTable
 

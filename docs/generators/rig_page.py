@@ -6,8 +6,7 @@ from functools import partial
 from key_tables import key_table
 from model.config.fields import Section
 from model.rig import sections
-from model.rig.era_section import EraSection
-from model.rig.exciter_section import ExciterSection
+from model.rig.actuator_keys import EraSection, ExciterSection
 from model.structure.exciter_types import EXCITER_TYPES
 from model.structure.feet_and_frames import FEET, FOOT_LOSS
 from model.structure.materials import KNOWN_MATERIALS

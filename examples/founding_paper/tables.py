@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from model.fem import Mesh
 from model.figures.paper import SWEEP, PaperFigure, pair_map, paper_figures, with_stiffness
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import load_rig
-from model.rig.layouts import diagonal_pair
-from model.rig.rig import Rig
+from model.rig.rig import Rig, diagonal_pair
+from model.rig.rig_file import load_rig
 from model.structure.plate import Plate
 from model.vibration import NULL_SHARE, G, find_nulls, natural_modes
 

@@ -40,8 +40,7 @@ from model.identification.parameters import KINDS, MASS_CELLS
 from model.identification.stages import SHARE, relative_rms
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain
 
 MAX_FIT_ERROR = 0.25

@@ -63,7 +63,7 @@ def write_fitted_rig(
     rigs: before and after; comment: a heading as in _HEADING, and lines of the report.
     """
     from model.files.array_file import whole_or_nothing
-    from model.rig.rewritten import rewritten_text
+    from model.rig.rig_writing import rewritten_text
 
     text = rewritten_text(document, *rigs, comment="\n  ".join(comment), mesh=mesh)
     with whole_or_nothing(output) as stream:
@@ -139,7 +139,7 @@ def calibrate(
     from model.calibration.responses import LEAST_SENSORS, read_measured, responses_of
     from model.config.document import read_document
     from model.diagnosis.verdict import check_consistency
-    from model.rig.file import rig_of
+    from model.rig.rig_file import rig_of
 
     check_rig_output(output, rig_file, measured_file)
     if picture is not None:

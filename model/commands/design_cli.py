@@ -89,7 +89,7 @@ def design(
     from model.config.document import read_document
     from model.design.outcome import summary, write_design
     from model.design.request import design as find
-    from model.rig.file import rig_of
+    from model.rig.rig_file import rig_of
 
     document = read_document(rig_file)
     rig = rig_of(document, mesh=mesh)

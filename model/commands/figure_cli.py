@@ -34,7 +34,7 @@ def figure(
     from model.figures import save_figure
     from model.figures.paper import paper_figures
     from model.files.csv_file import write_columns
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
     output.mkdir(parents=True, exist_ok=True)

@@ -53,7 +53,7 @@ def modes(
 
     The plate is undamped; rigid modes of a free plate are left out.
     """
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.vibration import natural_modes
 
     rig = load_rig(rig_file, mesh=mesh)
@@ -108,7 +108,7 @@ def plate_map(
     import numpy as np
 
     from model.commands.options import beyond_limits, parse_drives
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.structure.support import support_problem
     from model.vibration import G
     from model.vibration import plate_map as solve
@@ -173,7 +173,7 @@ def convergence(
 
     Print errors of natural frequencies and of responses.
     """
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.vibration import (
         FOOT,
         MOVED,
@@ -302,8 +302,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     Reached is by the board of the file; one whose parts deviate reaches more or less.
     """
     from model.quantities import in_display_unit
-    from model.rig.file import load_rig
-    from model.rig.plate_summary import FURTHER, plate_summary
+    from model.rig.rig_file import load_rig
+    from model.rig.rig_summary import FURTHER, plate_summary
 
     rig = load_rig(rig_file)
     summary = plate_summary(rig)
@@ -493,7 +493,7 @@ def template(
     """
     from model.calibration.responses import read_places
     from model.figures import Template, write_template
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
 
     check_picture(output)
     rig = load_rig(rig_file)

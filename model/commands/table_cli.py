@@ -466,7 +466,7 @@ def build(
     from model.compiled.kernels import why_slow
     from model.drive_modes import checked_mode
     from model.finger import Grid
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.table.build import TableProblem, solve_table
     from model.table.file import ZIP, save_table
     from model.table.table import default_drive_frequencies

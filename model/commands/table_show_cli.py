@@ -122,7 +122,7 @@ def verify(
 def _verify_by_solving(
     table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
 ) -> None:
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.study.verify import verify_table
     from model.table.file import load_table
 
@@ -268,7 +268,7 @@ def _verify_by_measuring(
     as_json: bool,
 ) -> None:
     """Measure promises of a table; exit with 1 where too few are kept."""
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from model.study.table_check import check_by_measuring, plain_rig
     from model.table.file import load_table
 

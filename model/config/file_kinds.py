@@ -53,7 +53,7 @@ class ConfigKind:
 KINDS = {
     "daemon": "controller.daemon.config:DAEMON",
     "layout": "controller.effects.layout_file:LAYOUT",
-    DEFAULT_KIND: "model.rig.kind:RIG",
+    DEFAULT_KIND: "model.rig.rig_summary:RIG",
 }
 """Where each is, by name: this package does not import those above it."""
 

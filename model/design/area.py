@@ -17,7 +17,7 @@ from model.arrays import FloatArray
 from model.config.document import read_bytes, read_document
 from model.config.fields import Polygon, PolygonSection, Section, Validation
 from model.errors import InputError
-from model.rig.key_types import Identifier
+from model.rig.actuator_keys import Identifier
 from model.structure.plate import Plate
 
 EDGE, ANYWHERE = "edge", "anywhere"

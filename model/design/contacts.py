@@ -25,7 +25,7 @@ from model.config.fields import (
 )
 from model.errors import InputError
 from model.finger import MAX_CONTACTS, MAX_CONTENTS
-from model.rig.key_types import Identifier
+from model.rig.actuator_keys import Identifier
 from model.structure.plate import Plate
 
 DEFAULT_APART = 0.05

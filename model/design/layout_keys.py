@@ -7,7 +7,7 @@ from typing import Any
 from model.arrays import FloatArray
 from model.config.fields import section_by_kind
 from model.design.problem import DesignProblem
-from model.rig.actuators import KINDS
+from model.rig.actuator_keys import KINDS
 from model.rig.rig import Channel, Rig
 
 MAX_CHANNELS = 4

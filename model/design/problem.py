@@ -20,8 +20,7 @@ from model.config.fields import PointSection, Section, Validation
 from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
 from model.errors import InputError
-from model.rig.layouts import named_layouts
-from model.rig.rig import Rig
+from model.rig.rig import Rig, named_layouts
 from model.structure.actuators import Actuator
 from model.structure.support import rigid_body_frequencies, static_loads
 from model.table.table import default_drive_frequencies

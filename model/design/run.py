@@ -22,9 +22,9 @@ from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from model.processes import Progress, on_processes, unseen
-from model.rig.file import rig_of
-from model.rig.from_keys import stated
 from model.rig.rig import Rig
+from model.rig.rig_file import rig_of
+from model.rig.rig_writing import stated
 from model.structure.actuators import Actuator
 from model.structure.support import support_problem
 from model.table.build import build_table

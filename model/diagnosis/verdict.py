@@ -69,9 +69,8 @@ from model.diagnosis.plate_match import (
     plate_changes,
 )
 from model.errors import InputError
-from model.rig.exciter_checks import exciters_of, sections_of
-from model.rig.rig import Channel, Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
+from model.rig.rig_summary import exciters_of, sections_of
 from model.structure.attachments import Era, PointLoad
 from model.study.exact_plates import draw_plates, felt_on
 from model.study.random_contacts import random_contacts

@@ -44,7 +44,7 @@ from statistics import NormalDist
 import numpy as np
 
 from model.arrays import Complex64Array, ComplexArray, Float32Array, FloatArray
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import (
     Fingertip,
     PointLoad,

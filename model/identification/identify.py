@@ -35,9 +35,8 @@ from model.identification.stages import (
 from model.processes import Progress, unseen
 from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.meshes import mesh_of
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import mesh_of
 from model.spectral.mesh import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable
 from model.study.exact_plates import draw_plates, felt_on

@@ -46,8 +46,7 @@ from model.identification.settled_patterns import (
     explain,
     update,
 )
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.modal_elasticity import lowest_elastic
 from model.table.following import table_following
 from model.table.table import LocalizationTable

@@ -25,8 +25,7 @@ from model.fem import Mesh, element_slopes
 from model.finger import Grid
 from model.reduction.free_plate import TERMS, FreeModes, FreePlate
 from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.spectral.shape_stiffness import stiffness_slopes
 from model.structure.actuators import Actuator
 from model.structure.attachments import Gain, PointLoad, damping_from_ratio, footprints_of

@@ -55,8 +55,7 @@ from model.identification.least_squares import (
 from model.identification.parameters import KINDS, MODE_SHIFTS, Space, inwards, plate_with, space_of
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.spectral.shape_stiffness import grain_slopes
 from model.structure.modal_elasticity import lowest_elastic
 from model.structure.plate import Plate

@@ -1,29 +1,160 @@
-"""A rig: a plate, its ERAs, the amplifier channel of each ERA; and what else must be the same."""
+"""A rig: a plate, its ERAs, the amplifier channel of each ERA; and what else must be the same.
+
+How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it.
+
+Layouts of ERAs by name.
+
+The drawings of the paper's layouts (its Figures 8 and 9) are not available, so these are our own.
+Places are fractions of the plate's length and width, so that a layout fits every plate.
+"""
 
 import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import combinations
 from numbers import Real
 from pkgutil import resolve_name
 from typing import Any
 
+import numpy as np
+
+from model.arrays import FloatArray, best_of
 from model.config.document import Document
-from model.errors import InputError
+from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
-from model.rig.uncertainty import BOUNDS, Uncertainty
 from model.spectral.mesh import PlateMesh
-from model.structure.actuators import Actuator
-from model.structure.attachments import Fingertip, PointLoad, feet_of
+from model.structure.actuators import Actuator, OneKind
+from model.structure.attachments import Fingertip, PointLoad, Source, feet_of
 from model.structure.feet_and_frames import FEET_DEVIATE
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.plugins import did_you_mean
 
-_REPLACED = "model.rig.from_keys:replaced"
+BOUNDS = {
+    "gain": (0.0, 0.5),
+    "phase_deg": (0.0, 60.0),
+    "thickness": (0.0, 0.03),
+    "stiffness": (0.0, 0.5),
+    "damping": (1.0, 4.0),
+    "fingertip": (0.0, 1.0),
+    "common_gain": (0.0, 0.5),
+    "field": (0.0, 0.5),
+    "modulus": (0.0, 0.1),
+    "place": (0.0, 0.01),
+    "harmonic": (0.0, 0.2),
+    "supports": (0.0, 0.5),
+}
+"""What a rig may state of each parameter: exactly known, and the most."""
+
+_RELATIVE = (
+    "gain",
+    "thickness",
+    "modulus",
+    "stiffness",
+    "supports",
+    "common_gain",
+    "field",
+    "harmonic",
+)
+
+MAX_UNCERTAINTY = 1000.0
+"""Of any of them, also in a study of plates beyond BOUNDS."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """One standard deviation of each parameter; independent of each other.
+
+    gain: of each channel, relative; phase_deg: of each channel [degrees]; thickness: of the plate,
+    relative; stiffness: of each ERA, relative; damping: a factor, of the ERAs' damping and of the
+    plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
+    of all channels together, relative; field: of what an ERA alone does at a finger, relative to
+    its root mean square over the plate, beside all others; modulus: of the plate's modulus of
+    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
+    [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
+    amplitude, of any phase; supports: of the logarithm of the stiffness of each foot, 0.3 of a rig
+    file with feet by default. The defaults are those of a plate as built from its drawing and not
+    measured.
+    """
+
+    gain: float = 0.05
+    phase_deg: float = 5.0
+    thickness: float = 0.02
+    stiffness: float = 0.1
+    damping: float = 1.5
+    fingertip: float = 0.5
+    common_gain: float = 0.0
+    field: float = 0.0
+    modulus: float = 0.02
+    place: float = 0.001
+    harmonic: float = 0.01
+    supports: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not finite, negative ones, and a factor below 1."""
+        for key, (exact, _) in BOUNDS.items():
+            expect_between(getattr(self, key), exact, MAX_UNCERTAINTY, what=f"uncertainty: {key}")
+
+    @classmethod
+    def none(cls) -> "Uncertainty":
+        """A rig whose every parameter is known exactly."""
+        return cls(**{key: exact for key, (exact, _) in BOUNDS.items()})
+
+    @classmethod
+    def clipped(cls, **estimates: float) -> "Uncertainty":
+        """An uncertainty by estimates, each brought within BOUNDS."""
+        return cls(
+            **{
+                key: min(max(value, BOUNDS[key][0]), BOUNDS[key][1])
+                for key, value in estimates.items()
+            }
+        )
+
+    def __str__(self) -> str:
+        """Its terms that are not none, as 'gain 5 %, phase 5°, damping x 1.5'."""
+        percents = [
+            f"{key.replace('_', ' ')} {100 * getattr(self, key):.3g} %"
+            for key in _RELATIVE
+            if getattr(self, key)
+        ]
+        others = [
+            f"phase {self.phase_deg:.3g}°" if self.phase_deg else "",
+            f"damping x {self.damping:.4g}" if self.damping > 1 else "",
+            f"fingertip x {math.exp(self.fingertip):.2g}" if self.fingertip else "",
+            f"place {1e3 * self.place:.3g} mm" if self.place else "",
+        ]
+        return ", ".join([*percents, *filter(None, others)]) or "none"
+
+    @property
+    def gain_variance(self) -> float:
+        """Mean square of a channel's relative error, phase included: (1 + g²) exp(p²) - 1.
+
+        Relative to the mean of all, whose amplitude is smaller by exp(-p² / 2); p in radians.
+        """
+        return (1 + self.gain**2) * math.exp(math.radians(self.phase_deg) ** 2) - 1
+
+    @property
+    def elasticity(self) -> float:
+        """Of the modulus, relative: it is known where the thickness is, as a plate that stays."""
+        return self.modulus if self.thickness > 0 else 0.0
+
+    @property
+    def frequency(self) -> float:
+        """Of the plate's natural frequencies, relative: as the thickness and the modulus' root."""
+        return math.hypot(self.thickness, self.elasticity / 2)
+
+    @staticmethod
+    def of_frequency(std: float) -> dict[str, float]:
+        """Thickness and modulus, as uncertain as each other, of that of natural frequencies."""
+        each = std / math.hypot(1.0, 0.5)
+        return {"thickness": each, "modulus": each}
+
+
+_REPLACED = "model.rig.rig_writing:replaced"
 """By name: it makes rigs, and so needs this file."""
 
 # m; two bolts cannot be closer
@@ -258,3 +389,88 @@ def _differing(key: str, own: Any, rigs: Any) -> Iterator[str]:
 def canonical_json(value: object) -> str:
     """JSON of plain data with sorted keys, the same for 1 and 1.0, and for -0.0 and 0.0."""
     return json.dumps(_plain(value), sort_keys=True, separators=(",", ":"))
+
+
+Place = tuple[float, float]
+"""Place of an ERA as fractions of the length and the width, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class EraLayout:
+    """Places of the ERAs of a rig."""
+
+    name: str
+    places: tuple[Place, ...]
+
+    def positions(self, plate: Plate) -> FloatArray:
+        """Positions on a plate [m], (eras, 2)."""
+        return np.array(self.places) * [plate.length, plate.width]
+
+
+FOUR_ERA_LAYOUTS = (
+    EraLayout("corners", ((0, 0), (1, 0), (1, 1), (0, 1))),
+    EraLayout("mid-edges", ((1 / 2, 0), (1, 1 / 2), (1 / 2, 1), (0, 1 / 2))),
+    EraLayout("long edges", ((1 / 4, 0), (3 / 4, 0), (3 / 4, 1), (1 / 4, 1))),
+    EraLayout("short edges", ((0, 1 / 4), (1, 1 / 4), (1, 3 / 4), (0, 3 / 4))),
+    EraLayout("inset corners", ((1 / 6, 1 / 6), (5 / 6, 1 / 6), (5 / 6, 5 / 6), (1 / 6, 5 / 6))),
+    EraLayout("trapezoid", ((0, 0), (1, 0), (3 / 4, 1), (1 / 4, 1))),
+    EraLayout("diagonal", ((0, 0), (1 / 3, 1 / 3), (2 / 3, 2 / 3), (1, 1))),
+)
+"""Layouts of four ERAs; the first is that of the paper's Table 2."""
+
+_OTHERS = (
+    EraLayout("centre", ((1 / 2, 1 / 2),)),
+    EraLayout("opposite corners", ((0, 0), (1, 1))),
+    EraLayout("mid-short-edges", ((0, 1 / 2), (1, 1 / 2))),
+    EraLayout("triangle", ((0, 0), (1, 0), (1 / 2, 1))),
+    EraLayout("corners and centre", ((0, 0), (1, 0), (1, 1), (0, 1), (1 / 2, 1 / 2))),
+    EraLayout(
+        "corners and mid-long-edges", ((0, 0), (1 / 2, 0), (1, 0), (1, 1), (1 / 2, 1), (0, 1))
+    ),
+)
+
+
+def named_layouts(era_count: int) -> tuple[EraLayout, ...]:
+    """The named layouts with a number of ERAs."""
+    layouts = (*FOUR_ERA_LAYOUTS, *_OTHERS)
+    return tuple(layout for layout in layouts if len(layout.places) == era_count)
+
+
+def alike(era: OneKind, positions: FloatArray) -> tuple[OneKind, ...]:
+    """Copies of an ERA at positions [m] (n, 2), named E1, E2, ..."""
+    return tuple(
+        replace(era, name=f"E{number}", x=float(x), y=float(y))
+        for number, (x, y) in enumerate(positions, start=1)
+    )
+
+
+def edge_pair(eras: Sequence[Source]) -> tuple[int, int]:
+    """Two ERAs side by side along the plate's x axis: most alike in y, then furthest apart in x."""
+
+    def order(pair: tuple[int, int]) -> tuple[float, float]:
+        across, along = abs(_apart(eras, pair))[::-1]
+        return _rounded(across), -_rounded(along)
+
+    return min(_pairs(eras), key=order)
+
+
+def diagonal_pair(eras: Sequence[Source]) -> tuple[int, int]:
+    """The two ERAs that are furthest apart; the first of several such pairs."""
+    pairs = _pairs(eras)
+    return pairs[best_of([np.hypot(*_apart(eras, pair)) for pair in pairs])]
+
+
+def _pairs(eras: Sequence[Source]) -> list[tuple[int, int]]:
+    if len(eras) < 2:
+        raise InputError(f"ERAs of the rig must be at least two to drive a pair, got {len(eras)}")
+    return list(combinations(range(len(eras)), 2))
+
+
+def _apart(eras: Sequence[Source], pair: tuple[int, int]) -> FloatArray:
+    first, second = (eras[index] for index in pair)
+    return np.array([second.x - first.x, second.y - first.y])
+
+
+def _rounded(distance: float) -> float:
+    """A distance [m] without the rounding errors that would decide between equal pairs."""
+    return round(float(distance), 9)

@@ -35,10 +35,10 @@ from model.config.fields import (
     Section,
 )
 from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
-from model.rig.actuators import ActuatorOfAnyKind
-from model.rig.key_types import (
+from model.rig.actuator_keys import (
     MODES,
     MODULI,
+    ActuatorOfAnyKind,
     Foot,
     Frequency,
     GainRow,
@@ -51,7 +51,7 @@ from model.rig.key_types import (
     check_ascending,
     check_url,
 )
-from model.rig.uncertainty import BOUNDS, Uncertainty
+from model.rig.rig import BOUNDS, Uncertainty
 from model.structure.feet_and_frames import DEFAULT_POINTS, FootKind
 from model.structure.materials import KnownMaterial, known_material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond

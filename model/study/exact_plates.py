@@ -16,8 +16,7 @@ from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.attached_plate import AttachedPlate
 from model.ensemble.draws import over_fingertips
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import (
     FingertipLoad,
     attached_stiffness,

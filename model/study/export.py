@@ -17,7 +17,7 @@ from model.config.fields import Section, quantities
 from model.errors import InputError
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import write_rows
-from model.rig.actuators import KINDS
+from model.rig.actuator_keys import KINDS
 from model.rig.rig import PHYSICS
 from model.rig.sections import (
     AirGapSection,

@@ -20,8 +20,8 @@ from model.drive_modes import checked_mode
 from model.errors import InputError, expect, expect_path
 from model.files.array_file import UNREADABLE, begins_with, digest_of, read_arrays, write_arrays
 from model.finger import Grid, check_has_threshold
-from model.rig.meshes import parse_mesh
 from model.rig.rig import PHYSICS, Rig, differences
+from model.rig.rig_file import parse_mesh
 from model.table.raster import Raster
 from model.table.table import LocalizationTable
 from registry.wording import first_problem

@@ -44,8 +44,7 @@ from model.finger import (
     sensitivities,
 )
 from model.reduction.reduced_plate import ReducedPlate
-from model.rig.rig import fingerprint_of
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty, fingerprint_of
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import (

@@ -17,8 +17,8 @@ import numpy as np
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
-from model.rig.exciter_checks import Excursions, exciters_of
 from model.rig.rig import Rig
+from model.rig.rig_summary import Excursions, exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES

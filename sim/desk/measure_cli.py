@@ -107,7 +107,7 @@ def measure(
     from model.calibration.responses import are_places, read_sensors
     from model.config.fields import parse_frequencies
     from model.files.array_file import check_ending, check_place
-    from model.rig.file import load_rig
+    from model.rig.rig_file import load_rig
     from sim.desk.measuring.desk import Desk
     from sim.desk.measuring.measure import measure_at_once, open_desk
 

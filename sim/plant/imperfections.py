@@ -17,8 +17,8 @@ from drivers.protocol.table import CLOCK_TURN
 from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
-from model.rig.meshes import mesh_of
 from model.rig.rig import Channel, Rig
+from model.rig.rig_file import mesh_of
 from model.spectral.mesh import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import (

@@ -19,7 +19,7 @@ from model.calibration.responses import WiredSensor, read_measured, read_places,
 from model.design.area import area_of
 from model.errors import InputError
 from model.identification.learned_plate import load_learned
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.table.file import load_table
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.impedance_run import read_impedance

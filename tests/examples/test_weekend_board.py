@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.weekend.chain import BuiltBoard
 from controller.cli.main import run
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 
 FOLDER = Path(__file__).parents[2] / "examples" / "weekend"
 

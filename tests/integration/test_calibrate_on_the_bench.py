@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses import write_responses_csv
 from model.cli import app
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from perturbed_plate import FREQUENCIES, perturbed
 from sim.plant.accelerometer import Accelerometer
 

@@ -21,7 +21,7 @@ from controller.demo.run import Scene, layout_of_people
 from controller.sources.capture import read_capture
 from gateway_bench import wait_for
 from installed_program import ERA
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from patient_daemon import wait_long
 from tuio_messages import write_schedule
 from virtual_loop import run_virtual

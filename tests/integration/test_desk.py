@@ -15,7 +15,7 @@ from benchmarks.desk.session import BLOCK, EXAMPLES, PLATE, Desk, desk
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from model.calibration.responses import read_measured, responses_of
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 
 pytestmark = [
     pytest.mark.long,

@@ -26,8 +26,8 @@ from drivers.judge.watching.config import TimeLimits
 from drivers.opening import Lines
 from long_form import in_turn, shortly
 from model.fem import Mesh
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.vibration import Tone
 from registry import threads
 from registry.limits import GuardLimits

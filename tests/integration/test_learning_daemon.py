@@ -22,8 +22,8 @@ from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from daemon_bench import daemon_at, far_end, ready
 from model.identification.learned_plate import load_learned
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from registry import threads

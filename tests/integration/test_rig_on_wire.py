@@ -18,8 +18,8 @@ from drivers.errors import CommandError, LinkError
 from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses import write_responses_csv, write_responses_uff
 from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import SCALED
 from rig_files import write_rig
 from rig_on_wire import WIRES, far_side

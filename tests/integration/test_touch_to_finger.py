@@ -30,8 +30,8 @@ from model.finger import (
     mean_level_db_sl,
 )
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.build import build_table
 from model.table.table import LocalizationTable

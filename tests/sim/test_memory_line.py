@@ -13,8 +13,8 @@ from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.protocol.table import FAULTS
 from drivers.wires.serial_line.host import SerialWire
-from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
 from registry import threads
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import LIMITS, layer, make_bench

@@ -24,8 +24,8 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import STATES
 from era_haptics.lab.cli import app
 from model.errors import InputError
-from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from sim.far_ends.opening import Wire

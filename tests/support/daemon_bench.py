@@ -26,8 +26,8 @@ from controller.process.log import LogThread
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from plate_judge import PlateJudge
 from registry import threads

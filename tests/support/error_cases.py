@@ -31,7 +31,7 @@ from controller.cli.main import run
 from distorted_responses import DISTORTIONS, every
 from gateway_bench import real_daemon, wait_for
 from model.calibration.responses import read_measured, responses_of, write_responses_csv
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "errors.md"

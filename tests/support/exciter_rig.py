@@ -1,7 +1,7 @@
 """Boards on exciters: four of them, and foam at the corners."""
 
-from model.rig.file import parse_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 
 ACRYLIC = "{name: acrylic, E: 4.5 GPa, rho: 1190, nu: 0.37}"
 

@@ -15,7 +15,7 @@ from typing import Any
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 
 PATIENCE = 180  # s; for a loaded machine, not an expectation

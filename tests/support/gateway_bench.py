@@ -57,7 +57,7 @@ from controller.api.server import ApiServer
 from controller.api.topics import Hub, StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from installed_program import ERA
-from model.rig.file import parse_rig
+from model.rig.rig_file import parse_rig
 from model.table.file import save_table
 from model.table.table import LocalizationTable
 from rig_files import write_rig

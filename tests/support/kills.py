@@ -36,7 +36,7 @@ from daemon_process import (
     loudness,
     silent_from_of,
 )
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import WIRES, far_side
 from sim.far_ends.opening import Wire

@@ -3,7 +3,7 @@
 import asyncio
 
 from controller.demo.run import run_live
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from small_table import small_table
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from scipy.signal import cont2discrete
 
 from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
-from model.rig.exciter_checks import exciters_of
 from model.rig.rig import Rig
+from model.rig.rig_summary import exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import Motion
 from sim.plant.plant import Plant

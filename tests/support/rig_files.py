@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 
 
 def write_rig(path: Path, *changes: tuple[str, str], mesh: str = "16x12") -> Path:

@@ -17,8 +17,8 @@ from controller.play.intent import IntentSource
 from model.answer.answer_report import Timing
 from model.config.fields import Rectangle
 from model.finger import STRONG_DB_SL, Grid
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.build import TableProblem, solve_table
 from model.table.table import LocalizationTable
 from newest_contact import BuzzNewestContact

@@ -13,7 +13,7 @@ from model.commands.calibrate_cli import check_rig_output
 from model.commands.options import next_line
 from model.config.document import edited_text, read_document
 from model.files.array_file import whole_or_nothing
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from registry.plugins import did_you_mean
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, tone

@@ -33,7 +33,7 @@ from era_haptics.lab.cli import app
 from long_form import in_turn
 from model.config.fields import Circle, Rectangle
 from model.config.file_kinds import KINDS
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable

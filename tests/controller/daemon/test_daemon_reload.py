@@ -17,7 +17,7 @@ from controller.daemon.reload import config_change
 from controller.process.child import child_command
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from virtual_loop import in_virtual_time
 
 FREQUENCIES = np.arange(60.0, 301.0, 20.0)  # Hz; of a table

@@ -28,7 +28,7 @@ from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger import detection_threshold
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from registry import threads
 from sim.faults.fault_window import FaultWindow
 from virtual_loop import in_virtual_time

@@ -26,8 +26,8 @@ from model.errors import InputError
 from model.identification.forward import Sensor
 from model.identification.identify import identify
 from model.identification.least_squares import MeasuredPlate
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers

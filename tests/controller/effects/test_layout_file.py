@@ -11,7 +11,7 @@ from controller.effects.layout_file import LayoutSection, RegionSection, load_la
 from key_tables import key_rows
 from model.config.document import ConfigError
 from model.config.fields import CircleSection, Rectangle, RectangleSection
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 EXAMPLE = Path(__file__).parents[3] / "controller" / "effects" / "example.yaml"
 

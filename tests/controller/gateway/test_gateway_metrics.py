@@ -30,7 +30,7 @@ from controller.gateway.settings import Settings
 from daemon_bench import PATIENCE, ready_daemon, until
 from gateway_bench import ScriptedDaemon
 from model.arrays import ComplexArray
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 
 def scraped(status: StatusResult | None) -> dict[tuple[str, str], float]:

@@ -18,8 +18,8 @@ from drivers.errors import CommandRefused
 from drivers.host.group import Group
 from long_form import shortly
 from model.answer.answer_report import Timing
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import contact_sets, smooth_rig

@@ -15,7 +15,7 @@ from controller.effects.region import Region
 from model.answer.answer_report import Timing
 from model.answer.stimulus import STRONGEST
 from model.config.fields import Circle
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from several_fingers import LEFT, Fingers, fingers_on, table

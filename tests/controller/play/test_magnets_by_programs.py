@@ -29,8 +29,8 @@ from magnets import Magnets, Outputs
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray
 from model.config.fields import Circle
-from model.rig.file import parse_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from sim.far_ends.opening import Wire

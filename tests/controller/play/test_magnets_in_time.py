@@ -18,8 +18,8 @@ from model.answer.answer_report import Timing
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, Point
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.transients.base_motion import Envelopes

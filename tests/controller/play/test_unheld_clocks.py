@@ -18,8 +18,7 @@ from drivers.host.group import Group
 from drivers.protocol.table import CLOCK_UNKNOWN
 from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
-from model.rig.rig import Channel, Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from paper_table import smooth_rig

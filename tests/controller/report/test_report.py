@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from controller.report.collect import MAX_DUMPS, collect, shown, versions
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 
 HOME = Path("/home/user")
 yaml = YAML(typ="safe")

@@ -18,7 +18,7 @@ from drivers.judge.asking import Report
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.table import READINGS, STATUS_FLAGS
 from era_haptics.lab.cli import app as lab_app
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 from word_wires import WORD_WIRES
 

@@ -14,7 +14,7 @@ from model.answer.promise import FingersOnPlate, share_stroke
 from model.answer.stimulus import KEPT, MISSING, Contents, Placement, Stream
 from model.answer.tone_search import choose_by_numpy, choose_tones, ranked, worst_ratios
 from model.finger import THRESHOLDS
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.build import build_table
 from model.table.table import LocalizationTable

@@ -9,7 +9,7 @@ import pytest
 from model.answer.answer import MIXED, OWN, verdict_of, verdict_shown
 from model.answer.stimulus import Finger, Placement
 from model.finger import THRESHOLDS, detection_threshold
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips

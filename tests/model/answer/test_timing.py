@@ -9,7 +9,7 @@ import pytest
 from model.answer.answer_report import Timing, query_batch
 from model.answer.stimulus import Placement
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped

@@ -21,8 +21,8 @@ from model.calibration.fit import sensed_plate
 from model.diagnosis.verdict import check_consistency
 from model.identification.parameters import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.mesh import stretched
 from model.structure.attachments import PointLoad
 

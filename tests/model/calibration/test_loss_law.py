@@ -16,8 +16,8 @@ from model.diagnosis.verdict import check_consistency
 from model.fem import Mesh, assemble
 from model.identification.derivatives import jacobian
 from model.identification.forward import viscous_difference
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 ROOT = Path(__file__).parents[3]
 TONES = np.arange(41.0, 500.0, 20.0)

@@ -10,8 +10,8 @@ from benchmarks.weekend import chain
 from model.arrays import FloatArray
 from model.calibration.calibrate import calibrate
 from model.diagnosis.verdict import check_consistency
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 
 def _off(found: Rig, true: Rig) -> FloatArray:

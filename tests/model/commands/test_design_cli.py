@@ -14,7 +14,7 @@ from model.cli import app
 from model.config.document import read_document
 from model.design import problem, search
 from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.commands.figure_cli import figure_app
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -14,7 +14,7 @@ from model.commands import options
 from model.commands.config_cli import config_app
 from model.commands.options import next_line, progress_bar
 from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.vibration import study_convergence
 from rig_files import write_rig
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from model.cli import app
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.errors import InputError
-from model.rig.file import example_rig_path
+from model.rig.rig_file import example_rig_path
 from model.study import overview
 from model.table.file import load_table, save_table
 

@@ -7,7 +7,7 @@ from matplotlib.image import imsave
 from model.design.area import area_of
 from model.design.contacts import contact_rule
 from model.errors import InputError
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 PLATE = load_rig(example_rig_path()).plate
 

@@ -15,7 +15,7 @@ from model.design.layout_keys import layout_keys
 from model.design.problem import DesignProblem, layouts_of
 from model.design.run import Design, Runner, judge, rank_layouts
 from model.processes import on_cluster, on_processes
-from model.rig.file import parse_rig
+from model.rig.rig_file import parse_rig
 from paper_plate import make_paper_rig
 
 

@@ -19,9 +19,8 @@ from model.design.search import LayoutSearch
 from model.errors import InputError
 from model.finger import FIVE_POINTS, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.file import example_rig_path, load_rig
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import Era, attached_stiffness, drive_forces
 from model.structure.support import static_loads
 

@@ -24,8 +24,8 @@ from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
 from model.diagnosis.verdict import Verdict, check_consistency, diagnose
 from model.errors import InputError
 from model.fem import Mesh
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from perturbed_plate import noise_like, random_gains
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

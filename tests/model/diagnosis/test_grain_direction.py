@@ -15,8 +15,8 @@ from model.diagnosis.plate_match import ShapeMatch
 from model.diagnosis.verdict import check_consistency, check_meaning, diagnose
 from model.errors import InputError
 from model.identification.least_squares import MeasuredPlate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 TONES = np.arange(91.0, 300.0, 20.0)
 

@@ -13,8 +13,8 @@ from model.calibration.responses import Responses, write_responses
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
 from model.diagnosis.verdict import check_consistency, diagnose
 from model.errors import InputError
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 
 TONES = np.arange(91.0, 300.0, 20.0)
 NAMES = ("NE", "NW", "SW", "SE")

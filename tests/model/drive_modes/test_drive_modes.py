@@ -14,7 +14,7 @@ from model.answer.stimulus import Placement
 from model.arrays import NEARLY, Complex64Array
 from model.drive_modes import Forms, playable_drive_modes
 from model.finger import fingertip_points
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from paper_table import contact_sets, forms_of, smooth_table
 
 SIGMA = 0.1

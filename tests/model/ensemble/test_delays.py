@@ -15,8 +15,7 @@ from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
 from model.ensemble.draws import EXACT_CLOCKS, PROMISED_DRAWS, ClockErrors, Drawing, delayed, draw
 from model.errors import InputError
-from model.rig.rig import Channel
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Uncertainty
 from model.study.exact_plates import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips

@@ -13,8 +13,8 @@ import pytest
 from benchmarks.setting import random_contacts
 from model.answer.stimulus import Placement
 from model.ensemble.draws import draw
-from model.rig.file import load_rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
+from model.rig.rig_file import load_rig
 from model.study.exact_plates import draw_plates, felt_on
 from model.table.build import build_table
 from only import only

@@ -12,7 +12,7 @@ from model.arrays import FloatArray
 from model.ensemble.draws import Drawing, percentile
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad
 from model.table.build import build_table
 from model.table.table import LocalizationTable

@@ -14,7 +14,7 @@ from model.ensemble.touched_plate import TouchedPlate, touch
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
 from model.structure.exciter import Exciter
 from paper_plate import LENGTH, WIDTH

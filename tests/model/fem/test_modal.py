@@ -11,7 +11,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import ELEMENTS, Element, Mesh, PlateMatrices, assemble, lowest_modes, rigidities
 from model.reduction.free_plate import solve_free_plate
-from model.rig.meshes import parse_mesh
+from model.rig.rig_file import parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
 from model.vibration import natural_modes

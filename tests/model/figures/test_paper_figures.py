@@ -16,7 +16,7 @@ from model.figures import (
 from model.figures.paper import SWEEP, PaperFigure, equal_area_points, paper_figures
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
-from model.rig.layouts import FOUR_ERA_LAYOUTS, alike
+from model.rig.rig import FOUR_ERA_LAYOUTS, alike
 from model.spectral.mesh import SpectralMesh
 from model.study.weak_cells import WeakCells
 from model.table.build import build_table

@@ -10,7 +10,7 @@ import pytest
 
 from controller.cli.main import run
 from model.figures import Template, _pages
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from rig_files import write_rig
 
 POINT = 25.4 / 72  # mm

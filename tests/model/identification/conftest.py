@@ -8,7 +8,7 @@ from model.identification.forward import Sensor
 from model.identification.identify import Identification, identify
 from model.identification.learned_plate import PlateEstimate
 from model.identification.least_squares import Measurement
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from settled_patterns import FREQUENCIES
 
 

@@ -18,8 +18,8 @@ from model.identification.identify import (
 from model.identification.least_squares import Measurement
 from model.identification.parameters import space_of
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Channel, Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from settled_patterns import FREQUENCIES
 
 LATE = 30e-6

@@ -16,9 +16,9 @@ from model.identification.identify import identify, parameter_rows
 from model.identification.least_squares import Measurement
 from model.identification.parameters import space_of
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import rig_of
-from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
+from model.rig.rig_file import rig_of
+from model.rig.rig_writing import rewritten_text
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import PointLoad

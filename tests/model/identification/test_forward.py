@@ -18,9 +18,8 @@ from model.identification.parameters import (
     space_of,
 )
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import example_rig_path, load_rig
-from model.rig.meshes import mesh_of
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig, mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.mesh import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support

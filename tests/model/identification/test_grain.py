@@ -10,8 +10,8 @@ from model.identification.forward import Sensor
 from model.identification.identify import fit_rows, identify
 from model.identification.least_squares import Measurement
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import rig_of
-from model.rig.rewritten import rewritten_text
+from model.rig.rig_file import rig_of
+from model.rig.rig_writing import rewritten_text
 from model.spectral.mesh import SpectralMesh
 from model.structure.plate import Orthotropy
 

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.identification.answers import table_of
 from benchmarks.identification.hidden import draw
 from benchmarks.identification.plates import FREQUENCIES, outcome
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 
 @pytest.mark.long

@@ -22,9 +22,9 @@ from model.identification.identify import (
     identify,
 )
 from model.identification.least_squares import Measurement, Repeat
-from model.rig.file import example_rig_path, load_rig
-from model.rig.rewritten import rewritten_text
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_writing import rewritten_text
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)
 ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0

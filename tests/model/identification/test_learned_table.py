@@ -10,8 +10,7 @@ from benchmarks.identification.hidden import Hidden
 from model.errors import InputError
 from model.identification import learned_plate
 from model.identification.learned_plate import LearnedTable, PlateEstimate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from settled_patterns import played, settled_patterns

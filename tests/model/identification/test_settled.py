@@ -21,7 +21,7 @@ from model.identification.settled_patterns import (
     StateUpdate,
     update,
 )
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from settled_patterns import settled_patterns
 
 

@@ -17,7 +17,7 @@ from model.identification.stages import (
     solved_with_modes_of,
 )
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 FREQUENCIES = np.linspace(40.0, 500.0, 27)
 

@@ -15,8 +15,7 @@ from model.identification.forward import ForwardModel, Sensor
 from model.identification.parameters import space_of
 from model.reduction import free_plate
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
 from model.table.build import TableProblem, build_table

@@ -14,10 +14,9 @@ from exciter_rig import exciter_rig, exciter_rig_text
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, parse_document
 from model.errors import InputError
-from model.rig.exciter_checks import exciter_notes, excursion_notes
-from model.rig.file import parse_rig
-from model.rig.kind import RIG
-from model.rig.rewritten import rewritten_text
+from model.rig.rig_file import parse_rig
+from model.rig.rig_summary import RIG, exciter_notes, excursion_notes
+from model.rig.rig_writing import rewritten_text
 from model.structure.exciter import Exciter
 from model.structure.exciter_types import EXCITER_TYPES
 from model.table.build import build_table

@@ -14,14 +14,14 @@ from model.config.document import ConfigError
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
-from model.rig.file import load_rig, parse_rig
-from model.rig.kind import gain_notes
-from model.rig.layouts import (
+from model.rig.rig import (
     FOUR_ERA_LAYOUTS,
+    Rig,
     diagonal_pair,
     edge_pair,
 )
-from model.rig.rig import Rig
+from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_summary import gain_notes
 from model.structure.attachments import footprints_of
 from model.table.build import build_table
 from model.transients.base_motion import BaseMotions, Term

@@ -7,9 +7,9 @@ import pytest
 
 from key_tables import quantities
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import parse_rig
-from model.rig.plate_summary import plate_summary
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
+from model.rig.rig_summary import plate_summary
 from model.rig.sections import PlateSection
 from model.structure.support import rigid_body_frequencies
 from model.vibration import natural_modes

@@ -8,11 +8,10 @@ import pytest
 
 from model.config.document import parse_document
 from model.errors import InputError
-from model.rig import rewritten
-from model.rig.file import rig_of
-from model.rig.rewritten import rewritten_text
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig import rig_writing
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import rig_of
+from model.rig.rig_writing import rewritten_text
 from model.structure.attachments import PointLoad
 
 RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
@@ -168,11 +167,11 @@ def test_text_that_reads_back_otherwise_is_refused(
 ) -> None:
     """A file whose plate cannot be changed, also by a quarter of a percent, is not the other's."""
     document = parse_document("rig.yaml", FLOW)
-    rig, put = rig_of(document), rewritten._put
+    rig, put = rig_of(document), rig_writing._put
     plate = replace(rig.plate, loss_factor=rig.plate.loss_factor + off)
     other = replace(rig, plate=plate if key == "loss_factor" else plate.scaled(modulus=1 + off))
     monkeypatch.setattr(
-        rewritten, "_put", lambda data, path, *more: path[-1] == key or put(data, path, *more)
+        rig_writing, "_put", lambda data, path, *more: path[-1] == key or put(data, path, *more)
     )
     with pytest.raises(InputError, match="read back"):
         rewritten_text(document, rig, other, comment="")

@@ -6,11 +6,9 @@ import pytest
 
 from model.config.document import ConfigError, read_document
 from model.errors import InputError
-from model.rig.file import load_rig
-from model.rig.kind import RIG
-from model.rig.meshes import parse_mesh
-from model.rig.rig import Channel, Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
+from model.rig.rig_file import load_rig, parse_mesh
+from model.rig.rig_summary import RIG
 from model.structure.attachments import Fingertip, PointLoad
 from model.structure.materials import material
 from model.structure.plate import Plate

@@ -8,8 +8,8 @@ import model
 import rig_page
 from model.config.fields import Section
 from model.rig import sections
-from model.rig.actuators import KINDS
-from model.rig.file import load_rig
+from model.rig.actuator_keys import KINDS
+from model.rig.rig_file import load_rig
 from model.structure.materials import KNOWN_MATERIALS
 
 ROOT = Path(model.__file__).parent.parent

@@ -9,7 +9,7 @@ from benchmarks.direct_plate import direct_responder
 from benchmarks.layers.gap import air_pressure, cell_middles
 from long_form import in_turn
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import parse_rig
+from model.rig.rig_file import parse_rig
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import SpectralPlate
 from model.spectral.stiffness import air_motion

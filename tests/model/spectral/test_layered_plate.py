@@ -13,7 +13,7 @@ from model.errors import InputError
 from model.fem import Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from model.spectral.direct import AtOneFrequency
 from model.spectral.mesh import SpectralMesh
 from model.spectral.modes import Band, SpectralPlate

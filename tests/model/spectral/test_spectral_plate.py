@@ -11,7 +11,7 @@ from long_form import in_turn
 from model.errors import InputError
 from model.fem import Q5, Mesh
 from model.reduction.free_plate import SpectralModes, solve_free_plate
-from model.rig.meshes import mesh_of
+from model.rig.rig_file import mesh_of
 from model.spectral.direct import direct_spectral_acceleration
 from model.spectral.functions import CLASSES
 from model.spectral.local_compliance import local_compliance

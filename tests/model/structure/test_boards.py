@@ -13,8 +13,8 @@ from model.fem import ELEMENTS, Mesh
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
-from model.rig.from_keys import rig as rig_by_keys
 from model.rig.rig import Rig
+from model.rig.rig_writing import rig as rig_by_keys
 from model.structure.attachments import PointLoad, footprints_of
 from model.structure.materials import known_material
 from model.structure.plate import Material, Plate

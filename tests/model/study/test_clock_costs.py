@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 
 from drivers.line_kinds import CLOCK_ERRORS
 from model.cli import app
-from model.rig.file import example_rig_path
-from model.rig.rig import Channel
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Uncertainty
+from model.rig.rig_file import example_rig_path
 from model.study.clock_costs import ClockCost, clock_cost
 from paper_table import smooth_rig
 

@@ -12,7 +12,7 @@ from model.answer.stimulus import Placement
 from model.ensemble.draws import percentile
 from model.fem import assemble
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.exact_plates import Plates, draw_plates, felt_on
 from model.table.build import build_table

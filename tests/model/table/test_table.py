@@ -14,8 +14,8 @@ from model.drive_modes import highest_levels
 from model.errors import InputError
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.study.exact_plates import Plates, felt_on

@@ -16,10 +16,9 @@ from model.config.fields import Section
 from model.errors import InputError
 from model.finger import Grid
 from model.rig import sections
-from model.rig.era_section import EraSection
-from model.rig.exciter_section import ExciterSection
-from model.rig.file import parse_rig
+from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 from model.table.build import TableProblem, solve_table
 from model.table.file import load_table, save_table
 

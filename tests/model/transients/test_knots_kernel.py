@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.rig.file import load_rig
+from model.rig.rig_file import load_rig
 from model.table.build import build_table
 from model.transients.base_motion import shaped
 from model.transients.knots import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.fem import Mesh
-from model.rig.meshes import mesh_of
+from model.rig.rig_file import mesh_of
 from model.vibration import default_frequencies, meshes_to_compare, study_convergence
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 

@@ -3,8 +3,8 @@
 import pytest
 
 from benchmarks.desk_plate.truth import Truth, draw_truth
-from model.rig.file import example_rig_path, load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,8 @@ from desk_card import DeskCard
 from model.calibration.fit import sensed_plate
 from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.identification.identify import identify
-from model.rig.file import parse_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 from model.spectral.direct import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
 from sim.desk.measuring.desk import Desk

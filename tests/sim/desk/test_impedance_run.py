@@ -18,7 +18,7 @@ from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
-from model.rig.file import parse_rig
+from model.rig.rig_file import parse_rig
 from sim.desk.impedance_cli import app
 from sim.desk.measuring.impedance_run import read_impedance
 from sim.desk.measuring.sound_card import SoundCard

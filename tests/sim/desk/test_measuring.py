@@ -16,8 +16,8 @@ from drivers.errors import LinkError
 from model.calibration.responses import WiredSensor
 from model.errors import InputError
 from model.processes import unseen
-from model.rig.file import parse_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.live_plot import STEPS, plot
 from sim.desk.measuring.loopback import check_wiring, latency

@@ -20,8 +20,8 @@ from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import read_measured, read_sensors, responses_of
 from model.errors import InputError
 from model.identification.identify import identify
-from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
 from sim.desk.measuring.sound_card import DeviceLost
 
 RATE, GRAMS = 8_000.0, 5.0

@@ -20,8 +20,8 @@ from model.calibration.responses import WiredSensor
 from model.config.document import read_document
 from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
-from model.rig.file import load_rig
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.outputs import Heard, listen, matched, tone
 

@@ -9,8 +9,8 @@ import pytest
 from controller.cli.main import run
 from examples.make_measured import record_responses
 from model.calibration.responses import WiredSensor, read_measured, responses_of
-from model.rig.file import example_rig_path, load_rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Uncertainty
+from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
 from sim.desk.measuring import simulated_plate
 from sim.desk.measuring.desk import Desk

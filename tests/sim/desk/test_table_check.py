@@ -24,9 +24,8 @@ from model.calibration.responses import read_sensors
 from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold
-from model.rig.file import example_rig_path, load_rig
-from model.rig.rig import Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import example_rig_path, load_rig
 from model.study.promise_at_sensors import Promise, promises
 from model.study.table_check import CheckSettings
 from model.table.build import build_table

@@ -19,8 +19,7 @@ from drivers.playing.voices import Transition
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.rig.rig import Channel, Rig
-from model.rig.uncertainty import Uncertainty
+from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import Fingertip, PointLoad
 from plate_in_time import lock_in
 from sim.amplifier.clock import StraightClock

@@ -16,8 +16,8 @@ from controller.cli.main import run
 from drivers.playing.contents import Tone
 from drivers.protocol.table import QUANTITIES, STATES
 from far_end_process import SESSION, far_end_process, playing
-from model.rig.file import example_rig_path
 from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path
 from recordings import read_recording
 from rig_files import write_rig
 from sim.bench.bench import Bench

@@ -1,0 +1,545 @@
+"""The text of a mesh, in a rig's and in a table's file.
+
+Conversion of the sections of a rig file to values of the model.
+
+Checks of a rig across its sections.
+
+Reading a rig from its file.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from model.config.document import Document, KeyPath, key_name, parse_document, read_document
+from model.config.fields import (
+    LENGTH,
+    RATIO,
+    Quantity,
+    Section,
+    Validation,
+    quantity,
+    section_by_kind,
+)
+from model.config.file_kinds import check_is_rig
+from model.errors import InputError, expect_path, shown
+from model.fem import MITC4, Mesh, element_of
+from model.rig.actuator_keys import KINDS, place_on, stiff_mount_problems
+from model.rig.rig import SAME_POINT, Channel, Rig, Uncertainty
+from model.rig.sections import (
+    ISOTROPIC,
+    ORTHOTROPIC,
+    FingertipSection,
+    LayerSection,
+    LimitsSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+    RigSection,
+    SupportSection,
+    UncertaintySection,
+)
+from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
+from model.structure.attachments import Fingertip, PointLoad
+from model.structure.feet_and_frames import EDGE_FOOT, FEET, FEET_DEVIATE, FOOT_LOSS, edge_points
+from model.structure.laminate_section import equivalent_plate
+from model.structure.materials import KnownMaterial
+from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Orthotropy, Plate
+from registry.limits import GuardLimits
+from registry.plugins import did_you_mean
+
+_MAX_ELEMENTS_PER_SIDE = 1000
+_ACCURACY = Quantity(RATIO, at_least=0.0005, at_most=0.1)
+_DEFAULT_ACCURACY = 0.01  # places within 0.1 mm of an ERA's change the response as much
+_MAX_NODES = 300_000  # a million degrees of freedom: minutes, and most of a machine's memory
+
+_STRIPS = " with strips of "
+
+
+def mesh_of(
+    text: str, plate: Plate, *, frequency_max: float, stiffness: float = 0.0, foot: float = 0.0
+) -> PlateMesh:
+    """The mesh `auto` or `auto A %`, accurate up to a frequency [Hz], or that of `parse_mesh`.
+
+    Those are of polynomials over the plate for an error of the response of A %, by default 1 %.
+    stiffness [N/m]: of the stiffest ERA; foot [m]: radius of the smallest, 0 for a point.
+    """
+    words = text.split()
+    if words[:1] != ["auto"]:
+        mesh = parse_mesh(text, plate)
+        if isinstance(mesh, Mesh) and max(mesh.nx, mesh.ny) > _MAX_ELEMENTS_PER_SIDE:
+            raise InputError(
+                f"mesh must have 1 to {_MAX_ELEMENTS_PER_SIDE} elements a side, got {mesh}"
+            )
+        if isinstance(mesh, Mesh) and mesh.node_count > _MAX_NODES:
+            raise InputError(f"mesh must have at most {_MAX_NODES} nodes, got {mesh}")
+        return mesh
+    asked = " ".join(words[1:]) or _DEFAULT_ACCURACY
+    try:
+        accuracy = _ACCURACY.read(asked)
+    except ValueError as error:
+        raise InputError(f"mesh: the accuracy of auto {error}; for example auto 1 %") from None
+    polynomials = SpectralMesh.accurate(
+        plate, frequency_max=frequency_max, accuracy=accuracy, stiffness=stiffness, foot=foot
+    )
+    if polynomials is None:
+        raise InputError(
+            f"mesh: {text} must need at most {MAX_POLYNOMIALS} polynomials up to degree "
+            f"{MAX_DEGREE}, got more up to {frequency_max:g} Hz; check the plate's sizes, lower "
+            "limits.frequency, or ask for less accuracy"
+        )
+    return polynomials
+
+
+def parse_mesh(text: str, plate: Plate) -> PlateMesh:
+    """The mesh `NXxNY`, or `NXxNY ELEMENT`, over a plate; with Legendre the numbers are degrees.
+
+    Elements may be `with strips of` a length, as a mesh is printed. Raises InputError for other
+    text, an unknown element, and no elements.
+    """
+    match = re.fullmatch(
+        rf"\s*(\d{{1,6}})\s*[xX×]\s*(\d{{1,6}})(?:\s+(\S{{1,40}}))?(?:{_STRIPS}(.{{1,40}}))?\s*",
+        text,
+        re.ASCII,
+    )
+    if match is None:
+        raise InputError(
+            f"mesh must be auto, auto 1 %, or NXxNY with an optional element, for example 48x36 "
+            f"or 12x9 Q3, got {text[:40]!r}"
+        )
+    nx, ny = int(match[1]), int(match[2])
+    strip = quantity(match[4], LENGTH) if match[4] else 0.0
+    if match[3] == POLYNOMIALS:
+        if strip:
+            raise InputError(f"mesh of polynomials must be without strips, got {text[:40]!r}")
+        return SpectralMesh(nx, ny, plate.length, plate.width)
+    element = element_of(match[3]) if match[3] else MITC4
+    return Mesh(nx=nx, ny=ny, length=plate.length, width=plate.width, element=element, strip=strip)
+
+
+_OF_PLATE = {"length", "width", "loss_exponent"}
+"""Fields that have the values of the keys of their names."""
+
+
+def plate_of(section: PlateSection, *, frequency_max: float) -> Plate:
+    """The plate; what is like a homogeneous one of a laminate is so at the highest frequency."""
+    gap, laminate = section.air_gap, laminate_of(section)
+    stated = section.model_dump(include=_OF_PLATE) | {
+        "loss_factor": _loss_factor(section),
+        "mode_deviations": tuple((2 * math.log(f), math.log(loss)) for f, loss in section.modes),
+        "air_gap": None if gap is None else AirGap(**gap.model_dump()),
+    }
+    if laminate is not None:
+        plate = equivalent_plate(
+            laminate, length=section.length, width=section.width, frequency=frequency_max
+        )
+        return replace(plate, **stated)
+    assert section.thickness is not None  # noqa: S101  see model.rig.rig_file
+    assert section.material is not None  # noqa: S101
+    material = material_of(section.material, section.thickness)
+    if section.grain == "width":
+        material = material.turned()
+    return Plate(thickness=section.thickness, material=material, **stated)
+
+
+def _loss_factor(section: PlateSection) -> float:
+    """That stated, or the greater one of a mounted panel's 1 % and of the material itself."""
+    if section.loss_factor is not None:
+        return section.loss_factor
+    own = section.material.own_loss if isinstance(section.material, KnownMaterial) else 0.0
+    return max(own, Plate.loss_factor)
+
+
+def material_of(section: MaterialSection | KnownMaterial, thickness: float) -> Material:
+    """The material of a board or layer of a thickness [m]; InputError for one of no solid."""
+    if isinstance(section, KnownMaterial):
+        return section.of_thickness(thickness)
+    if section.E is not None and section.nu is not None:
+        return Material(**section.model_dump(include={"name", "rho", *ISOTROPIC}))
+    E1, E2, nu12 = section.E1, section.E2, section.nu12
+    G12, G13, G23 = section.G12, section.G13, section.G23
+    # see model.rig.rig_file
+    assert E1 and E2 and G12 and G13 and G23 and nu12 is not None  # noqa: S101, PT018
+    shares = Orthotropy(E2 / E1, G12 / E1, G13 / E1, G23 / E1)
+    return Material(section.name, E1, section.rho, nu12, shares)
+
+
+def laminate_of(section: PlateSection) -> Laminate | None:
+    """The laminate of the plate; None without layers.
+
+    A single layer stands for a material that depends on frequency.
+    """
+    if section.layers is None:
+        known, thickness = section.material, section.thickness
+        if known is None or not known.by_frequency or thickness is None:
+            return None
+        alone = material_of(known, thickness)
+        return Laminate((LaminateLayer(alone, thickness, by_frequency=tuple(known.by_frequency)),))
+    return Laminate(tuple(map(_layer_of, section.layers)), bond=section.bond)
+
+
+def _layer_of(section: LayerSection) -> LaminateLayer:
+    """A layer; its material's dependence on frequency holds unless it states losses of its own."""
+    rows = section.by_frequency
+    if rows is None and section.loss_factor is None:
+        rows = [*(section.material.by_frequency or ())]
+    return LaminateLayer(
+        material_of(section.material, section.thickness),
+        section.thickness,
+        loss_factor=section.loss_factor or 0.0,
+        by_frequency=tuple(rows or ()),
+    )
+
+
+def masses_of(section: MassSection, plate: Plate) -> tuple[PointLoad, ...]:
+    """A mass on the plate, or those of a frame along its edges."""
+    if section.at is not None:
+        x, y = place_on(plate, section.at)
+        return (PointLoad(x, y, mass=section.mass or 0.0, foot=section.foot),)
+    per_length = section.mass_per_length or 0.0
+    return tuple(
+        PointLoad(x, y, mass=per_length * length, foot=EDGE_FOOT)
+        for x, y, length in edge_points(plate, section.points)
+    )
+
+
+def supports_of(section: SupportSection, plate: Plate) -> tuple[PointLoad, ...]:
+    """A foot under the plate, or springs along its edges."""
+    damping, loss_factor = section.damping or 0.0, section.loss_factor
+    if loss_factor is None:
+        loss_factor = FOOT_LOSS if section.damping is None else 0.0
+    spring = PointLoad(0.0, 0.0, damping=damping, loss_factor=loss_factor)
+    if section.at is not None:
+        stiffness = section.stiffness or FEET[section.kind or "foam"]
+        x, y = place_on(plate, section.at)
+        foot = replace(spring, x=x, y=y, foot=section.foot)
+        return (replace(foot, stiffness=stiffness, is_foot=True),)
+    edge, per_length = 2 * (plate.length + plate.width), section.stiffness_per_length or 0.0
+    return tuple(
+        replace(
+            spring,
+            x=x,
+            y=y,
+            stiffness=per_length * length,
+            damping=damping * length / edge,
+            foot=EDGE_FOOT,
+        )
+        for x, y, length in edge_points(plate, section.points)
+    )
+
+
+def uncertainty_of(section: UncertaintySection, feet: Iterable[SupportSection]) -> Uncertainty:
+    """How well the rig is known; feet of which it says nothing as `FEET_DEVIATE`."""
+    unknown = {"supports": FEET_DEVIATE} if any(foot.at is not None for foot in feet) else {}
+    return Uncertainty(**(unknown | section.model_dump(exclude_none=True)))
+
+
+def limits_of(section: LimitsSection) -> GuardLimits:
+    """The limits of commands; infinite where none is given."""
+    low, high = section.frequency
+    given = section.model_dump(exclude={"frequency"}, exclude_none=True)
+    return GuardLimits(frequency_min=low, frequency_max=high, **given)
+
+
+def fingertip_of(section: FingertipSection | str) -> Fingertip | None:
+    """The load of a fingertip; None for weightless ones."""
+    return None if isinstance(section, str) else Fingertip(**section.model_dump())
+
+
+class Way(NamedTuple):
+    """One of two ways to state something: keys that it needs, and further ones of it alone."""
+
+    needed: Set[str]
+    further: Set[str] = frozenset()
+
+
+_WHOLE, _LAYERED = Way({"thickness", "material"}, {"grain"}), Way({"layers"}, {"bond"})
+_ISOTROPIC, _ORTHOTROPIC = Way(ISOTROPIC, {"by_frequency"}), Way(ORTHOTROPIC)
+
+
+def check_across(validation: Validation[RigSection], *, mesh_given: bool) -> None:
+    """Add problems between sections that are valid by themselves."""
+    limits = validation.field(("limits", "frequency"), LimitsSection)
+    high = (limits or LimitsSection().frequency)[1]
+    plate = _check_plate(validation, frequency_max=high)
+    if plate is not None and not mesh_given:
+        _check_mesh(validation, plate, frequency_max=high)
+    eras = {}
+    for name, keys in validation.mapping(("eras",)).items():
+        section = section_by_kind([*KINDS.values()], keys)
+        eras[name] = given = _given(validation, ("eras", name), section)
+        for key, problem in section.problems(given) if given else ():
+            validation.add(("eras", name, key), problem)
+    _check_places(validation, eras, plate)
+    _check_wiring(validation, eras)
+    for name in validation.mapping(("masses",)):
+        _check_attached(validation, ("masses", name), MassSection, plate)
+    for name in validation.mapping(("supports",)):
+        given = _check_attached(validation, ("supports", name), SupportSection, plate)
+        for key, problem in stiff_mount_problems(given):
+            validation.add(("supports", name, key), problem)
+
+
+def _check_attached(
+    validation: Validation[RigSection],
+    path: tuple[str, str],
+    section: type[MassSection | SupportSection],
+    plate: Plate | None,
+) -> dict[str, Any]:
+    """Check that a mass or support is on the plate, at a point or along the edges; its keys."""
+    given = _given(validation, path, section)
+    _check_on_plate(validation, path, given.get("at"), plate)
+    per_length = "mass_per_length" if section is MassSection else "stiffness_per_length"
+    own = set() if "kind" in given else {per_length.removesuffix("_per_length")}
+    at_point, at_edges = Way({"at", *own}, {"foot", "kind"}), Way({"along", per_length})
+    if given:
+        ways = (at_edges, at_point) if "along" in given else (at_point, at_edges)
+        _check_way(validation, path, *ways)
+    return given
+
+
+def _check_way(validation: Validation[RigSection], path: KeyPath, this: Way, other: Way) -> bool:
+    """Check that a section has all keys of the way that it takes, and none of the other."""
+    given = _given(validation, path).keys()
+    missing, too_many = this.needed - given, given & (other.needed | other.further)
+    for key in sorted(missing):
+        instead = ", ".join(sorted(other.needed))
+        validation.add((*path, key), f"missing; add it, or {instead} instead")
+    for key in sorted(too_many):
+        beside = min(this.needed & given, default="the others")
+        validation.add((*path, key), f"must not be given with {beside}; remove it")
+    return not (missing or too_many)
+
+
+def _check_plate(validation: Validation[RigSection], *, frequency_max: float) -> Plate | None:
+    """The plate if its section is valid: thickness and material, or layers."""
+    given = _given(validation, ("plate",))
+    if not given:
+        return None
+    is_layered = "layers" in given
+    ways = (_LAYERED, _WHOLE) if is_layered else (_WHOLE, _LAYERED)
+    _check_way(validation, ("plate",), *ways)
+    layers = validation.mapping(("plate",)).get("layers")
+    count = len(layers) if isinstance(layers, list) else 0
+    paths = [("plate", "layers", number, "material") for number in range(count)]
+    good = [_check_material(validation, path) for path in (("plate", "material"), *paths)]
+    section = validation.part(("plate",), PlateSection)
+    if section is None or not (all(good) and ways[0].needed <= given.keys()):
+        return None
+    try:
+        laminate = laminate_of(section)
+        plate = plate_of(section, frequency_max=frequency_max)
+    except InputError as error:
+        key = "material" if not is_layered else "bond" if "bond" in given else "layers"
+        validation.add(("plate", key), str(error))
+        return None
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    if thickness > min(plate.length, plate.width):
+        validation.add(
+            ("plate", "thickness" if laminate is None else "layers"),
+            f"must be less than the plate's sides, got {thickness:g} m; if in mm, write "
+            f"{thickness:g} mm",
+        )
+    return plate
+
+
+def _check_material(validation: Validation[RigSection], path: KeyPath) -> bool:
+    """Check that a material by numbers has those of one of both kinds, and only these."""
+    given = _given(validation, path).keys()
+    has_grain = len(given & ORTHOTROPIC) > (1 if given & ISOTROPIC else 0)
+    ways = (_ORTHOTROPIC, _ISOTROPIC) if has_grain else (_ISOTROPIC, _ORTHOTROPIC)
+    return not given or _check_way(validation, path, *ways)
+
+
+def _check_mesh(validation: Validation[RigSection], plate: Plate, *, frequency_max: float) -> None:
+    text = validation.field(("mesh",), RigSection)
+    try:
+        mesh = mesh_of(text or "auto", plate, frequency_max=frequency_max)
+    except InputError as error:
+        validation.add(("mesh",), str(error))
+        return
+    if plate.is_layered and not isinstance(mesh, SpectralMesh):
+        what = "layers" if plate.laminate is not None else "an air gap"
+        validation.add(
+            ("mesh",),
+            f"must be of polynomials for a plate with {what}, got {mesh}; use auto, or degrees "
+            "such as 12x9 Legendre",
+        )
+        return
+    if frequency_max > mesh.highest_frequency(plate):
+        validation.add(
+            ("mesh",),
+            f"{mesh} is too coarse for bending waves at {frequency_max:g} Hz (limits.frequency): "
+            f"at least {mesh.resolving(plate, frequency_max)} is needed; auto chooses an accurate "
+            "mesh",
+        )
+
+
+def _check_places(
+    validation: Validation[RigSection], eras: Mapping[str, Mapping[str, Any]], plate: Plate | None
+) -> None:
+    placed: dict[str, tuple[float, float]] = {}
+    for name, given in eras.items():
+        place = given.get("at")
+        _check_on_plate(validation, ("eras", name), place, plate)
+        if place is None:
+            continue
+        for other, taken in placed.items():
+            if math.dist(taken, place) < SAME_POINT:
+                validation.add(
+                    ("eras", name, "at"),
+                    f"must be unique, got the place of ERA {other}; move one",
+                )
+        placed[name] = place
+
+
+def _check_on_plate(
+    validation: Validation[RigSection],
+    path: tuple[str, str],
+    place: tuple[float, float] | None,
+    plate: Plate | None,
+) -> None:
+    """Check the place of what is attached to a plate, where both are known."""
+    if place is None or plate is None:
+        return
+    (x, y), length, width = place, plate.length, plate.width
+    d = SAME_POINT
+    if not (-d <= x <= length + d and -d <= y <= width + d):
+        validation.add(
+            (*path, "at"),
+            f"must be on the plate, from (0, 0) to ({length:g}, {width:g}) m, got ({x:g}, {y:g}) "
+            "m; move it",
+        )
+
+
+def _check_wiring(
+    validation: Validation[RigSection], eras: Mapping[str, Mapping[str, Any]]
+) -> None:
+    amplifiers = validation.mapping(("amplifiers",))
+    wired: dict[tuple[str, int], str] = {}
+    if eras and not any("amplifier" in given for given in eras.values()):
+        validation.add(("eras",), "must have at least one ERA with an amplifier; add its amplifier")
+    for name, given in eras.items():
+        amplifier, channel = given.get("amplifier"), given.get("channel")
+        if amplifier is not None and amplifier not in amplifiers:
+            known = ", ".join(key_name((key,)) for key in amplifiers) or "none"
+            validation.add(
+                ("eras", name, "amplifier"),
+                f"unknown amplifier {amplifier}; {did_you_mean(amplifier, amplifiers)}"
+                f"known are {known}",
+            )
+        if amplifier is None or channel is None:
+            continue
+        other = wired.setdefault((amplifier, channel), name)
+        if other != name:
+            validation.add(
+                ("eras", name, "channel"),
+                f"must be unique, got {channel} of amplifier {amplifier} as ERA {other}; give each "
+                "ERA its own channel",
+            )
+
+
+def _given(
+    validation: Validation[RigSection], path: KeyPath, section: type[Section] = Section
+) -> dict[str, Any]:
+    """Keys of a section that are not empty, with the values of those that are valid, else None."""
+    own = validation.mapping(path)
+    return {
+        key: validation.field((*path, key), section)
+        for key, value in own.items()
+        if value is not None
+    }
+
+
+def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
+    """Read a rig file; mesh: `auto` or NXxNY, replaces that of the file.
+
+    Raises ConfigError with all problems of the file; InputError for an invalid mesh. The mesh given
+    here may be coarser than a file's, to study its error.
+
+    Example:
+        >>> rig = era.load_rig("examples/paper_plate.yaml")
+        >>> [each.name for each in rig.eras]
+        ['SW', 'SE', 'NE', 'NW']
+    """
+    if mesh is not None and not isinstance(mesh, str):
+        raise InputError(f"mesh must be text such as '48x36' or 'auto', got {shown(mesh)}")
+    return rig_of(read_document(expect_path(path, what="path")), mesh=mesh)
+
+
+def parse_rig(source: str, text: str) -> Rig:
+    """Read the text of a rig file that came from a source; raises ConfigError."""
+    return rig_of(parse_document(source, text))
+
+
+def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
+    """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
+    if "plate" not in document.data:
+        check_is_rig(document)
+    validation = Validation(document, RigSection)
+    check_across(validation, mesh_given=mesh is not None)
+    section = validation.finish()
+    if mesh is not None:
+        document = Document(document.source, "", document.data | {"mesh": mesh}, {})
+    plate = plate_of(section.plate, frequency_max=section.limits.frequency[1])
+    wanted = section.mesh if mesh is None else mesh
+    everything = {
+        name: era.made(name, plate, len(section.eras)) for name, era in section.eras.items()
+    }
+    wiring = {
+        name: Channel(era.amplifier, era.channel)
+        for name, era in section.eras.items()
+        if era.amplifier is not None and era.channel is not None
+    }
+    electrical = {era.amplifier for era in section.eras.values() if era.is_electrical}
+    supports = {name: era for name, era in everything.items() if name not in wiring}
+    return Rig(
+        plate=plate,
+        mesh=mesh_of(
+            wanted,
+            plate,
+            frequency_max=section.limits.frequency[1],
+            stiffness=max(era.in_time.stiffness for era in everything.values()),
+            foot=min(era.foot for era in everything.values()),
+        ),
+        eras=tuple(era for name, era in everything.items() if name in wiring),
+        wiring=wiring,
+        amplifiers={name: amplifier.url for name, amplifier in section.amplifiers.items()},
+        limits=limits_of(section.limits),
+        masses=(
+            *(each for mass in section.masses.values() for each in masses_of(mass, plate)),
+            *(each for foot in section.supports.values() for each in supports_of(foot, plate)),
+            *(era.support for era in supports.values()),
+        ),
+        supports=tuple(supports),
+        laminate=laminate_of(section.plate),
+        uncertainty=uncertainty_of(section.uncertainty, section.supports.values()),
+        fingertip=fingertip_of(section.fingertip),
+        threshold=section.threshold,
+        promised_thresholds=tuple(section.promised_thresholds),
+        outputs=frozenset(
+            name
+            for name, amplifier in section.amplifiers.items()
+            if (amplifier.full_level or ("motion", "output")[name in electrical]) == "output"
+        ),
+        clock_errors={
+            name: math.inf if amplifier.clock_error == "unknown" else amplifier.clock_error
+            for name, amplifier in section.amplifiers.items()
+        },
+        document=document,
+    )
+
+
+def example_rig_path() -> Path:
+    """The path of the commented rig of the paper's plate.
+
+    Example:
+        >>> era.example_rig_path().name
+        'paper_plate.yaml'
+    """
+    here = Path(__file__).parents[1]  # a wheel has it in the model's data
+    installed = here / "data" / "paper_plate.yaml"
+    return installed if installed.exists() else here.parent / "examples" / "paper_plate.yaml"

@@ -1,0 +1,585 @@
+"""What the exciters of a rig can follow: from which frequency on, and what its file may mean.
+
+Numbers of a rig's plate and its exciters: materials, rigidity, bending wavelengths, types.
+
+Rig files as a kind of configuration of `era config`.
+
+Its amplifiers are checked by the package that knows wires. Warnings say what a rig does not know or
+leaves out.
+"""
+
+import cmath
+import contextlib
+import math
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import FloatArray
+from model.config.document import ConfigError, ConfigProblem, Document
+from model.config.fields import Quantity, quantities
+from model.config.file_kinds import CheckedFile, ConfigKind
+from model.errors import InputError
+from model.quantities import percent
+from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, limits_of, rig_of
+from model.rig.sections import LimitsSection, PlateSection, RigSection
+from model.structure.attachments import Era, Source
+from model.structure.exciter import Exciter
+from model.structure.exciter_types import EXCITER_TYPES
+from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
+from model.structure.laminate_section import (
+    bending,
+    freely_sliding,
+    perfectly_bonded,
+    slide_frequency,
+    wavenumber_of,
+)
+from model.structure.plate import AirGap, Bond, Laminate, Plate
+from model.structure.support import GRAVITY, support_problem
+from registry.limits import GuardLimits
+
+_EXCURSIONS = "model.transients.excursions:excursions_of"
+"""By name: it solves plates, which the packages above this one do."""
+
+_NEARLY = 1.001
+_LAG = 0.01  # (omega L / R)² from which time and frequency differ visibly
+_ABOVE = 1.3  # times the resonance of a magnet, where little depends on it
+_LIGHT, _HIGH = 0.3, 100.0  # share of the coil in the magnet's mass; Hz
+
+
+@dataclass(frozen=True, eq=False)
+class Excursions:
+    """Excursions [m] of each exciter at the rig's level, (n,).
+
+    at_lowest: settled at its lowest frequency; largest: in onsets within all that it allows, of
+    those that are limited; passed (n,): whether these are more than they may be; allowed: the
+    lowest frequency [Hz] from which all stay within up to the highest, infinite where they do not
+    there.
+    """
+
+    at_lowest: FloatArray
+    largest: FloatArray
+    passed: NDArray[np.bool_]
+    allowed: float
+
+
+def exciters_of(rig: Rig) -> list[Exciter]:
+    """The exciters among its actuators."""
+    return [era for era in rig.eras if isinstance(era, Exciter)]
+
+
+def sections_of(rig: Rig) -> dict[str, ExciterSection]:
+    """Keys of its exciters by name, none of a rig without keys."""
+    keys: Any = rig.document.data["eras"] if rig.document else {}
+    names = [one.name for one in exciters_of(rig) if one.name in keys]
+    return {name: ExciterSection.model_validate(keys[name]) for name in names}
+
+
+def excursion_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where full level would move magnets beyond their excursion."""
+    exciters, limits = exciters_of(rig), rig.limits
+    found: Excursions | None = resolve_name(_EXCURSIONS)(rig) if exciters else None
+    if found is None or not found.passed.any():
+        return
+    shares = found.largest / [one.excursion for one in exciters]
+    worst = int(shares.argmax())
+    names = [one.name for one, is_far in zip(exciters, found.passed, strict=True) if is_far]
+    lowest = (
+        f"within from {found.allowed:g} Hz on" if np.isfinite(found.allowed) else "nowhere within"
+    )
+    yield (
+        f"limits.frequency: from {limits.frequency_min:g} Hz on limits.level {limits.level:g} can "
+        f"move the magnets of {', '.join(names)} beyond their excursion, that of "
+        f"{exciters[worst].name} by {1e3 * found.largest[worst]:.2g} mm of "
+        f"{1e3 * exciters[worst].excursion:.2g} mm ({lowest}); answers play less there, tones by "
+        "hand do not: a level of at most "
+        f"{math.floor(1e3 * limits.level / shares[worst]) / 1e3:g} is safe"
+    )
+
+
+def exciter_notes(rig: Rig) -> Iterator[str]:
+    """Yield warnings: resonances that may be misread, and magnets that move too far or resonate.
+
+    Of a resonance that may be misread it is not said from where on to play.
+    """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    sections = sections_of(rig)
+    misread: dict[str, list[str]] = {}
+    for name, section in sections.items():
+        if said := _misread_resonance(section):
+            misread.setdefault(said, []).append(name)
+    yield from (f"resonance_is of {', '.join(names)}: {said}" for said, names in misread.items())
+    for one in exciters_of(rig):
+        yield from (f"eras.{one.name}.{each}" for each in _hazards(one, sections[one.name], rig))
+    yield from excursion_notes(rig)
+    doubted = {name for names in misread.values() for name in names}
+    free = [one for one in exciters_of(rig) if not one.held and one.name not in doubted]
+    near = {one.name: f for one in free if low < _ABOVE * (f := one.magnet_frequency)}
+    if near:
+        highest = max(near.values())
+        start = math.ceil(_ABOVE * highest)
+        advice = f"start at {start} Hz, or identify the rig" if start < high else "identify the rig"
+        yield (
+            f"limits.frequency: starts at {low:g} Hz, below {_ABOVE:g} times the resonance of the "
+            f"magnets of {', '.join(near)} at up to {highest:.1f} Hz, where "
+            f"the field depends on suspension and weight as much as on the plate; {advice}"
+        )
+
+
+def _misread_resonance(section: ExciterSection) -> str | None:
+    """A warning for a resonance that is said to be the mounted one, and hardly can be."""
+    values = section.values
+    f, coil, weight = values["resonance"], values["coil_mass"], values["weight"]
+    if section.stiffness or values["resonance_is"] != "mounted":
+        return None
+    if f <= _HIGH or coil >= _LIGHT * weight:
+        return None
+    return (
+        f"{f:g} Hz is high for a magnet of {1e3 * weight:.3g} g, and probably that of the coil of "
+        f"{1e3 * coil:.3g} g on a data sheet; with resonance_is: free the glued magnet resonates "
+        f"at {f * math.sqrt(coil / weight):.0f} Hz"
+    )
+
+
+def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
+    """Yield what may harm an exciter, and what the model then misses, by key."""
+    volts, limits = rig.limits.level * one.largest_gain * one.voltage, rig.limits
+    heat = (volts / one.loop_resistance) ** 2 * one.resistance / 2
+    by_gains = f"gains: of up to {one.largest_gain:.3g}"
+    rated = section.of_type.get("power", section.values["power"])
+    if heat > _NEARLY * rated:
+        yield (
+            f"{by_gains} put {heat:.3g} W into the coil at full level, which bears {rated:.3g} W; "
+            "lower power, or limits.level"
+        )
+    if section.clip is not None and volts > _NEARLY * section.clip:
+        yield (
+            f"{by_gains} ask for {volts:.3g} V at full level, and the amplifier clips at "
+            f"{section.clip:.3g} V; lower power, or limits.level"
+        )
+    if not math.isfinite(one.excursion):
+        yield "excursion: missing, so that nothing limits how far its magnet moves; add it"
+    sag = 0.0 if one.held else GRAVITY * one.magnet_mass / one.stiffness
+    if sag > one.excursion:
+        yield (
+            f"resonance: of {one.magnet_frequency:.3g} Hz when glued, at which the magnet hangs "
+            f"{1e3 * sag:.2g} mm from its middle by its weight, of an excursion of "
+            f"{1e3 * one.excursion:.2g} mm; check resonance, resonance_is and weight, or hold it"
+        )
+    highest = limits.frequency_max
+    lag = (2 * math.pi * highest * one.inductance / one.loop_resistance) ** 2
+    if lag > _LAG:
+        yield (
+            f"inductance: (omega L / R)² is {lag:.2g} at {highest:g} Hz, by which onsets, "
+            "endings and courses are computed too strong or too weak; check it, or end "
+            f"limits.frequency at {math.floor(highest * math.sqrt(_LAG / lag))} Hz"
+        )
+
+
+FURTHER = {
+    name: each.dimension
+    for name, field in PlateSection.model_fields.items()
+    for each in field.metadata
+    if isinstance(each, Quantity) and name not in {"length", "width", "loss_factor"}
+}
+"""Keys of the plate that are plain quantities and have no line of their own in a summary."""
+
+
+def plate_summary(rig: Rig) -> dict[str, Any]:
+    """The plate that is solved, the laminate that it stands for, and what it carries.
+
+    Keys carry their units. A laminate comes with both bounds of its rigidity, perfectly bonded and
+    freely sliding layers, and, where its layers are bonded, the rigidity in free bending waves at
+    both ends of the rig's frequencies.
+    """
+    plate, limits, gap = rig.plate, rig.limits, rig.plate.air_gap
+    return {
+        "length_m": plate.length,
+        "width_m": plate.width,
+        "thickness_m": plate.thickness,
+        "material": plate.material.name,
+        "E_pa": plate.material.E,
+        "rho_kg_m3": plate.material.rho,
+        "nu": plate.material.nu,
+        "orthotropic": _grain(plate),
+        "loss_factor": plate.loss_factor,
+        "further": {each.key(name): getattr(plate, name) for name, each in FURTHER.items()},
+        "mass_kg": plate.mass,
+        "surface_density_kg_m2": plate.surface_density,
+        "flexural_rigidity_n_m": plate.flexural_rigidity,
+        "bending_wavelength_m": {
+            f"{frequency:g}_hz": 2 * math.pi / wavenumber_of(plate.laminate, frequency).real
+            if plate.laminate
+            else plate.bending_wavelength(frequency)
+            for frequency in (limits.frequency_min, limits.frequency_max)
+        },
+        "air_gap": None if gap is None else _air_gap(gap, limits),
+        "point_masses": [
+            {"at_m": [mass.x, mass.y], "mass_kg": mass.mass} for mass in rig.masses if mass.mass
+        ],
+        "supports": [
+            {
+                "at_m": [each.x, each.y],
+                "stiffness_n_m": each.stiffness,
+                "damping_n_s_m": each.damping,
+                "loss_factor": each.loss_factor,
+            }
+            for each in rig.masses
+            if each.stiffness
+        ],
+        "laminate": None if rig.laminate is None else _laminate(rig.laminate, limits),
+        "exciters": [_exciter(one) for one in exciters_of(rig)],
+        "exciter_types": _types(rig),
+    }
+
+
+def _grain(plate: Plate) -> dict[str, float] | None:
+    """Numbers of a board along and across the plate's length; None of an isotropic plate."""
+    material = plate.material
+    if material.orthotropy is None:
+        return None
+    along, across = plate.rigidity_towards(1.0), plate.rigidity_towards(0.0)
+    return {
+        **{f"{key}_pa": each for key, each in material.moduli.items()},
+        "nu12": material.nu,
+        "flexural_rigidity_along_n_m": float(along),
+        "flexural_rigidity_across_n_m": float(across),
+    }
+
+
+def _air_gap(gap: AirGap, limits: GuardLimits) -> dict[str, Any]:
+    return {
+        "depth_m": gap.depth,
+        "closed": gap.closed,
+        "inertia_kg_m3": {
+            f"{frequency:g}_hz": gap.inertia(frequency).real
+            for frequency in (limits.frequency_min, limits.frequency_max)
+        },
+        "stiffness_n_m3": gap.bulk_modulus(limits.frequency_max).real / gap.depth
+        if gap.closed
+        else 0.0,
+    }
+
+
+def _laminate(laminate: Laminate, limits: GuardLimits) -> dict[str, Any]:
+    frequencies = limits.frequency_min, limits.frequency_max
+    by_frequency = {f"{each:g}_hz": bending(laminate, each).rigidity for each in frequencies}
+    return {
+        "layers": [
+            {
+                "material": layer.material.name,
+                "thickness_m": layer.thickness,
+                "E_pa": layer.material.E,
+                "rho_kg_m3": layer.material.rho,
+                "nu": layer.material.nu,
+                "loss_factor": layer.loss_factor,
+                "by_frequency": [list(row) for row in layer.by_frequency],
+            }
+            for layer in laminate.layers
+        ],
+        "thickness_m": laminate.thickness,
+        "bond": laminate.bond.value,
+        "rigidity_perfectly_bonded_n_m": perfectly_bonded(laminate.layers).rigidity,
+        "rigidity_freely_sliding_n_m": freely_sliding(laminate.layers).rigidity,
+        **({"rigidity_by_frequency_n_m": by_frequency} if laminate.bond is Bond.FULL else {}),
+    }
+
+
+def _exciter(one: Exciter) -> dict[str, Any]:
+    """An exciter by itself."""
+    return {
+        "name": one.name,
+        "magnet": "held" if one.held else "free",
+        "magnet_resonance_hz": one.magnet_frequency,
+        "q": one.quality,
+        "force_at_1_w_n": one.force_factor * math.sqrt(2 / one.resistance),
+        "full_level_v": one.voltage * one.largest_gain,
+        "full_level_force_n": one.largest_force,
+        "excursion_max_m": one.excursion if math.isfinite(one.excursion) else None,
+    }
+
+
+def _types(rig: Rig) -> dict[str, dict[str, Any]]:
+    """Types of a rig's exciters by name: what to know of each, and what no source gives of it.
+
+    assumed: by key the lowest and the highest value that is likely, unless every exciter of the
+    type states its own.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for section in sections_of(rig).values():
+        if section.type is not None:
+            known = EXCITER_TYPES[section.type]
+            entry = found.setdefault(section.type, {"note": known.note, "assumed": {}})
+            for key, between in known.assumed.items():
+                (quantity,) = quantities(ExciterSection.model_fields[key])
+                if getattr(section, key) is None:
+                    entry["assumed"][quantity.dimension.key(key)] = list(between)
+    return found
+
+
+# Modes are within 3 % of the direct solution up to half of where layers slide by themselves, off
+# by as much as there is around it (faces of 0.5 mm aluminium on 50 mm of E 0.1 to 10 MPa).
+_FAR_FROM_SLIDING = 2.0
+
+
+def _check(document: Document) -> CheckedFile:
+    """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
+    problems: list[ConfigProblem] = []
+    rig = None
+    try:
+        rig = rig_of(document)
+    except ConfigError as error:
+        problems += error.problems
+    urls = _urls(document)
+    counts = rig.channel_counts if rig else Counter[str]()
+    limits = rig.limits if rig else limits_of(LimitsSection())
+    wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
+    if rig is not None:
+        support = support_problem(rig.plate, rig.eras, loads=rig.masses)
+        problems += [] if support is None else [document.problem(("eras",), support)]
+    known = {problem.key for problem in problems}
+    of_urls = [document.problem(("amplifiers", name, "url"), what) for name, what in wrong.items()]
+    problems += [problem for problem in of_urls if problem.key not in known]
+    if rig is None or problems:
+        raise ConfigError(document.source, problems)
+    note = rig.uncertainty_note
+    line, lost, more = clock_costs(rig, urls)
+    warnings = [*exciter_notes(rig), *warnings]
+    costs = [
+        *(*lost, *gain_notes(rig), *_plate_notes(rig)),
+        *(*_mount_notes(rig), *_span_notes(rig)),
+    ]
+    return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
+
+
+RIG = ConfigKind(
+    "A rig of era-haptics",
+    recognises=lambda document: "plate" in document.data,
+    check=_check,
+    example_file=example_rig_path(),
+    keys=RigSection.model_json_schema,
+)
+
+
+_THICK = 0.02  # m; of one material
+
+
+def _plate_notes(rig: Rig) -> Iterator[str]:
+    """Yield warnings of a plate in the wrong unit, and of what air and soft layers cost."""
+    plate, low, high = rig.plate, rig.limits.frequency_min, rig.limits.frequency_max
+    if rig.laminate is None and plate.thickness > _THICK:
+        yield (
+            f"plate.thickness: {1e3 * plate.thickness:g} mm is thick for a plate that is to be "
+            "felt; check its unit, mm or cm"
+        )
+    if plate.air_gap is not None and (error := plate.air_gap.coupling_error(low)):
+        off = "half of it or more: take no answer from it" if error > 0.1 else f"{100 * error:g} %"
+        yield (
+            f"plate.air_gap: in {1e3 * plate.air_gap.depth:g} mm friction of the air couples the "
+            f"modes at {low:g} Hz, which is left out: the response may be off by {off}"
+        )
+    slide = math.inf if plate.laminate is None else slide_frequency(plate.laminate, high)
+    if high >= slide / _FAR_FROM_SLIDING:
+        yield (
+            f"plate.layers: at {slide:.3g} Hz they slide to and fro by themselves, and change "
+            "their thickness little above, which is left out: take no answer from it above "
+            f"{slide / _FAR_FROM_SLIDING:.3g} Hz"
+        )
+
+
+_SMALL_SPAN = 1 / 3  # of the plate
+
+
+def _span_notes(rig: Rig) -> Iterator[str]:
+    """Yield a warning where ERAs span a small part of the plate, with what its corners promise.
+
+    None for ERAs in one line along a side.
+    """
+    places = np.array([[era.x, era.y] for era in rig.eras])
+    sides = np.array([rig.plate.length, rig.plate.width])
+    span = np.ptp(places, axis=0)
+    share = float((span / sides).prod())
+    if not 0 < share < _SMALL_SPAN:
+        return
+    apart = (sides * (places - places.min(axis=0)) / span).tolist()
+    eras = tuple(replace(era, x=x, y=y) for era, (x, y) in zip(rig.eras, apart, strict=True))
+    exact = dict.fromkeys(rig.channel_counts, 0.0)
+    with contextlib.suppress(InputError):  # no place for two fingers
+        here, there = (
+            resolve_name(_COST)(each, exact).exact_db for each in (rig, replace(rig, eras=eras))
+        )
+        yield (
+            f"eras: they span {percent(share)} of the plate; two contents are promised {here:.1f} "
+            f"dB, with ERAs spread to its corners {there:.1f} dB: check `at` of each after a "
+            "change of plate.length or plate.width"
+        )
+
+
+def _mount_notes(rig: Rig) -> Iterator[str]:
+    """Yield what stiff mounts cost that are points, and few points of an edge with many waves."""
+    decade = math.log(10) / (2 * math.pi * rig.plate.shear_rigidity)
+    mounts = {era.name: era.support for era in rig.eras} | dict(
+        zip(rig.supports, rig.masses[len(rig.masses) - len(rig.supports) :], strict=True)
+    )
+    for name, mount in mounts.items():
+        if mount.stiffness >= STIFF_MOUNT and not mount.foot:
+            yield (
+                f"eras.{name}.foot: the dent under a point of {mount.stiffness:g} N/m has no "
+                f"limit, a tenfold smaller one adds at least {100 * decade * mount.stiffness:.1f} "
+                "% of the mount's own compliance; give its radius, and see `era plate convergence`"
+            )
+    high = rig.limits.frequency_max
+    needed = least_points(rig.plate, high)
+    for kind in ("masses", "supports"):
+        for name, keys in _attached(rig, kind).items():
+            if "along" in keys and (count := keys.get("points", DEFAULT_POINTS)) < needed:
+                yield (
+                    f"{kind}.{name}.points: {count} on each edge are few at {high:g} Hz; give "
+                    f"{needed}"
+                )
+
+
+def _summary(rig: Rig) -> str:
+    plate, laminate = rig.plate, rig.laminate
+    thickness = plate.thickness if laminate is None else laminate.thickness
+    sizes = " x ".join(f"{1e3 * size:g}" for size in (plate.length, plate.width, thickness))
+    made_of = plate.material.name
+    if laminate is not None and len(laminate.layers) > 1:
+        made_of = f"laminate ({', '.join(layer.material.name for layer in laminate.layers)})"
+    parts = [
+        f"{sizes} mm of {made_of}",
+        f"mesh {rig.mesh}",
+        f"ERAs {', '.join(era.name for era in rig.eras)}",
+    ]
+    gap = plate.air_gap
+    if gap is not None:
+        edges = "sealed" if gap.closed else "open"
+        parts.insert(1, f"{1e3 * gap.depth:g} mm of air behind it, {edges} at the edges")
+    if feet := [*_attached(rig, "supports"), *rig.supports]:
+        parts.append(f"supported without being driven by {', '.join(feet)}")
+    if carried := sum(mass.mass for mass in rig.masses):
+        parts.append(f"carries {1e3 * carried:g} g")
+    return f"good: {', '.join(parts)}"
+
+
+def _attached(rig: Rig, kind: str) -> dict[str, Any]:
+    """Masses or supports of the rig's file."""
+    keys: Any = {} if rig.document is None else rig.document.data.get(kind)
+    return dict(keys or {})
+
+
+_MAX_ANGLE = math.radians(20.5)  # between two rows
+
+
+def gain_notes(rig: Rig) -> list[str]:
+    """Warnings: ERAs behind an output whose gains are missing, and each with rows too far apart.
+
+    What others than ERAs do behind an output is known without gains.
+    """
+    behind = [era for era in rig.eras if rig.wiring[era.name].amplifier in rig.outputs]
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    names = [era.name for era in behind if isinstance(era, Era) and not era.gains]
+    notes = []
+    if names:
+        notes.append(
+            f"gains of {', '.join(names)}: missing behind an output, so that their motion is a "
+            "guess, a stroke by full level at every frequency; measure the plate and calibrate the "
+            "rig"
+        )
+    return [*notes, *(text for era in behind for text in _notes(era, low, high))]
+
+
+def _notes(era: Source, low: float, high: float) -> list[str]:
+    played = [each for each in pairwise(era.gains) if each[0][0] < high and each[1][0] > low]
+    turns = {
+        abs(cmath.phase(cmath.rect(1, other[2] - one[2]))): (one[0], other[0])
+        for one, other in played
+    }
+    angle = max(turns, default=0.0)
+    if angle <= _MAX_ANGLE:
+        return []
+    first, last = turns[angle]
+    return [
+        f"eras.{era.name}.gains: phases differ by {math.degrees(angle):.0f} degrees between "
+        f"{first:g} and {last:g} Hz, at most 20 are interpolated well; measure between them"
+    ]
+
+
+_ARRANGEMENT = "drivers.by_hand.rig_check:arrangement_of"
+_COST = "model.study.clock_costs:clock_cost"
+_LOST_DB = 0.1  # contrast that is worth a warning
+
+
+def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict[str, Any]]:
+    """What the clocks of several amplifiers leave: to the line of a good rig, warnings, and data.
+
+    urls: by the amplifier's name. Nothing of one alone.
+    """
+    arrangement = resolve_name(_ARRANGEMENT)(
+        urls, channels=rig.channel_counts, stated=rig.clock_errors
+    )
+    if arrangement is None:
+        return "", [], {}
+    errors = dict.fromkeys(rig.channel_counts, 0.0) | arrangement.errors
+    try:
+        cost = resolve_name(_COST)(rig, errors)
+    except InputError:  # no place for two fingers
+        return "", [], {}
+    alone = [name for name, each in errors.items() if math.isinf(each)]
+    us = 1e6 * max((each for each in errors.values() if math.isfinite(each)), default=0.0)
+    said = (
+        f"{len(rig.eras)} ERAs on {len(errors)} amplifiers over {arrangement.lines}: clocks held "
+        f"together to {us:.0f} us; two contents keep {cost.kept_db:.1f} of {cost.exact_db:.1f} dB"
+    )
+    data = {
+        "lines": arrangement.lines,
+        "error_us": {
+            name: None if name in alone else round(1e6 * each, 1) for name, each in errors.items()
+        },
+        "exact_contrast_db": cost.exact_db,
+        "kept_contrast_db": cost.kept_db,
+    }
+    if cost.exact_db - cost.kept_db < _LOST_DB:
+        return f"; {said}", [], {"clocks": data}
+    remedy = f"; {arrangement.remedy} gives all of it" if arrangement.remedy and not alone else ""
+    unsteered = [
+        f"amplifier {name} has no clock that can be steered: its ERAs play contents of their own"
+        for name in alone
+    ]
+    return "", [said + remedy, *unsteered], {"clocks": data}
+
+
+_CHECK = "drivers.by_hand.rig_check:check_links"
+"""By name: this package does not import the one beside it.
+
+Of URLs by the amplifier's name, numbers of channels that are wired, and the rig's limits; it gives
+errors by the amplifier's name, and warnings, and opens none.
+"""
+
+
+def _urls(document: Document) -> dict[str, str]:
+    """All URLs that are text."""
+    amplifiers = document.data.get("amplifiers")
+    return {
+        name: whole_url(url, document.source, str(name))
+        for name, amplifier in (amplifiers.items() if isinstance(amplifiers, dict) else ())
+        if isinstance(amplifier, dict) and isinstance(url := amplifier.get("url"), str)
+    }
+
+
+def whole_url(url: str, rig_file: str | Path, amplifier: str) -> str:
+    """The URL of an amplifier; `sim://` alone becomes a simulated one over this rig's plate."""
+    if url != "sim://":
+        return url
+    return f"sim://{quote(os.fsencode(rig_file))}?amplifier={quote(amplifier)}"

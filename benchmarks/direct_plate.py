@@ -1,6 +1,6 @@
 """Response of a plate on any mesh solved at each frequency, without modes: a reference.
 
-Of polynomials it is `model.spectral.direct`; of finite elements one sparse factorisation for each
+Of polynomials it is `model.spectral.direct_solution`; of finite elements one sparse factorisation for each
 frequency. What ERAs and loads do to the plate is computed here: from the motion of an ERA's base
 the force (k_b + i omega c) y of the founding paper's Eq. 25, and the dynamic stiffness of each; of
 an exciter by the equations of its magnet and of its current, solved beside each other.
@@ -14,8 +14,8 @@ from scipy import sparse
 
 from model.arrays import ComplexArray, FloatArray
 from model.fem import Mesh, PlateMatrices, assemble, factorise
-from model.spectral.direct import Responder, direct_spectral_acceleration
-from model.spectral.mesh import PlateMesh
+from model.spectral.direct_solution import Responder, direct_spectral_acceleration
+from model.spectral.modes import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
 from model.structure.exciter import Exciter

@@ -121,8 +121,8 @@ def realised(
     import numpy as np
 
     from model.finger import DiscRule, decibels, detection_threshold, fingertips_on
-    from model.spectral.direct import direct_spectral_acceleration
-    from model.spectral.mesh import SpectralMesh
+    from model.spectral.direct_solution import direct_spectral_acceleration
+    from model.spectral.modes import SpectralMesh
     from model.structure.attachments import fingertip_loads
     from model.study.exact_plates import draw_plates
     from model.vibration import base_amplitudes

@@ -473,7 +473,7 @@ def element_slopes(plate: Plate, mesh: Mesh, shapes: FloatArray) -> FloatArray:
     """Derivatives of the stiffness between shapes (dof, r) of a plate on a mesh, (3, r, r).
 
     By the logarithms of length and width, at the same mass, and by Poisson's ratio: exactly, for
-    the reasons of `model.spectral.shape_stiffness`.
+    the reasons of `model.spectral.direct_solution`.
     """
     of, section = plate.material, rigidities(plate)
     apart = of.orthotropy is not None  # its shear moduli do not follow from nu

@@ -14,7 +14,7 @@ Discretisation error of natural frequencies and response, against a finer mesh.
 Without a converged response the error is estimated: of polynomials over the plate it is the sum of
 two changes of the response: by two further degrees, and where the compliance under forces that
 polynomials do not resolve is higher by 20 % and, under points, by a decade of the logarithm
-(`model.spectral.local_compliance`). Of finite elements it is the change to polynomials over the
+(`model.spectral.modes`). Of finite elements it is the change to polynomials over the
 plate, which are solved in a tenth of the time of elements as accurate or less (`reference_mesh`).
 """
 
@@ -37,7 +37,7 @@ from model.reduction.free_plate import FreePlate, SpectralModes, solve_free_plat
 from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import mesh_of
-from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import PointLoad, Source, footprints_of
 from model.structure.plate import Plate

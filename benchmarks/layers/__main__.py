@@ -11,8 +11,8 @@ from model.arrays import FloatArray
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.spectral.functions import CLASSES
 from model.spectral.modes import Band, SpectralPlate
+from model.spectral.polynomials import CLASSES
 from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.vibration import natural_modes

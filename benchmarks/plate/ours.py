@@ -7,7 +7,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.reduction import free_plate
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import mesh_of
-from model.spectral import functions
+from model.spectral import polynomials
 from model.structure.attachments import Era
 
 NAME = "era-haptics"
@@ -48,7 +48,7 @@ def eras_at(case: Case, shares: FloatArray) -> list[Era]:
 
 def forget() -> None:
     """Forget what is kept from one plate to the next: integrals of one dimension, weights."""
-    for module in (functions, free_plate):
+    for module in (polynomials, free_plate):
         for kept in vars(module).values():
             if hasattr(kept, "cache_clear"):
                 kept.cache_clear()

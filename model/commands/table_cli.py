@@ -40,7 +40,7 @@ from model.files.array_file import (
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.spectral.mesh import PlateMesh
+    from model.spectral.modes import PlateMesh
     from model.study.contrast_map import ContrastMap
 
 _MAX_LINE = 1 << 20  # characters of a question

@@ -84,7 +84,7 @@ from model.identification.least_squares import Linearization
 from model.identification.parameters import VALUE_UNITS
 from model.quantities import percent
 from model.rig.rig import Rig
-from model.spectral.mesh import stretched
+from model.spectral.modes import stretched
 from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
 from model.structure.exciter import Exciter

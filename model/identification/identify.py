@@ -37,7 +37,7 @@ from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
-from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable
 from model.study.exact_plates import draw_plates, felt_on
 from model.study.random_contacts import MIN_DISTANCE, random_contacts

@@ -26,7 +26,7 @@ from model.finger import Grid
 from model.reduction.free_plate import TERMS, FreeModes, FreePlate
 from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.spectral.shape_stiffness import stiffness_slopes
+from model.spectral.direct_solution import stiffness_slopes
 from model.structure.actuators import Actuator
 from model.structure.attachments import Gain, PointLoad, damping_from_ratio, footprints_of
 from model.structure.exciter import Exciter

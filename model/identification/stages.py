@@ -56,7 +56,7 @@ from model.identification.parameters import KINDS, MODE_SHIFTS, Space, inwards, 
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.spectral.shape_stiffness import grain_slopes
+from model.spectral.direct_solution import grain_slopes
 from model.structure.modal_elasticity import lowest_elastic
 from model.structure.plate import Plate
 

@@ -61,15 +61,17 @@ from model.fem import (
     factorise,
     lowest_modes,
 )
-from model.spectral.functions import CLASSES, deflections_by_class
-from model.spectral.local_compliance import (
+from model.spectral.modes import (
+    Band,
+    PlateMesh,
+    SpectralMesh,
+    SpectralPlate,
     UnresolvedCompliance,
     compliance_between,
     uncertain_compliance,
     unresolved_at,
 )
-from model.spectral.mesh import PlateMesh, SpectralMesh
-from model.spectral.modes import Band, SpectralPlate
+from model.spectral.polynomials import CLASSES, deflections_by_class
 from model.structure.attachments import (
     Source,
     Support,

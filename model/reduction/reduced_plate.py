@@ -47,7 +47,7 @@ from model.arrays import FloatArray
 from model.errors import InputError, shown
 from model.files.csv_file import as_frame
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.spectral.mesh import PlateMesh
+from model.spectral.modes import PlateMesh
 from model.structure.attachments import (
     Fingertip,
     FingertipLoad,

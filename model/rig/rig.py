@@ -26,7 +26,7 @@ from model.arrays import FloatArray, best_of
 from model.config.document import Document
 from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
-from model.spectral.mesh import PlateMesh
+from model.spectral.modes import PlateMesh
 from model.structure.actuators import Actuator, OneKind
 from model.structure.attachments import Fingertip, PointLoad, Source, feet_of
 from model.structure.feet_and_frames import FEET_DEVIATE

@@ -42,7 +42,7 @@ from model.rig.sections import (
     SupportSection,
     UncertaintySection,
 )
-from model.spectral.mesh import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
+from model.spectral.modes import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
 from model.structure.attachments import Fingertip, PointLoad
 from model.structure.feet_and_frames import EDGE_FOOT, FEET, FEET_DEVIATE, FOOT_LOSS, edge_points
 from model.structure.laminate_section import equivalent_plate

@@ -1,7 +1,7 @@
 """Verification of a table: a sample of it recomputed by other methods.
 
 - Content: fields on the raster and at the cells, against the plate solved at each frequency
-  without modes (`model.spectral.direct`), relative L2. On finite elements, and with measured modes,
+  without modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with measured modes,
   against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
 - Answers: level and contrast at random contacts, against the same with the fingers attached, too.
 - Promises: the felt contrast of nine of ten plates, on plates solved exactly.
@@ -37,8 +37,8 @@ from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
-from model.spectral.direct import Responder, direct_spectral_acceleration
-from model.spectral.mesh import PlateMesh, SpectralMesh
+from model.spectral.direct_solution import Responder, direct_spectral_acceleration
+from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.attachments import fingertip_loads, footprints_of
 from model.study.exact_plates import draw_plates, felt_on
 from model.study.random_contacts import random_contacts

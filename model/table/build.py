@@ -26,7 +26,7 @@ from model.processes import Progress, on_processes, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json
-from model.spectral.mesh import PlateMesh
+from model.spectral.modes import PlateMesh
 from model.structure.attachments import footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales
 from model.structure.support import check_supported

@@ -45,7 +45,7 @@ from model.finger import (
 )
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Uncertainty, fingerprint_of
-from model.spectral.mesh import PlateMesh
+from model.spectral.modes import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import (
     Fingertip,

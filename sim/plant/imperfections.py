@@ -19,7 +19,7 @@ from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import mesh_of
-from model.spectral.mesh import PlateMesh
+from model.spectral.modes import PlateMesh
 from model.structure.actuators import Actuator
 from model.structure.attachments import (
     Fingertip,

@@ -22,7 +22,7 @@ from model.arrays import FloatArray
 from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import mesh_of
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
 from model.vibration import estimate_error

@@ -23,7 +23,7 @@ from model.identification.parameters import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from model.spectral.mesh import stretched
+from model.spectral.modes import stretched
 from model.structure.attachments import PointLoad
 
 FREQUENCIES = np.arange(50.0, 491.0, 40.0)

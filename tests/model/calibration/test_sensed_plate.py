@@ -7,7 +7,7 @@ import pytest
 
 from model.calibration.fit import SensedPlate, sensed_plate
 from model.rig.rig import Rig
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import PointLoad
 from paper_plate import make_paper_rig
 

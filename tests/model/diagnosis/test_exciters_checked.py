@@ -12,8 +12,8 @@ from model.calibration.responses import Responses
 from model.diagnosis.diagnosis_report import verdict_rows
 from model.diagnosis.verdict import Verdict, diagnose
 from model.rig.rig import Rig
-from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.mesh import SpectralMesh
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
 from model.structure.exciter import Exciter
 
 TONES = np.arange(41.0, 300.0, 20.0)

@@ -17,7 +17,7 @@ from model.figures.paper import SWEEP, PaperFigure, equal_area_points, paper_fig
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import FOUR_ERA_LAYOUTS, alike
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.study.weak_cells import WeakCells
 from model.table.build import build_table
 from paper_plate import make_paper_rig

@@ -19,8 +19,8 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.rig_writing import rewritten_text
-from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.mesh import SpectralMesh
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
 

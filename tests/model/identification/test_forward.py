@@ -20,8 +20,8 @@ from model.identification.parameters import (
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, mesh_of
-from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.mesh import SpectralMesh
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.exciter import Exciter
 from model.structure.laminate_section import equivalent_plate

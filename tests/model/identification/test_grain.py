@@ -12,7 +12,7 @@ from model.identification.least_squares import Measurement
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import rig_of
 from model.rig.rig_writing import rewritten_text
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.structure.plate import Orthotropy
 
 TEXT = """\

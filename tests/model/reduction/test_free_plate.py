@@ -11,7 +11,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.errors import InputError
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Laminate, LaminateLayer, Plate
 from model.vibration import natural_modes

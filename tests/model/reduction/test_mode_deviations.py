@@ -11,9 +11,8 @@ from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.reduction.reduced_plate import modal_matrices, reduce_free_plate, reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
-from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.local_compliance import local_compliance
-from model.spectral.mesh import SpectralMesh
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh, local_compliance
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
 from model.study.verify import verify_table

@@ -10,9 +10,8 @@ from benchmarks.layers.gap import air_pressure, cell_middles
 from long_form import in_turn
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import parse_rig
-from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import SpectralPlate
-from model.spectral.stiffness import air_motion
+from model.spectral.modes import SpectralMesh, SpectralPlate
+from model.spectral.polynomials import air_motion
 from model.structure.attachments import Era
 from model.structure.plate import HEAT_RATIO, PRESSURE, VISCOSITY, AirGap, Material, Plate
 from model.vibration import natural_modes

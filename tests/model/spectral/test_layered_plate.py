@@ -14,9 +14,8 @@ from model.fem import Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig_file import load_rig
-from model.spectral.direct import AtOneFrequency
-from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import Band, SpectralPlate
+from model.spectral.direct_solution import AtOneFrequency
+from model.spectral.modes import Band, SpectralMesh, SpectralPlate
 from model.structure.attachments import Era, footprints_of
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Laminate, LaminateLayer, Material, Plate

@@ -7,8 +7,8 @@ import pytest
 
 from model.fem import ELEMENTS, Mesh, element_slopes
 from model.reduction.free_plate import solve_free_plate
-from model.spectral.mesh import SpectralMesh
-from model.spectral.shape_stiffness import grain_slopes, stiffness_slopes
+from model.spectral.direct_solution import grain_slopes, stiffness_slopes
+from model.spectral.modes import SpectralMesh
 from model.structure.laminate_section import equivalent_plate
 from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
 

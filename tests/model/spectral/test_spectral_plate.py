@@ -12,11 +12,9 @@ from model.errors import InputError
 from model.fem import Q5, Mesh
 from model.reduction.free_plate import SpectralModes, solve_free_plate
 from model.rig.rig_file import mesh_of
-from model.spectral.direct import direct_spectral_acceleration
-from model.spectral.functions import CLASSES
-from model.spectral.local_compliance import local_compliance
-from model.spectral.mesh import SpectralMesh
-from model.spectral.modes import SpectralPlate
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh, SpectralPlate, local_compliance
+from model.spectral.polynomials import CLASSES
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Material, Plate
 from model.vibration import natural_modes

@@ -8,8 +8,8 @@ from scipy import special
 from scipy.integrate import trapezoid
 
 from model.reduction.free_plate import solve_free_plate
-from model.spectral.functions import EVEN, EdgedFunctions
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
+from model.spectral.polynomials import EVEN, EdgedFunctions
 from paper_plate import make_paper_rig
 
 PLATE = make_paper_rig(12, 9).plate

@@ -9,7 +9,7 @@ import pytest
 from error_estimates import CASES, MAX_RATIO, judge
 from long_form import shortly
 from model.errors import InputError
-from model.spectral.mesh import SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.vibration import Tone, find_nulls, peak_acceleration, plate_map, tone_fields
 from paper_plate import LENGTH, WIDTH
 

@@ -16,7 +16,7 @@ from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.identification.identify import identify
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
-from model.spectral.direct import direct_spectral_acceleration
+from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.moved_sensor import PlacesFile, measure_places

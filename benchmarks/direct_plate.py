@@ -16,9 +16,8 @@ from model.arrays import ComplexArray, FloatArray
 from model.fem import Mesh, PlateMatrices, assemble, factorise
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
 from model.spectral.modes import PlateMesh
-from model.structure.actuators import Actuator
 from model.structure.attachments import Era, FingertipLoad, PointLoad, footprints_of
-from model.structure.exciter import Exciter
+from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import loss_factors
 from model.structure.plate import Plate
 

@@ -27,9 +27,8 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from model.arrays import FloatArray, IntArray, lattice
 from model.errors import InputError
-from model.structure.attachments import PointLoad, footprints_of
-from model.structure.discretisation import Discretisation
-from model.structure.footprint import check_on_plate, mean_over
+from model.structure.attachments import PointLoad, check_on_plate, footprints_of, mean_over
+from model.structure.modal_elasticity import Discretisation
 from model.structure.plate import SHEAR_CORRECTION, Plate
 
 DOF_PER_NODE = 3

@@ -38,8 +38,8 @@ from model.reduction.reduced_plate import on_springs, reduce_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
-from model.structure.actuators import Actuator
 from model.structure.attachments import PointLoad, Source, footprints_of
+from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 
 

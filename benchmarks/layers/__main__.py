@@ -13,8 +13,16 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.spectral.modes import Band, SpectralPlate
 from model.spectral.polynomials import CLASSES
-from model.structure.laminate_section import bending, equivalent_plate, wavenumber_of
-from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
+from model.structure.plate import (
+    AirGap,
+    Laminate,
+    LaminateLayer,
+    Material,
+    Plate,
+    bending,
+    equivalent_plate,
+    wavenumber_of,
+)
 from model.vibration import natural_modes
 
 PANEL = load_rig(RIG.parent / "glass_panel.yaml")

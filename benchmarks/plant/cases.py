@@ -15,8 +15,8 @@ from model.finger import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import load_rig
-from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
+from model.structure.exciter import Actuator
 from model.transients.base_motion import raised_cosine
 from sim.bench.bench import Bench
 from sim.plant.plant import SAMPLE_RATE, Plant

@@ -34,7 +34,7 @@ from model.identification.learned_plate import was_learned
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.rig_summary import clock_costs, gain_notes, whole_url
-from model.structure.support import check_supported
+from model.structure.attachments import check_supported
 
 API_SOURCES = "api"
 """Prefix of the touch sources of API clients, reserved for them."""

@@ -7,9 +7,8 @@ from key_tables import key_table
 from model.config.fields import Section
 from model.rig import sections
 from model.rig.actuator_keys import EraSection, ExciterSection
-from model.structure.exciter_types import EXCITER_TYPES
-from model.structure.feet_and_frames import FEET, FOOT_LOSS
-from model.structure.materials import KNOWN_MATERIALS
+from model.structure.attachments import FEET, FOOT_LOSS
+from model.structure.materials import EXCITER_TYPES, KNOWN_MATERIALS
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,

@@ -49,7 +49,7 @@ from model.files.uff import (
 from model.identification.forward import Sensor
 from model.identification.least_squares import Measurement
 from model.rig.rig import Rig
-from model.structure.actuators import Actuator
+from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 
 # Tolerances of a ruler [m]: of an ERA's position, and of a sensor beyond the plate's edge.

@@ -109,7 +109,7 @@ def plate_map(
 
     from model.commands.options import beyond_limits, parse_drives
     from model.rig.rig_file import load_rig
-    from model.structure.support import support_problem
+    from model.structure.attachments import support_problem
     from model.vibration import G
     from model.vibration import plate_map as solve
 

@@ -14,7 +14,7 @@ from model.design.run import Design, RankedLayout
 from model.figures import COLORS, Template, draw_eras, label_plate, save_figure, write_template
 from model.files.array_file import whole_or_nothing
 from model.files.csv_file import Columns, write_columns
-from model.structure.support import rigid_body_frequencies, static_loads
+from model.structure.attachments import rigid_body_frequencies, static_loads
 
 MAX_SHOWN = 10
 """Layouts in a summary; the CSV file has all."""

@@ -21,8 +21,8 @@ from model.design.area import EDGE, Area, candidates_of
 from model.design.contacts import ContactRule
 from model.errors import InputError
 from model.rig.rig import Rig, named_layouts
-from model.structure.actuators import Actuator
-from model.structure.support import rigid_body_frequencies, static_loads
+from model.structure.attachments import rigid_body_frequencies, static_loads
+from model.structure.exciter import Actuator
 from model.table.table import default_drive_frequencies
 
 DEFAULT_LOWEST = 20.0

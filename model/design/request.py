@@ -29,7 +29,7 @@ from model.errors import (
 )
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.rig.rig import Rig
-from model.structure.support import MIN_RIGID_BODY_FREQUENCY
+from model.structure.attachments import MIN_RIGID_BODY_FREQUENCY
 
 MAX_STIFFNESSES, MAX_ERAS = 9, 32
 

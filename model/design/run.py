@@ -25,8 +25,8 @@ from model.processes import Progress, on_processes, unseen
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.rig_writing import stated
-from model.structure.actuators import Actuator
-from model.structure.support import support_problem
+from model.structure.attachments import support_problem
+from model.structure.exciter import Actuator
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 

@@ -31,8 +31,8 @@ from model.ensemble.touched_plate import expected_power, power_of
 from model.finger import FIVE_POINTS, STRONG_DB_SL, Grid, detection_threshold, fingertips_on
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.structure.actuators import Actuator
 from model.structure.attachments import coupled_forces
+from model.structure.exciter import Actuator
 
 LEVEL_RESERVE = 1.2
 """Factor on the wanted level for what nine of ten plates need beyond the nominal plate."""

@@ -85,9 +85,8 @@ from model.identification.parameters import VALUE_UNITS
 from model.quantities import percent
 from model.rig.rig import Rig
 from model.spectral.modes import stretched
-from model.structure.actuators import Actuator
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
-from model.structure.exciter import Exciter
+from model.structure.exciter import Actuator, Exciter
 
 _SIZES = (0.6, 0.67, 0.75, 0.82, 0.88, 0.94, 1.06, 1.13, 1.21, 1.33, 1.5, 1.67)
 _STIFFNESSES = (0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)

@@ -21,7 +21,7 @@ from model.files.csv_file import Columns
 from model.finger import Grid
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import FOUR_ERA_LAYOUTS, Rig, alike, diagonal_pair, edge_pair
-from model.structure.actuators import Actuator
+from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 from model.vibration import G, Tone, natural_modes, plate_map
 

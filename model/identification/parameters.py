@@ -27,10 +27,14 @@ from model.reduction.free_plate import TERMS, FreeModes, FreePlate
 from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.spectral.direct_solution import stiffness_slopes
-from model.structure.actuators import Actuator
-from model.structure.attachments import Gain, PointLoad, damping_from_ratio, footprints_of
-from model.structure.exciter import Exciter
-from model.structure.feet_and_frames import FEET_DEVIATE
+from model.structure.attachments import (
+    FEET_DEVIATE,
+    Gain,
+    PointLoad,
+    damping_from_ratio,
+    footprints_of,
+)
+from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FACTOR, Plate
 

@@ -75,13 +75,13 @@ from model.spectral.polynomials import CLASSES, deflections_by_class
 from model.structure.attachments import (
     Source,
     Support,
+    as_footprints,
     attached_stiffness,
+    check_on_plate,
     coupled_forces,
     footprints_of,
     unit_accelerations,
 )
-from model.structure.footprint import as_footprints, check_on_plate
-from model.structure.laminate_section import short_wave_plate
 from model.structure.modal_elasticity import (
     Dispersion,
     ModalElasticity,
@@ -89,7 +89,7 @@ from model.structure.modal_elasticity import (
     loss_factors,
     modal_receptance,
 )
-from model.structure.plate import Plate
+from model.structure.plate import Plate, short_wave_plate
 
 RESIDUAL_ORDER = 4
 """Residual vectors of each point.

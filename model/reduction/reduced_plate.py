@@ -54,12 +54,12 @@ from model.structure.attachments import (
     InTime,
     PointLoad,
     Source,
+    as_footprints,
+    check_supported,
     footprints_of,
 )
-from model.structure.footprint import as_footprints
 from model.structure.modal_elasticity import Dispersion, ModalElasticity, loss_factors
 from model.structure.plate import Plate
-from model.structure.support import check_supported
 
 RESIDUAL_VECTORS = 3  # for each attachment
 

@@ -41,10 +41,9 @@ from model.config.fields import (
     Section,
 )
 from model.finger import THRESHOLDS
-from model.structure.actuators import Actuator
 from model.structure.attachments import Era, Gain, damping_from_ratio
-from model.structure.exciter import Exciter
-from model.structure.exciter_types import EXCITER_TYPES
+from model.structure.exciter import Actuator, Exciter
+from model.structure.materials import EXCITER_TYPES
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean
 

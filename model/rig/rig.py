@@ -27,9 +27,8 @@ from model.config.document import Document
 from model.errors import InputError, expect_between
 from model.finger import DEFAULT_THRESHOLD, FINGERTIP_RADIUS, THRESHOLDS
 from model.spectral.modes import PlateMesh
-from model.structure.actuators import Actuator, OneKind
-from model.structure.attachments import Fingertip, PointLoad, Source, feet_of
-from model.structure.feet_and_frames import FEET_DEVIATE
+from model.structure.attachments import FEET_DEVIATE, Fingertip, PointLoad, Source, feet_of
+from model.structure.exciter import Actuator, OneKind
 from model.structure.plate import Laminate, Plate
 from registry.limits import GuardLimits
 from registry.plugins import did_you_mean

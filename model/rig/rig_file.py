@@ -43,11 +43,25 @@ from model.rig.sections import (
     UncertaintySection,
 )
 from model.spectral.modes import MAX_DEGREE, MAX_POLYNOMIALS, POLYNOMIALS, PlateMesh, SpectralMesh
-from model.structure.attachments import Fingertip, PointLoad
-from model.structure.feet_and_frames import EDGE_FOOT, FEET, FEET_DEVIATE, FOOT_LOSS, edge_points
-from model.structure.laminate_section import equivalent_plate
+from model.structure.attachments import (
+    EDGE_FOOT,
+    FEET,
+    FEET_DEVIATE,
+    FOOT_LOSS,
+    Fingertip,
+    PointLoad,
+    edge_points,
+)
 from model.structure.materials import KnownMaterial
-from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Orthotropy, Plate
+from model.structure.plate import (
+    AirGap,
+    Laminate,
+    LaminateLayer,
+    Material,
+    Orthotropy,
+    Plate,
+    equivalent_plate,
+)
 from registry.limits import GuardLimits
 from registry.plugins import did_you_mean
 

@@ -34,19 +34,27 @@ from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, limits_of, rig_of
 from model.rig.sections import LimitsSection, PlateSection, RigSection
-from model.structure.attachments import Era, Source
+from model.structure.attachments import (
+    DEFAULT_POINTS,
+    GRAVITY,
+    Era,
+    Source,
+    least_points,
+    support_problem,
+)
 from model.structure.exciter import Exciter
-from model.structure.exciter_types import EXCITER_TYPES
-from model.structure.feet_and_frames import DEFAULT_POINTS, least_points
-from model.structure.laminate_section import (
+from model.structure.materials import EXCITER_TYPES
+from model.structure.plate import (
+    AirGap,
+    Bond,
+    Laminate,
+    Plate,
     bending,
     freely_sliding,
     perfectly_bonded,
     slide_frequency,
     wavenumber_of,
 )
-from model.structure.plate import AirGap, Bond, Laminate, Plate
-from model.structure.support import GRAVITY, support_problem
 from registry.limits import GuardLimits
 
 _EXCURSIONS = "model.transients.excursions:excursions_of"

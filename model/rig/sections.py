@@ -52,7 +52,7 @@ from model.rig.actuator_keys import (
     check_url,
 )
 from model.rig.rig import BOUNDS, Uncertainty
-from model.structure.feet_and_frames import DEFAULT_POINTS, FootKind
+from model.structure.attachments import DEFAULT_POINTS, FootKind
 from model.structure.materials import KnownMaterial, known_material, material_names
 from model.structure.plate import MAX_LOSS_EXPONENT, Bond
 

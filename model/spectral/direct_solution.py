@@ -37,20 +37,21 @@ from model.spectral.polynomials import (
 from model.structure.attachments import (
     Source,
     Support,
+    as_footprints,
     coupled_forces,
     footprints_of,
     unit_accelerations,
 )
-from model.structure.footprint import as_footprints
-from model.structure.laminate_section import (
+from model.structure.modal_elasticity import loss_factors
+from model.structure.plate import (
     CrossSection,
+    LaminateLayer,
+    Plate,
     interface_mass,
     section_of,
     shear_corrections,
     short_wave_plate,
 )
-from model.structure.modal_elasticity import loss_factors
-from model.structure.plate import LaminateLayer, Plate
 
 Responder: TypeAlias = Callable[..., ComplexArray]
 """Acceleration [m/s²] of each ERA alone at full stroke, (f, eras, p).

@@ -61,15 +61,16 @@ from model.spectral.polynomials import (
     edge_decays,
     follow,
 )
-from model.structure.discretisation import Discretisation
-from model.structure.footprint import as_footprints, mean_over
-from model.structure.laminate_section import (
+from model.structure.attachments import as_footprints, mean_over
+from model.structure.modal_elasticity import Discretisation
+from model.structure.plate import (
+    LaminateLayer,
+    Plate,
     interface_mass,
     opposite_motions,
     section_of,
     shear_corrections,
 )
-from model.structure.plate import LaminateLayer, Plate
 
 NODES = 12
 """Frequencies of a band at which modes state their stiffness."""

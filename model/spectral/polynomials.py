@@ -39,9 +39,8 @@ from numpy.polynomial.legendre import leggauss, legvander
 from scipy import linalg
 
 from model.arrays import FloatArray
-from model.structure.footprint import mean_over
-from model.structure.laminate_section import CrossSection
-from model.structure.plate import AirGap
+from model.structure.attachments import mean_over
+from model.structure.plate import AirGap, CrossSection
 
 EVEN, ODD = 1, -1
 

@@ -15,18 +15,20 @@ moving mass of that sheet.
 
 Not modelled: stiffness and damping by amplitude, heat of the coil (0.39 % of R_e a kelvin), eddy
 currents, rocking of the magnet.
+
+Kinds of actuators that drive a plate.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import ClassVar, Self, TypeAlias, TypeVar
 
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import MAX_VALUE, InputError, expect_values
-from model.structure.attachments import Factor, InTime, PointLoad, Source
+from model.structure.attachments import Era, Factor, InTime, PointLoad, Source
 
 _MAX_LAG = 0.1
 
@@ -231,3 +233,10 @@ class Exciter(Source):
         """Force of the current of a coil that is held [N], at full level."""
         drive = self.voltage * self.gain(w / (2 * np.pi))
         return np.asarray(self.force_factor / self._impedance(w) * drive)
+
+
+Actuator: TypeAlias = Era | Exciter
+"""Any of them, each a `Source`; further kinds are listed here and in `model.rig.actuator_keys`."""
+
+OneKind = TypeVar("OneKind", Era, Exciter, Actuator)
+"""Of a function that gives the kind of actuator that it is given."""

@@ -6,8 +6,11 @@ loss factor of its lowest elastic modes differ (`Plate.mode_deviations`), and th
 varies as a power of the frequency. Shapes stay those of the theory, and so do all higher modes.
 
 Adhesives and air change the complex eigenvalues of modes with frequency: their dispersion.
+
+What discretisations of a plate have in common: the shortest waves that they resolve.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
@@ -164,3 +167,39 @@ def modal_receptance(
 def _powers(plate: Plate, omega: FloatArray) -> FloatArray:
     ratio = np.abs(omega) / (2 * np.pi * LOSS_FREQUENCY)
     return np.asarray(ratio**plate.loss_exponent)
+
+
+@dataclass(frozen=True)
+class Discretisation(ABC):
+    """nx by ny elements, or polynomials of these degrees, over length by width [m]."""
+
+    nx: int
+    ny: int
+    length: float
+    width: float
+
+    @property
+    @abstractmethod
+    def shortest_wavelength(self) -> float:
+        """The shortest bending wavelength [m] that it resolves."""
+
+    @abstractmethod
+    def resolving(self, plate: Plate, frequency: float) -> Self:
+        """The coarsest of its kind that resolves a frequency [Hz]."""
+
+    def highest_frequency(self, plate: Plate) -> float:
+        """The highest frequency [Hz] whose bending waves in a plate it resolves."""
+        return plate.bending_frequency(self.shortest_wavelength)
+
+    def check_frequencies(self, plate: Plate, frequencies: FloatArray) -> None:
+        """Raise InputError for frequencies (f,) [Hz] not above zero, or too high for it."""
+        for frequency in frequencies:
+            if not (np.isfinite(frequency) and frequency > 0):
+                raise InputError(f"frequency must be above zero, got {frequency} Hz")
+        highest, resolved = max(frequencies, default=0.0), self.highest_frequency(plate)
+        if highest > resolved:
+            raise InputError(
+                f"frequency must be at most {resolved:g} Hz, which mesh {self} resolves, got "
+                f"{highest:g} Hz; use mesh {self.resolving(plate, highest)} or finer, or with "
+                f"mesh: auto raise the upper limits.frequency to {highest:g} Hz"
+            )

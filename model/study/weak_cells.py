@@ -21,8 +21,8 @@ from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point, nullable
 from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, Grid
-from model.structure.actuators import Actuator
 from model.structure.attachments import PointLoad
+from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 from model.study.random_contacts import MIN_DISTANCE
 from model.table.table import LocalizationTable

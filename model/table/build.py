@@ -27,9 +27,8 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import PHYSICS, Rig, canonical_json
 from model.spectral.modes import PlateMesh
-from model.structure.attachments import footprints_of
+from model.structure.attachments import check_supported, footprints_of
 from model.structure.modal_elasticity import Dispersion, check_scales
-from model.structure.support import check_supported
 from model.table.file import FORMAT_VERSION, MAX_BYTES, load_table, save_table
 from model.table.raster import Raster
 from model.table.table import PAPER_GRID, LocalizationTable, default_drive_frequencies

@@ -14,8 +14,8 @@ import numpy as np
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig, differences
-from model.structure.actuators import Actuator
 from model.structure.attachments import footprints_of
+from model.structure.exciter import Actuator
 from model.structure.modal_elasticity import check_scales
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable

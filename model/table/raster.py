@@ -14,7 +14,7 @@ import numpy as np
 from model.arrays import Float32Array, FloatArray, IntArray, lattice
 from model.errors import InputError
 from model.finger import FINGERTIP_RADIUS, FIVE_AND_FINE, FIVE_POINTS, fingertips_on
-from model.structure.footprint import mean_over
+from model.structure.attachments import mean_over
 from model.structure.plate import Plate
 
 POINTS_PER_WAVELENGTH = 20

@@ -46,14 +46,13 @@ from model.finger import (
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Uncertainty, fingerprint_of
 from model.spectral.modes import PlateMesh
-from model.structure.actuators import Actuator
 from model.structure.attachments import (
     Fingertip,
     PointLoad,
     fingertip_loads,
     footprints_of,
 )
-from model.structure.exciter import Exciter
+from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
 from model.table.raster import FingertipShapes, Raster

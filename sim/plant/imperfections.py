@@ -20,13 +20,13 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh
-from model.structure.actuators import Actuator
 from model.structure.attachments import (
     Fingertip,
     FingertipLoad,
     PointLoad,
     fingertip_loads,
 )
+from model.structure.exciter import Actuator
 from model.study.exact_plates import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration import finer_mesh

@@ -21,8 +21,7 @@ from model.finger import FIVE_POINTS, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
-from model.structure.attachments import Era, attached_stiffness, drive_forces
-from model.structure.support import static_loads
+from model.structure.attachments import Era, attached_stiffness, drive_forces, static_loads
 
 GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
 """Errors of the gains only, 5 % and 5 degrees."""

@@ -24,8 +24,7 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.exciter import Exciter
-from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Bond, Laminate, LaminateLayer, Material
+from model.structure.plate import Bond, Laminate, LaminateLayer, Material, equivalent_plate
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])
 PAD = Sensor("pad", x=0.1, y=0.07)

@@ -18,7 +18,7 @@ from model.rig.rig_file import parse_rig
 from model.rig.rig_summary import RIG, exciter_notes, excursion_notes
 from model.rig.rig_writing import rewritten_text
 from model.structure.exciter import Exciter
-from model.structure.exciter_types import EXCITER_TYPES
+from model.structure.materials import EXCITER_TYPES
 from model.table.build import build_table
 from model.table.following import table_following
 

@@ -11,7 +11,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
 from model.rig.rig_summary import plate_summary
 from model.rig.sections import PlateSection
-from model.structure.support import rigid_body_frequencies
+from model.structure.attachments import rigid_body_frequencies
 from model.vibration import natural_modes
 
 PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}

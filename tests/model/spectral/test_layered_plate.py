@@ -17,8 +17,7 @@ from model.rig.rig_file import load_rig
 from model.spectral.direct_solution import AtOneFrequency
 from model.spectral.modes import Band, SpectralMesh, SpectralPlate
 from model.structure.attachments import Era, footprints_of
-from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Laminate, LaminateLayer, Material, Plate
+from model.structure.plate import Laminate, LaminateLayer, Material, Plate, equivalent_plate
 from model.vibration import natural_modes
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"

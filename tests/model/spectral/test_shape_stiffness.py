@@ -9,8 +9,14 @@ from model.fem import ELEMENTS, Mesh, element_slopes
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.direct_solution import grain_slopes, stiffness_slopes
 from model.spectral.modes import SpectralMesh
-from model.structure.laminate_section import equivalent_plate
-from model.structure.plate import Laminate, LaminateLayer, Material, Orthotropy, Plate
+from model.structure.plate import (
+    Laminate,
+    LaminateLayer,
+    Material,
+    Orthotropy,
+    Plate,
+    equivalent_plate,
+)
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
 PLATE = Plate(0.3, 0.21, 0.001, GLASS)

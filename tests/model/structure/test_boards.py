@@ -15,10 +15,15 @@ from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig import Rig
 from model.rig.rig_writing import rig as rig_by_keys
-from model.structure.attachments import PointLoad, footprints_of
+from model.structure.attachments import (
+    GRAVITY,
+    PointLoad,
+    footprints_of,
+    static_loads,
+    support_problem,
+)
 from model.structure.materials import known_material
 from model.structure.plate import Material, Plate
-from model.structure.support import GRAVITY, static_loads, support_problem
 from model.table.build import TableProblem, solve_table
 from model.table.following import table_following
 from model.table.table import LocalizationTable

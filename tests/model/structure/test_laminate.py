@@ -8,7 +8,11 @@ import pytest
 
 from benchmarks.layers.elasticity import wave_number
 from long_form import in_turn
-from model.structure.laminate_section import (
+from model.structure.plate import (
+    Bond,
+    Laminate,
+    LaminateLayer,
+    Material,
     bending,
     equivalent_plate,
     freely_sliding,
@@ -17,7 +21,6 @@ from model.structure.laminate_section import (
     wave_rigidity,
     wavenumber_of,
 )
-from model.structure.plate import Bond, Laminate, LaminateLayer, Material
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)

@@ -11,10 +11,16 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.fem import Mesh
 from model.reduction.free_plate import solve_free_plate
-from model.structure.attachments import Era, Fingertip, PointLoad
-from model.structure.footprint import mean_over
+from model.structure.attachments import (
+    Era,
+    Fingertip,
+    PointLoad,
+    check_supported,
+    mean_over,
+    rigid_body_frequencies,
+    support_problem,
+)
 from model.structure.plate import Material, Plate
-from model.structure.support import check_supported, rigid_body_frequencies, support_problem
 from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))

@@ -10,8 +10,12 @@ from exciter_rig import exciter_rig
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig import Rig
-from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
-from model.structure.support import rigid_body_frequencies
+from model.structure.attachments import (
+    Fingertip,
+    FingertipLoad,
+    footprints_of,
+    rigid_body_frequencies,
+)
 from model.transients.knots import steady_states
 from model.transients.loaded_envelopes import enveloped_accelerations
 from model.transients.time_response import PlateInTime, plate_in_time

@@ -7,7 +7,7 @@ The examples with four, eight, twelve and sixteen ERAs, 40 to 320 Hz in steps of
 apart (8 cm on the table) with contents of 20 dB SL, 20 Hz apart; `identified`: with an uncertainty
 as after `era rig identify`. For every number of contents and quiet fingers the worst finger that
 nine of ten plates promise: median over the sets (and their worst tenth); share of exactly solved
-plates that keep the promise (`model.study.exact_plates`); processor time of an answer on one
+plates that keep the promise (`model.study.verification`); processor time of an answer on one
 thread, median. With --fingers so many fingers in all, 3 cm apart, for the times. With --modulation
 contents 30 Hz apart, of which the first comes and goes so often: what that costs the worst finger
 where it is served, median over the sets (and the most). With --distortion amplifiers whose second
@@ -313,7 +313,7 @@ def _kept(
     import numpy as np
 
     from model.answer.stimulus import Placement
-    from model.study.exact_plates import draw_plates, powers_on
+    from model.study.verification import draw_plates, powers_on
 
     count = len(found.layers) + len(quiet)
     plates = draw_plates(

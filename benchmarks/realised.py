@@ -124,7 +124,7 @@ def realised(
     from model.spectral.direct_solution import direct_spectral_acceleration
     from model.spectral.modes import SpectralMesh
     from model.structure.attachments import fingertip_loads
-    from model.study.exact_plates import draw_plates
+    from model.study.verification import draw_plates
     from model.vibration import base_amplitudes
 
     plate, eras = rig.plate, rig.eras

@@ -154,7 +154,7 @@ def _score(
 
     from benchmarks.realised import realised
     from model.finger import decibels
-    from model.study.exact_plates import draw_plates, felt_on
+    from model.study.verification import draw_plates, felt_on
     from model.vibration import Tone
 
     question = _placement(rig, quiet, number)

@@ -50,7 +50,7 @@ from model.rig.rig_file import load_rig as load_rig
 from model.rig.rig_writing import rig as rig
 from model.rig.rig_writing import save_rig as save_rig
 from model.structure.attachments import Fingertip as Fingertip
-from model.study.contrast_map import ContrastMap as ContrastMap
+from model.study.contrast_maps import ContrastMap as ContrastMap
 from model.table.file import load_table as load_table
 from model.table.file import save_table as save_table
 from model.table.table import LocalizationTable as LocalizationTable

@@ -13,7 +13,7 @@ from model.answer.answer import Answer
 from model.arrays import FloatArray
 from model.errors import InputError, expect, is_whole, shown
 from model.figures import contents_figure, contrast_map_figure, layer_figure, map_figure
-from model.study.contrast_map import ContrastMap
+from model.study.contrast_maps import ContrastMap
 from model.table.table import LocalizationTable
 from sim.plant.excited_plate import LEVEL_WINDOW, Playback
 from sim.plant.fingers import Record

@@ -21,7 +21,7 @@ from model.errors import InputError, expect, expect_number, shown
 from model.finger import STRONG_DB_SL, Grid
 from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig
-from model.study.contrast_map import ContrastMap, map_contrast
+from model.study.contrast_maps import ContrastMap, map_contrast
 from model.table.build import cached_table
 from model.table.table import PAPER_GRID, LocalizationTable
 

@@ -46,10 +46,9 @@ from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, Grid, sensation_level
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.structure.plate import Plate
-from model.study.contrast_map import ContrastMap
+from model.study.contrast_maps import WANTED_CONTRAST_DB, ContrastMap, WeakCells
 from model.study.overview import Overview
 from model.study.promise_at_sensors import MeasuredVerification
-from model.study.weak_cells import WANTED_CONTRAST_DB, WeakCells
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, G, PlateMap
 

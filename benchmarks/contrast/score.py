@@ -19,7 +19,7 @@ from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
-from model.study.exact_plates import draw_plates, felt_on
+from model.study.verification import draw_plates, felt_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable
 from model.vibration import Excitation

@@ -78,7 +78,7 @@ def clicks_on(table: "LocalizationTable", sets: int, seed: int) -> Clicks:
 
     from model.answer.plan import query
     from model.answer.stimulus import Placement
-    from model.study.random_contacts import random_contacts
+    from model.study.contrast_maps import random_contacts
 
     rng, found = np.random.default_rng(seed), []
     for number in range(sets):
@@ -113,7 +113,7 @@ def _drawn_plates(
     """The table of each plate, and gains and second harmonics of its drives (eras,)."""
     import numpy as np
 
-    from model.study.exact_plates import draw_plates
+    from model.study.verification import draw_plates
     from model.table.following import table_following
 
     drawn = draw_plates(

@@ -29,7 +29,7 @@ from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.finger import FINGERTIP_RADIUS
-from model.study.exact_plates import draw_plates, powers_on
+from model.study.verification import draw_plates, powers_on
 from model.table.table import read_fingertips
 from registry import threads
 

@@ -18,7 +18,7 @@ from benchmarks.setting import use_one_thread
 if TYPE_CHECKING:
     from model.answer.answer import Answer
     from model.arrays import FloatArray
-    from model.study.exact_plates import Plates
+    from model.study.verification import Plates
     from model.table.table import LocalizationTable
 
 
@@ -38,8 +38,8 @@ def main() -> None:
     from benchmarks.promise.cases import CASES
     from model.answer.plan import answer
     from model.answer.stimulus import Finger, Stimulus
-    from model.study.exact_plates import draw_plates
-    from model.study.random_contacts import random_contacts
+    from model.study.contrast_maps import random_contacts
+    from model.study.verification import draw_plates
 
     print("| | not counted: promised | kept | counted: promised | kept |")
     print("|---|---|---|---|---|")
@@ -71,7 +71,7 @@ def contrasts_on(table: "LocalizationTable", found: "Answer", plates: "Plates") 
     import numpy as np
 
     from model.answer.stimulus import Placement
-    from model.study.exact_plates import harmonics_on, powers_on
+    from model.study.verification import harmonics_on, powers_on
     from model.table.table import read_fingertips
 
     places = [each.at for each in found.asked]

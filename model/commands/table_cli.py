@@ -41,7 +41,7 @@ from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.spectral.modes import PlateMesh
-    from model.study.contrast_map import ContrastMap
+    from model.study.contrast_maps import ContrastMap
 
 _MAX_LINE = 1 << 20  # characters of a question
 
@@ -330,7 +330,7 @@ def export(
 
     docs/reference/table-file.md describes the content.
     """
-    from model.study.export import export_csv, export_mat
+    from model.study.overview import export_csv, export_mat
     from model.table.file import load_table
 
     if content is not None and to is Format.MAT:
@@ -381,7 +381,7 @@ def contrast_map(
 ) -> None:
     """Map the promised contrast of every place to given quiet fingers."""
     from model.finger import Grid
-    from model.study.contrast_map import map_contrast
+    from model.study.contrast_maps import map_contrast
     from model.table.file import load_table
 
     inches = figure_size(size)

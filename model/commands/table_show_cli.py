@@ -19,10 +19,9 @@ from model.files.array_file import begins_with, check_picture
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.study.promise_at_sensors import MeasuredVerification
-    from model.study.table_check import CheckSettings
-    from model.study.verify import Verification
-    from model.study.weak_cells import WeakCells
+    from model.study.contrast_maps import WeakCells
+    from model.study.promise_at_sensors import CheckSettings, MeasuredVerification
+    from model.study.verification import Verification
 
 
 def show(
@@ -99,7 +98,7 @@ def verify(
             f"the table must come before the rig: era table verify {rig_file} {table_file}"
         )
     if device is not None:
-        from model.study.table_check import CheckSettings
+        from model.study.promise_at_sensors import CheckSettings
 
         if sensors_file is None:
             raise InputError("--sensors is missing: a file of the accelerometers at the inputs")
@@ -123,7 +122,7 @@ def _verify_by_solving(
     table_file: Path, rig_file: Path, *, samples: int, seed: int, as_json: bool
 ) -> None:
     from model.rig.rig_file import load_rig
-    from model.study.verify import verify_table
+    from model.study.verification import verify_table
     from model.table.file import load_table
 
     rig = load_rig(rig_file)
@@ -154,7 +153,7 @@ def _example_query(table_file: Path, plate: list[float]) -> str:
 def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
     """Format the summary of a table; mapped: cells of the map that the shares are of."""
     from model.finger import FELT_DB_SL
-    from model.study.weak_cells import WANTED_CONTRAST_DB as WANTED_DB
+    from model.study.contrast_maps import WANTED_CONTRAST_DB as WANTED_DB
 
     def percent(key: str) -> str:
         return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
@@ -215,7 +214,7 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
     """Yield the map of a table; listed: with every weak cell."""
     import numpy as np
 
-    from model.study.weak_cells import text_map
+    from model.study.contrast_maps import text_map
 
     yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
     if np.isfinite(cells.errors_db).any():
@@ -269,7 +268,7 @@ def _verify_by_measuring(
 ) -> None:
     """Measure promises of a table; exit with 1 where too few are kept."""
     from model.rig.rig_file import load_rig
-    from model.study.table_check import check_by_measuring, plain_rig
+    from model.study.promise_at_sensors import check_by_measuring, plain_rig
     from model.table.file import load_table
 
     if picture is not None:

@@ -16,7 +16,7 @@ from model.diagnosis.verdict import ChannelState, ChannelVerdict, MisreadResonan
 from model.identification.identify import value_rows
 from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.study.verify import MIN_KEPT_SHARE
+from model.study.verification import MIN_KEPT_SHARE
 
 _REMEDIES: dict[ChannelState, str] = {
     "dead": "check its supply, its cable and the amplifier's channel",

@@ -72,8 +72,8 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_summary import exciters_of, sections_of
 from model.structure.attachments import Era, PointLoad
-from model.study.exact_plates import draw_plates, felt_on
-from model.study.random_contacts import random_contacts
+from model.study.contrast_maps import random_contacts
+from model.study.verification import draw_plates, felt_on
 from model.table.build import build_table
 
 _OTHER = {"free": "mounted", "mounted": "free"}

@@ -39,8 +39,8 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable
-from model.study.exact_plates import draw_plates, felt_on
-from model.study.random_contacts import MIN_DISTANCE, random_contacts
+from model.study.contrast_maps import MIN_DISTANCE, random_contacts
+from model.study.verification import draw_plates, felt_on
 from model.table.build import build_table
 
 MAX_CHI2 = 2.0

@@ -525,7 +525,7 @@ def _notes(era: Source, low: float, high: float) -> list[str]:
 
 
 _ARRANGEMENT = "drivers.by_hand.rig_check:arrangement_of"
-_COST = "model.study.clock_costs:clock_cost"
+_COST = "model.study.overview:clock_cost"
 _LOST_DB = 0.1  # contrast that is worth a warning
 
 

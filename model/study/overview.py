@@ -1,28 +1,58 @@
-"""What a table reaches: cells of its map, felt contrast of random contacts, their summary."""
+"""What a table reaches: cells of its map, felt contrast of random contacts, their summary.
 
-from collections.abc import Sequence
+What two contents keep of their contrast while the amplifiers' clocks are held to some error.
+
+By answers of the rig's own plate, at few places and frequencies, in a second.
+
+Export of tables: a .mat file of everything, or .csv files of patterns or fields.
+
+`docs/reference/table-file.md` lists every name with its shape and unit.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from model.answer.stimulus import Placement
-from model.arrays import FloatArray
+from model.answer.plan import answer, query, worst_of
+from model.answer.stimulus import Finger, Placement, Stimulus
+from model.arrays import Complex64Array, FloatArray
+from model.config.fields import Section, quantities
+from model.drive_modes import UNRESTRICTED
+from model.ensemble.draws import ClockErrors
 from model.errors import InputError
-from model.finger import FELT_DB_SL, highest_measured
+from model.files.array_file import whole_or_nothing
+from model.files.csv_file import write_rows
+from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, highest_measured
 from model.processes import Progress, unseen
-from model.study.random_contacts import random_contacts
-from model.study.weak_cells import (
+from model.rig.actuator_keys import KINDS
+from model.rig.rig import PHYSICS, Rig
+from model.rig.sections import (
+    AirGapSection,
+    FingertipSection,
+    LayerSection,
+    MassSection,
+    MaterialSection,
+    PlateSection,
+)
+from model.study.contrast_maps import (
     Contrasts,
     WeakCells,
     ask_once,
     contrasts_reached,
     find_weak_cells,
     pair_questions,
+    random_contacts,
     sampling_error,
 )
-from model.table.table import LocalizationTable
+from model.table.build import TableProblem, solve_table
+from model.table.file import FORMAT_VERSION
+from model.table.table import PAPER_GRID, LocalizationTable
 
 CONTACT_SETS = 64
 
@@ -112,3 +142,188 @@ def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
     summary["code_version"] = table.code_version
     summary["fingerprint"] = table.fingerprint
     return summary
+
+
+_PAIRS, _SEED, _LEVEL_DB_SL = 16, 14, 14.0
+_STEP, _HIGHEST = 20.0, 250.0  # Hz; fingers feel most there, and a table of more takes longer
+
+
+@dataclass(frozen=True)
+class ClockCost:
+    """Contrast promised to the worst of two fingers, median over places, and what is kept [dB]."""
+
+    exact_db: float
+    kept_db: float
+
+
+def clock_cost(rig: Rig, errors: Mapping[str, float]) -> ClockCost:
+    """Contrast of two contents with exact clocks, and with errors by amplifier, rms [s].
+
+    Raises InputError for a plate on which two fingers have no room, or that makes no table.
+    """
+    low, high = rig.limits.frequency_min, rig.limits.frequency_max
+    frequencies = np.arange(low, max(min(high, _HIGHEST), low) + 1e-9, _STEP)
+    problem = TableProblem(rig, frequencies, PAPER_GRID)
+    table = solve_table(problem, drive_mode=UNRESTRICTED, is_estimated=False)
+    clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
+    exact = _promised_db(table)
+    kept = _promised_db(table.with_clocks(clocks))  # made now: it shares what answers have computed
+    # Of places one by one, which differ by far more.
+    lost = max(float(np.median(exact - kept)), 0.0)
+    median = float(np.median(exact))
+    return ClockCost(median, median - lost)
+
+
+def _promised_db(table: LocalizationTable) -> FloatArray:
+    """Contrast promised to the worst of two fingers at places anywhere (pairs,)."""
+    rng, found = np.random.default_rng(_SEED), list[float]()
+    for _ in range(_PAIRS):
+        fingers = [
+            Finger(at, Stimulus(_LEVEL_DB_SL))
+            for at in random_contacts(rng, 2, table.plate, margin=FINGERTIP_RADIUS)
+        ]
+        found.append(worst_of(answer(table, fingers, min_contrast_db=-math.inf)))
+    return np.array(found)
+
+
+MAX_MAT_BYTES = (1 << 31) - 1
+"""Size of one variable in a .mat file of version 5, its header included."""
+
+
+def export_mat(table: LocalizationTable, path: Path) -> None:
+    """Write a struct `table` as a .mat file of version 5.
+
+    Raises InputError for a table that the format cannot hold, OSError where it cannot be written.
+    """
+    from scipy.io import savemat
+
+    size = 8 * table.raster.point_count * len(table.frequencies) * len(table.eras)
+    if size > MAX_MAT_BYTES:
+        raise InputError(
+            f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
+            f"{size / 1e9:.1f} GB; open the table itself, a .npz file, with numpy.load"
+        )
+    content = {
+        "format_version": float(FORMAT_VERSION),
+        "code_version": table.code_version,
+        "fingerprint": table.fingerprint,
+        "mode": table.drive_mode,
+        **_physics(table),
+        "mesh": str(table.mesh),
+        "reference_mesh": str(table.reference_mesh),
+        "discretisation_error": table.discretisation_error,
+        "frequency_hz": table.frequencies,
+        "raster_x_m": table.raster.x,
+        "raster_y_m": table.raster.y,
+        "acceleration_m_s2": _fields(table),
+        "mode_omega_rad_s": table.omega,
+        "mode_loss_rad2_s2": table.losses,
+        "mode_dispersion_hz": table.dispersion_frequencies,
+        "mode_dispersion_rad2_s2": table.dispersion,
+        "mode_shape": table.shapes,
+        "mode_shape_attachments": table.attachment_shapes,
+        "cell_centre_m": table.cell_centres,
+        "cells_along_x": float(table.grid.nx),
+        "cells_along_y": float(table.grid.ny),
+    }
+    with whole_or_nothing(path) as stream:
+        savemat(
+            stream,  # type: ignore[arg-type]  # it takes files too, its types do not say so
+            {"table": content},
+            long_field_names=True,
+            oned_as="column",
+        )
+
+
+def export_csv(table: LocalizationTable, path: Path, *, content: str) -> None:
+    """Write a .csv file whose columns have their units in their names.
+
+    content: "patterns": a row for each target and quiet finger of the table's map, with what each
+    ERA plays in the table's drive mode, empty where it is silent, and what is promised, all empty
+    where the level is not reached; "fields": a row for each raster point and frequency, with real
+    and imaginary acceleration by each ERA alone at full stroke.
+    """
+    write_rows(path, {"patterns": _pattern_rows, "fields": _field_rows}[content](table))
+
+
+def _pattern_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    parts = [f"{era.name}_{part}" for era in table.eras for part in ("hz", "level", "phase_deg")]
+    contacts = [f"{finger}_{axis}_m" for finger in ("target", "quiet") for axis in "xy"]
+    yield [*contacts, *parts, "promised_level_db_sl", "promised_contrast_db"]
+    for placed in chain.from_iterable(pair_questions(table)):
+        at = chain.from_iterable(placed.contacts)
+        found = query(table, placed)
+        if not found.is_reached:
+            yield [*at, *[""] * (len(parts) + 2)]
+            continue
+        drive, target = table.drive_of(found.layers[0].excitation), found.fingers[0]
+        tones = (drive[era.name].values() if era.name in drive else [""] * 3 for era in table.eras)
+        promised = (target.promised_level_db_sl, target.promised_contrast_db)
+        yield [*at, *chain.from_iterable(tones), *promised]
+
+
+def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
+    parts = [f"{era.name}_{part}_m_s2" for era in table.eras for part in ("real", "imag")]
+    yield ["x_m", "y_m", "frequency_hz", *parts]
+    for (x, y), at_point in zip(table.raster.points.tolist(), _fields(table), strict=True):
+        for frequency, values in zip(table.frequencies.tolist(), at_point, strict=True):
+            yield [x, y, frequency, *_short(values.view(np.float32))]
+
+
+def _fields(table: LocalizationTable) -> Complex64Array:
+    """Acceleration [m/s²] on the raster by each ERA alone at full stroke, (points, f, eras)."""
+    return np.ascontiguousarray(table.unit_fields(table.raster.points).transpose(2, 0, 1))
+
+
+def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
+    """Shortest decimals that identify single-precision numbers."""
+    return [str(value) for value in values]
+
+
+_SECTIONS: tuple[type[Section], ...] = (
+    *(PlateSection, LayerSection, MaterialSection, AirGapSection, MassSection, FingertipSection),
+    *KINDS.values(),
+)
+_NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
+    "voltage": "voltage_v"
+}
+
+
+def _physics(table: LocalizationTable) -> dict[str, Any]:
+    """All that a table must have of its rig, numbers with the units of the rig's file."""
+    by_unit = {
+        key: each.dimension.key(key)
+        for section in _SECTIONS
+        for key, field in section.model_fields.items()
+        for each in quantities(field)
+    } | _NAMES
+    return {
+        name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)
+        for name in PHYSICS
+    }
+
+
+def _exported(value: Any, names: Mapping[str, str]) -> Any:
+    """A value as .mat files have it; names: with units, by those of fields."""
+    if is_dataclass(value):
+        each = {field.name: getattr(value, field.name) for field in fields(value)}
+        return {names.get(key, key): _exported(own, names) for key, own in each.items()}
+    if value is None:
+        return np.zeros((0, 0))
+    if not isinstance(value, tuple):
+        return value
+    rows = [_exported(each, names) for each in value]
+    if rows and isinstance(rows[0], dict):
+        return _structs(rows)
+    is_named = bool(rows) and isinstance(rows[0], str)
+    return np.array(rows, dtype=object if is_named else float)  # objects are a cell array
+
+
+def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
+    """A struct array (n, 1) of rows; what a row has not is empty."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names])
+    for number, row in enumerate(rows):
+        for name in names:
+            structs[name][number, 0] = row.get(name, np.zeros((0, 0)))
+    return structs

@@ -4,11 +4,15 @@ Accelerometers stand for fingertips: patterns are asked for contacts at their pl
 without weight, since nothing touches the plate. The promise is what nine of ten plates within the
 rig's uncertainty give at these points, solved exactly; what fingers would feel over their whole
 tips is another number.
+
+The check of a table by what is measured, by the package that knows sound cards.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,10 +23,12 @@ from model.arrays import FloatArray, Point
 from model.ensemble.draws import percentile
 from model.errors import InputError
 from model.finger import decibels, sensation_level
-from model.study.exact_plates import amplitudes_on, draw_plates
-from model.study.random_contacts import are_apart
-from model.study.verify import MIN_KEPT_SHARE, PLATES
+from model.processes import Progress
+from model.rig.rig import Channel, Rig
+from model.study.contrast_maps import are_apart
+from model.study.verification import MIN_KEPT_SHARE, PLATES, amplitudes_on, draw_plates
 from model.table.table import LocalizationTable
+from registry.limits import GuardLimits
 
 _TRIES = 1000
 _MAX_OTHERS = 3
@@ -172,4 +178,71 @@ def _promise(
         contrast_db=float(percentile(contrast)),
         median_db=float(percentile(contrast, 50)),
         level_db_sl=float(percentile(level[0])),
+    )
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """What `era table verify --device` was given.
+
+    sensors_file: of accelerometers; device: that records them and plays, unless url is an amplifier
+    that does; samples: promises to play; level: of the loudest ERA, None: half of what the rig's
+    limits allow.
+    """
+
+    device: str
+    sensors_file: Path
+    url: str | None
+    samples: int
+    seed: int
+    level: float | None
+
+
+class TableCheck(Protocol):
+    """Plays promises of a table and measures them."""
+
+    def __call__(
+        self,
+        table: LocalizationTable,
+        rig: Rig,
+        settings: CheckSettings,
+        *,
+        progress: Progress,
+    ) -> MeasuredVerification:
+        """Raises InputError, LinkError."""
+
+
+_CHECK = "sim.desk.measuring.table_check:check_table"
+"""By name: this package does not import the one beside it."""
+
+
+def check_by_measuring(
+    table: LocalizationTable,
+    rig: Rig,
+    settings: CheckSettings,
+    *,
+    progress: Progress,
+) -> MeasuredVerification:
+    """Measure promises by the sound card's check."""
+    check: TableCheck = resolve_name(_CHECK)
+    return check(table, rig, settings, progress=progress)
+
+
+def plain_rig(table: LocalizationTable, *, level: float) -> Rig:
+    """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order.
+
+    level: its limit, which a table does not know; frequencies are those of the table.
+    """
+    low, high = (float(table.frequencies[end]) for end in (0, -1))
+    return Rig(
+        table.plate,
+        table.mesh,
+        table.eras,
+        {era.name: Channel("main", number) for number, era in enumerate(table.eras)},
+        {"main": "sim://"},
+        GuardLimits(low, high, level),
+        masses=table.masses,
+        uncertainty=table.uncertainty,
+        fingertip=table.fingertip,
+        threshold=table.threshold,
     )

@@ -27,7 +27,7 @@ from model.structure.attachments import (
     fingertip_loads,
 )
 from model.structure.exciter import Actuator
-from model.study.exact_plates import draw_plates
+from model.study.verification import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration import finer_mesh
 from sim.amplifier.clock import Crystal
@@ -231,7 +231,7 @@ def _feet(rig: Rig, factors: FloatArray) -> dict[int, float]:
 
 
 def draw_of_ensemble(rig: Rig, *, seed: int) -> Imperfections:
-    """Draw a plate as those on which promises are checked (`model.study.exact_plates`).
+    """Draw a plate as those on which promises are checked (`model.study.verification`).
 
     As `draw_imperfections`, and with what the gains of all channels have in common.
     """

@@ -15,8 +15,8 @@ from drivers.protocol.timing import BOOT_TIME
 from drivers.wires.known import address_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
-from model.study.verify import MIN_KEPT_SHARE
-from model.study.weak_cells import WANTED_CONTRAST_DB
+from model.study.contrast_maps import WANTED_CONTRAST_DB
+from model.study.verification import MIN_KEPT_SHARE
 from registry.limits import GuardLimits
 
 ROOT = Path(model.__file__).parents[1]

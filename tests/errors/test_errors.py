@@ -76,8 +76,8 @@ WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
         "model.table.build.solve_table"
     ),
-    "table export table.npz --format csv -o out.csv": "model.study.export.export_csv",
-    "table export table.npz --format mat -o out.mat": "model.study.export.export_mat",
+    "table export table.npz --format csv -o out.csv": "model.study.overview.export_csv",
+    "table export table.npz --format mat -o out.mat": "model.study.overview.export_mat",
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "model.figures.paper.paper_figures",
@@ -95,7 +95,7 @@ QUICK = [
 LONG = {
     "table plot table.npz -o plots": "model.figures.table_figures",
     "table show table.npz": "model.study.overview.find_overview",
-    "table verify table.npz rig.yaml": "model.study.verify.verify_table",
+    "table verify table.npz rig.yaml": "model.study.verification.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
     "demo --wire sim": "model.table.build.cached_table",

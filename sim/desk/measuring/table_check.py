@@ -14,11 +14,11 @@ from model.calibration.responses import read_sensors
 from model.processes import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (
+    CheckSettings,
     MeasuredVerification,
     measured_promise,
     promises,
 )
-from model.study.table_check import CheckSettings
 from model.table.table import LocalizationTable
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.loopback import check_levels, is_whole

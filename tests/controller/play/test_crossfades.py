@@ -20,7 +20,7 @@ from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Limits
 from model.config.fields import Rectangle
-from model.study.random_contacts import random_contacts
+from model.study.contrast_maps import random_contacts
 from several_fingers import LAYOUT, Fingers, chosen_for, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 

@@ -18,7 +18,7 @@ from model.answer.tone_search import choose_tones
 from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold
-from model.study.exact_plates import Plates, draw_plates, harmonics_on, powers_on
+from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import read_fingertips

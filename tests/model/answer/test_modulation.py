@@ -10,7 +10,7 @@ from model.answer.answer import Limits
 from model.answer.promise import with_gains
 from model.answer.stimulus import Finger, Placement
 from model.finger import detection_threshold
-from model.study.exact_plates import draw_plates, powers_on
+from model.study.verification import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import read_fingertips
 from only import phased as answer

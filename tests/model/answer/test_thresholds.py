@@ -10,7 +10,7 @@ from model.answer.answer import MIXED, OWN, verdict_of, verdict_shown
 from model.answer.stimulus import Finger, Placement
 from model.finger import THRESHOLDS, detection_threshold
 from model.rig.rig import Uncertainty
-from model.study.exact_plates import draw_plates, powers_on
+from model.study.verification import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
 from only import phased as answer

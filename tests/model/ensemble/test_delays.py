@@ -16,7 +16,7 @@ from model.arrays import FloatArray
 from model.ensemble.draws import EXACT_CLOCKS, PROMISED_DRAWS, ClockErrors, Drawing, delayed, draw
 from model.errors import InputError
 from model.rig.rig import Channel, Uncertainty
-from model.study.exact_plates import draw_plates, powers_on
+from model.study.verification import draw_plates, powers_on
 from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
 from paper_table import contact_sets, smooth_rig

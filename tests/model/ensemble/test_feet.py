@@ -15,7 +15,7 @@ from model.answer.stimulus import Placement
 from model.ensemble.draws import draw
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
-from model.study.exact_plates import draw_plates, felt_on
+from model.study.verification import draw_plates, felt_on
 from model.table.build import build_table
 from only import only
 

@@ -15,7 +15,7 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh, local_compliance
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
-from model.study.verify import verify_table
+from model.study.verification import verify_table
 from model.table.build import build_table
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 

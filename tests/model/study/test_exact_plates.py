@@ -14,7 +14,7 @@ from model.fem import assemble
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.study.exact_plates import Plates, draw_plates, felt_on
+from model.study.verification import Plates, draw_plates, felt_on
 from model.table.build import build_table
 from model.vibration import base_amplitudes
 from only import only

@@ -14,8 +14,8 @@ from model.errors import InputError
 from model.finger import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
-from model.study import export
-from model.study.export import export_csv, export_mat
+from model.study import overview
+from model.study.overview import export_csv, export_mat
 from model.table.file import save_table
 from only import only
 from small_table import FREQUENCIES, small_table, with_strokes
@@ -99,7 +99,7 @@ def test_export_mat_holds_masses(table, tmp_path):
 
 def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
     """Before anything is written; the error names a remedy."""
-    monkeypatch.setattr(export, "MAX_MAT_BYTES", 1000)
+    monkeypatch.setattr(overview, "MAX_MAT_BYTES", 1000)
     with pytest.raises(InputError, match="numpy"):
         export_mat(table, tmp_path / "t.mat")
     assert list(tmp_path.iterdir()) == []

@@ -11,14 +11,7 @@ from model.answer.stimulus import Placement
 from model.finger import Grid
 from model.structure.attachments import PointLoad
 from model.structure.plate import Laminate, LaminateLayer
-from model.study.overview import (
-    CONTACT_SETS,
-    Overview,
-    find_overview,
-    set_questions,
-    summarize,
-)
-from model.study.weak_cells import (
+from model.study.contrast_maps import (
     WeakCells,
     ask_once,
     contrasts_reached,
@@ -27,6 +20,13 @@ from model.study.weak_cells import (
     pair_questions,
     sampling_error,
     text_map,
+)
+from model.study.overview import (
+    CONTACT_SETS,
+    Overview,
+    find_overview,
+    set_questions,
+    summarize,
 )
 from model.table.build import build_table
 from paper_plate import make_paper_rig

@@ -10,7 +10,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.fem import assemble
 from model.finger import fingertip_points, fingertip_weights
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.study.verify import AnswerCheck, verify_table
+from model.study.verification import AnswerCheck, verify_table
 from model.table.build import solve_table
 from model.table.file import load_table, save_table
 from model.vibration import tone_fields

@@ -18,7 +18,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
-from model.study.exact_plates import Plates, felt_on
+from model.study.verification import Plates, felt_on
 from model.table.build import TableProblem, build_table
 from model.table.following import table_following
 from model.table.raster import Raster

@@ -26,8 +26,7 @@ from model.errors import InputError
 from model.finger import detection_threshold
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
-from model.study.promise_at_sensors import Promise, promises
-from model.study.table_check import CheckSettings
+from model.study.promise_at_sensors import CheckSettings, Promise, promises
 from model.table.build import build_table
 from model.table.file import save_table
 from model.table.table import LocalizationTable

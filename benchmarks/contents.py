@@ -66,7 +66,7 @@ def main() -> None:
 
     from benchmarks.promise.cases import IDENTIFIED
     from model.rig.rig_file import load_rig
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     sets = [(k, options.fingers - k) for k in range(1, 5)] if options.fingers else SETS
     if options.bands:

@@ -83,7 +83,7 @@ def _line(row: Row, sets: int) -> str:
     from model.answer.plan import query
     from model.answer.stimulus import Placement
     from model.rig.rig_file import load_rig
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     rig = load_rig(RIG.parent / f"{row.rig}.yaml")
     known = replace(DRIVES, gain=row.error, phase_deg=100 * row.error)

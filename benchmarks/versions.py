@@ -66,7 +66,7 @@ def _tables() -> "Iterator[tuple[str, str, Rig, LocalizationTable]]":
 
     from model.rig.rig import Uncertainty
     from model.rig.rig_file import load_rig
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     known = replace(Uncertainty.none(), gain=0.01, phase_deg=1.0)
     for name in PLATES:

@@ -51,9 +51,9 @@ from model.rig.rig_writing import rig as rig
 from model.rig.rig_writing import save_rig as save_rig
 from model.structure.attachments import Fingertip as Fingertip
 from model.study.contrast_maps import ContrastMap as ContrastMap
-from model.table.file import load_table as load_table
-from model.table.file import save_table as save_table
 from model.table.table import LocalizationTable as LocalizationTable
+from model.table.table_file import load_table as load_table
+from model.table.table_file import save_table as save_table
 from model.vibration import PlateMap as PlateMap
 from model.vibration import Tone as Tone
 from registry.limits import GuardLimits as GuardLimits

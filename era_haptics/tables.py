@@ -22,8 +22,8 @@ from model.finger import STRONG_DB_SL, Grid
 from model.processes import Progress, check_progress, unseen
 from model.rig.rig import Rig
 from model.study.contrast_maps import ContrastMap, map_contrast
-from model.table.build import cached_table
 from model.table.table import PAPER_GRID, LocalizationTable
+from model.table.table_file import cached_table
 
 
 def table(

@@ -24,7 +24,7 @@ from installed_program import needs  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.rig.rig_file import example_rig_path, load_rig  # noqa: E402
-from model.table.build import cached_table  # noqa: E402
+from model.table.table_file import cached_table  # noqa: E402
 from paper_plate import make_paper_rig  # noqa: E402
 from registry import threads  # noqa: E402
 from slowest_files import SLOWEST  # noqa: E402

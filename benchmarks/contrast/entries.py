@@ -34,8 +34,8 @@ from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
 from model.rig.rig import Uncertainty
 from model.study.verification import Plates, accelerations_on, draw_plates, touched
-from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
 from model.vibration import Excitation, Tone
 
 FREQUENCIES_IN_HINDSIGHT = 4

@@ -20,8 +20,8 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
 from model.study.verification import draw_plates, felt_on
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from model.vibration import Excitation
 from sim.plant.excited_plate import play
 from sim.plant.imperfections import draw_imperfections

@@ -14,8 +14,8 @@ from model.ensemble.attached_plate import AttachedPlate
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import LOSS_FREQUENCY
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 
 DRIVES = Uncertainty(gain=0.01, phase_deg=1, thickness=0, stiffness=0, damping=1, fingertip=0)
 

@@ -34,8 +34,8 @@ from model.identification.least_squares import Measurement
 from model.identification.settled_patterns import SettledPattern
 from model.rig.rig_file import load_rig
 from model.structure.attachments import Fingertip
-from model.table.following import table_following
 from model.table.table import LocalizationTable
+from model.table.table_file import table_following
 
 MINUTES_BETWEEN = 0.2
 MOUNT_AT, STICKER_AT = 20.0, 40.0

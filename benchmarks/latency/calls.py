@@ -23,7 +23,7 @@ from drivers.wires.serial_line.host import SerialWire
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.table.build import cached_table
+from model.table.table_file import cached_table
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

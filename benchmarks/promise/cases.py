@@ -11,8 +11,8 @@ from model.answer.plan import answer
 from model.answer.stimulus import ANY_BAND, Finger, Stimulus
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LEVEL_DB_SL = 14.0

@@ -46,7 +46,7 @@ def main() -> None:
 
     from benchmarks.promise.cases import EXAMPLES, IDENTIFIED
     from model.rig.rig_file import load_rig
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     print("| rig | uncertainty | promised [dB] | kept | beyond nine of ten [dB] |")
     print("|---|---|---|---|---|")
@@ -114,7 +114,7 @@ def _drawn_plates(
     import numpy as np
 
     from model.study.verification import draw_plates
-    from model.table.following import table_following
+    from model.table.table_file import table_following
 
     drawn = draw_plates(
         np.random.default_rng(seed),

@@ -23,7 +23,7 @@ from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import footprints_of
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.knots import steady_states
 from model.transients.measures import ENDING_WINDOW, Transients

@@ -167,7 +167,7 @@ def expected(board: Board, touches: int, plates: int) -> Expected:
     import numpy as np
 
     import era_haptics as era
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     rig = board.rig
     frequencies = np.arange(rig.limits.frequency_min, rig.limits.frequency_max + 1, STEP)

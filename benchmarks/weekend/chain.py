@@ -40,8 +40,8 @@ from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.structure.attachments import PointLoad, fingertip_loads
 from model.structure.exciter import Exciter
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from sim.plant.imperfections import draw_imperfections
 
 FOLDER = ROOT / "examples" / "weekend"

@@ -66,7 +66,7 @@ def check(
     from model.answer.answer import MIN_CONTRAST_DB
     from model.commands.options import Stopwatch
     from model.files.array_file import check_picture
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     if picture is not None:
         check_picture(picture)

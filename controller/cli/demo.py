@@ -67,7 +67,7 @@ def demo(
     from controller.demo.run import WIRES, Scene, check_page, example_scenes, run_demo, run_live
     from controller.sources.capture import read_capture
     from model.rig.rig_file import example_rig_path, load_rig
-    from model.table.build import cached_table
+    from model.table.table_file import cached_table
 
     if wire not in WIRES:
         raise InputError(f"--wire must be one of {', '.join(WIRES)}, got {wire}")

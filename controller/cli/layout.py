@@ -44,7 +44,7 @@ def check(
     from controller.effects.layout_file import load_layout
     from model.commands.options import progress_bar
     from model.files.array_file import check_picture_name
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     if picture is not None:
         check_picture_name(picture)

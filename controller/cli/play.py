@@ -100,7 +100,7 @@ def _simulate(
     from controller.check.content_check import play_content
     from model.files.array_file import begins_with, check_ending, check_place, check_replaceable
     from model.finger import STRONG_DB_SL, fingertip_weights
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     check_ending(output, ".wav", what="a sound")
     check_place(output, example="felt.wav")

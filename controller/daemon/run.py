@@ -24,9 +24,8 @@ from model.compiled.kernels import kernels
 from model.config.document import ConfigError, read_document
 from model.errors import InputError
 from model.quantities import counted
-from model.table.build import cached_table
-from model.table.file import load_table
 from model.table.table import LocalizationTable
+from model.table.table_file import cached_table, load_table
 from registry.threads import leave_work
 
 _IGNORED = (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)

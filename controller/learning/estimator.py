@@ -34,8 +34,8 @@ from model.files.array_file import remove_partial
 from model.identification.learned_plate import LearnedTable, PlateEstimate
 from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig, Uncertainty
-from model.table.following import table_following
 from model.table.table import LocalizationTable
+from model.table.table_file import table_following
 
 _NICE = 10  # above that of the daemon, whose loop comes first
 _SAVE_INTERVAL, _REFRESH_INTERVAL = 10.0, 60.0  # s

@@ -35,8 +35,7 @@ from model.ensemble.touched_plate import (
     touch,
 )
 from model.finger import decibels
-from model.table.raster import FingertipShapes
-from model.table.table import LocalizationTable, read_fingertips
+from model.table.table import FingertipShapes, LocalizationTable, read_fingertips
 
 MAX_FINGERS_BY_POINT = 4
 """Quiet fingers up to which the points of each are looked at one by one in a search."""

@@ -93,7 +93,7 @@ def query(
     ERA, and predicted levels and contrast.
     """
     from model.answer.answer_report import query_one
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     if batch is not None:
         if target or quiet or own or swap_bands:
@@ -235,7 +235,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
     defaults: of keys that lines leave out.
     """
     from model.answer.answer_report import query_batch
-    from model.table.file import load_table
+    from model.table.table_file import load_table
     from registry.files import regular_file
 
     table = load_table(table_file)
@@ -295,7 +295,7 @@ def plot(
     """Draw weak cells, levels, contrast and an answer."""
     from model.figures import save_figure, table_figures
     from model.study.overview import find_overview
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     inches = figure_size(size)
     table = load_table(table_file)
@@ -331,7 +331,7 @@ def export(
     docs/reference/table-file.md describes the content.
     """
     from model.study.overview import export_csv, export_mat
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     if content is not None and to is Format.MAT:
         raise InputError("--content must be left out with --format mat, which holds everything")
@@ -382,7 +382,7 @@ def contrast_map(
     """Map the promised contrast of every place to given quiet fingers."""
     from model.finger import Grid
     from model.study.contrast_maps import map_contrast
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     inches = figure_size(size)
     is_csv = output is not None and output.suffix.lower() == ".csv"
@@ -467,9 +467,8 @@ def build(
     from model.drive_modes import checked_mode
     from model.finger import Grid
     from model.rig.rig_file import load_rig
-    from model.table.build import TableProblem, solve_table
-    from model.table.file import ZIP, save_table
     from model.table.table import default_drive_frequencies
+    from model.table.table_file import ZIP, TableProblem, save_table, solve_table
 
     checked_mode(drive_mode, "--mode")
     check_place(output, example="table.npz")

@@ -31,7 +31,7 @@ def show(
 ) -> None:
     """Show levels, weak cells, contrast and origin of a table."""
     from model.study.overview import find_overview, summarize
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     table = load_table(table_file)
     with Stopwatch() as timed, progress_bar("questions") as progress:
@@ -91,7 +91,7 @@ def verify(
     Solve the plate at each frequency, and in time; with --device play patterns and compare what
     accelerometers measure with what nine of ten plates promise. Exit with 1 if a check fails.
     """
-    from model.table.file import ZIP
+    from model.table.table_file import ZIP
 
     if rig_file is not None and begins_with(rig_file, ZIP) and not begins_with(table_file, ZIP):
         raise InputError(
@@ -123,7 +123,7 @@ def _verify_by_solving(
 ) -> None:
     from model.rig.rig_file import load_rig
     from model.study.verification import verify_table
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     rig = load_rig(rig_file)
     table = load_table(table_file, rig=rig)
@@ -269,7 +269,7 @@ def _verify_by_measuring(
     """Measure promises of a table; exit with 1 where too few are kept."""
     from model.rig.rig_file import load_rig
     from model.study.promise_at_sensors import check_by_measuring, plain_rig
-    from model.table.file import load_table
+    from model.table.table_file import load_table
 
     if picture is not None:
         check_picture(picture)

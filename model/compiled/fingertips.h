@@ -1,4 +1,4 @@
-/* Shapes of the plate under fingertips: `model.table.raster` and `model.finger` in C. */
+/* Shapes of the plate under fingertips: `model.table.table` and `model.finger` in C. */
 #ifndef FINGERTIPS_H
 #define FINGERTIPS_H
 

@@ -27,8 +27,8 @@ from model.rig.rig_file import rig_of
 from model.rig.rig_writing import stated
 from model.structure.attachments import support_problem
 from model.structure.exciter import Actuator
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 
 SENSITIVITY_STEP = 0.005
 """Step [m] of an ERA by which the sensitivity to its place is measured."""

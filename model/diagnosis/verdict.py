@@ -74,7 +74,7 @@ from model.rig.rig_summary import exciters_of, sections_of
 from model.structure.attachments import Era, PointLoad
 from model.study.contrast_maps import random_contacts
 from model.study.verification import draw_plates, felt_on
-from model.table.build import build_table
+from model.table.table_file import build_table
 
 _OTHER = {"free": "mounted", "mounted": "free"}
 _VARYING = 0.8  # standard deviation of logarithms of gains, as no drive has it

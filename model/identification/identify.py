@@ -41,7 +41,7 @@ from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable
 from model.study.contrast_maps import MIN_DISTANCE, random_contacts
 from model.study.verification import draw_plates, felt_on
-from model.table.build import build_table
+from model.table.table_file import build_table
 
 MAX_CHI2 = 2.0
 """chi² beyond which a model does not explain a measurement, and nothing is promised from it."""

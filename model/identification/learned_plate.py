@@ -48,8 +48,8 @@ from model.identification.settled_patterns import (
 )
 from model.rig.rig import Rig, Uncertainty
 from model.structure.modal_elasticity import lowest_elastic
-from model.table.following import table_following
 from model.table.table import LocalizationTable
+from model.table.table_file import table_following
 
 _EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained

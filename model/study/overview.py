@@ -50,9 +50,8 @@ from model.study.contrast_maps import (
     random_contacts,
     sampling_error,
 )
-from model.table.build import TableProblem, solve_table
-from model.table.file import FORMAT_VERSION
 from model.table.table import PAPER_GRID, LocalizationTable
+from model.table.table_file import FORMAT_VERSION, TableProblem, solve_table
 
 CONTACT_SETS = 64
 

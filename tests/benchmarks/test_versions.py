@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import realised, versions
-from model.table.build import build_table
+from model.table.table_file import build_table
 from paper_table import smooth_rig
 
 

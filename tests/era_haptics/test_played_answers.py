@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from model.table.build import build_table
+from model.table.table_file import build_table
 from registry import threads
 from rig_on_wire import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from virtual_loop import in_virtual_time

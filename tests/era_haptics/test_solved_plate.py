@@ -25,7 +25,7 @@ def plate() -> era.SolvedPlate:
 @pytest.fixture(scope="module")
 def table(plate: era.SolvedPlate) -> era.LocalizationTable:
     """Of the same plate, at a few frequencies."""
-    from model.table.build import build_table
+    from model.table.table_file import build_table
 
     frequencies = np.array([60.0, 110.0, 180.0, 250.0])
     return build_table(plate.rig, frequencies=frequencies, grid=era.Grid(4, 3), drive_mode="phased")

@@ -74,7 +74,7 @@ def test_page_quotes_every_case_that_is_shown() -> None:
 
 WRITING = {
     "table build rig.yaml -o out.npz --frequencies 60:90:30 --grid 4x3": (
-        "model.table.build.solve_table"
+        "model.table.table_file.solve_table"
     ),
     "table export table.npz --format csv -o out.csv": "model.study.overview.export_csv",
     "table export table.npz --format mat -o out.mat": "model.study.overview.export_mat",
@@ -98,7 +98,7 @@ LONG = {
     "table verify table.npz rig.yaml": "model.study.verification.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",
     "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
-    "demo --wire sim": "model.table.build.cached_table",
+    "demo --wire sim": "model.table.table_file.cached_table",
 }
 """Other slow commands, with their slow function."""
 

@@ -20,7 +20,7 @@ from model.design.area import area_of
 from model.errors import InputError
 from model.identification.learned_plate import load_learned
 from model.rig.rig_file import example_rig_path, load_rig
-from model.table.file import load_table
+from model.table.table_file import load_table
 from sim.desk.measuring.desk import Desk
 from sim.desk.measuring.impedance_run import read_impedance
 from sim.desk.measuring.stepped_file import read_stepped

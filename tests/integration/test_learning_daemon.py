@@ -24,8 +24,8 @@ from daemon_bench import daemon_at, far_end, ready
 from model.identification.learned_plate import load_learned
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from registry import threads
 from rig_on_wire import FarSide
 from virtual_loop import VirtualLoop

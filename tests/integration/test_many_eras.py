@@ -12,7 +12,7 @@ from controller.effects.layout_file import load_layout
 from controller.sources.capture import read_capture
 from long_form import shortly
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
+from model.table.table_file import build_table
 from tuio_messages import write_schedule
 from virtual_loop import run_virtual
 

@@ -33,8 +33,8 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.attachments import FingertipLoad, footprints_of
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope, shaped
 from only import only
 from rig_files import TWO_AMPLIFIERS, write_rig

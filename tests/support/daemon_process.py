@@ -32,7 +32,7 @@ from daemon_bench import (
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from installed_program import ERA
-from model.table.file import save_table
+from model.table.table_file import save_table
 from patient_daemon import PROGRAM
 from rig_on_wire import FarSide
 from sim.amplifier.contract import Amplifier

@@ -58,8 +58,8 @@ from controller.api.topics import Hub, StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from installed_program import ERA
 from model.rig.rig_file import parse_rig
-from model.table.file import save_table
 from model.table.table import LocalizationTable
+from model.table.table_file import save_table
 from rig_files import write_rig
 
 T = TypeVar("T")

@@ -10,8 +10,8 @@ from model.answer.stimulus import Placement
 from model.drive_modes import Forms
 from model.fem import ELEMENTS, Mesh
 from model.rig.rig import Rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.linspace(40.0, 500.0, 27)

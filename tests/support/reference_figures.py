@@ -20,7 +20,7 @@ from model.design.contacts import anywhere
 from model.design.problem import DesignProblem, layouts_of
 from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
-from model.table.build import solve_table
+from model.table.table_file import solve_table
 from model.vibration import natural_modes
 from paper_plate import make_paper_rig
 from small_table import small_problem

@@ -30,8 +30,8 @@ from model.arrays import FloatArray
 from model.config.fields import Rectangle
 from model.finger import detection_threshold
 from model.rig.rig import Rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_table import smooth_rig
 from registry import threads
 from rig_on_wire import after_each

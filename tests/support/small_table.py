@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from model.finger import Grid
-from model.table.build import TableProblem, solve_table
 from model.table.table import LocalizationTable
+from model.table.table_file import TableProblem, solve_table
 from paper_plate import make_paper_rig
 
 FREQUENCIES = np.array([60.0, 110.0, 250.0])

@@ -19,8 +19,8 @@ from model.config.fields import Rectangle
 from model.finger import STRONG_DB_SL, Grid
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.table.build import TableProblem, solve_table
 from model.table.table import LocalizationTable
+from model.table.table_file import TableProblem, solve_table
 from newest_contact import BuzzNewestContact
 from paper_plate import make_paper_rig
 from rig_on_wire import on_amplifiers

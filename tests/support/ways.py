@@ -27,7 +27,7 @@ from daemon_bench import daemon_table, ready_daemon
 from era_haptics import query
 from examples.make_touches import tuio_datagram
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
+from model.table.table_file import build_table
 from own_calls import ROOT, Recorder, Way
 from registry import threads
 from stop_path import stop_path

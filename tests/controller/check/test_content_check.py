@@ -22,9 +22,8 @@ from model.finger import (
     fingertip_weights,
     over_threshold,
 )
-from model.table.build import build_table
-from model.table.file import save_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.measures import SAMPLE_RATE, Transients
 from paper_table import smooth_rig

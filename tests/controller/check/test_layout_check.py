@@ -34,9 +34,8 @@ from long_form import in_turn
 from model.config.fields import Circle, Rectangle
 from model.config.file_kinds import KINDS
 from model.rig.rig import Uncertainty
-from model.table.build import build_table
-from model.table.file import save_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table, save_table
 from paper_table import smooth_rig
 from several_fingers import WIRES, Felt, Pressed
 

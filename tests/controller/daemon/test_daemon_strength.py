@@ -21,8 +21,8 @@ from drivers.protocol.table import QUANTITIES
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_plate import make_paper_rig
 from registry import threads
 from virtual_loop import in_virtual_time

@@ -29,7 +29,7 @@ from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
-from model.table.build import build_table
+from model.table.table_file import build_table
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.far_ends.opening import Wire

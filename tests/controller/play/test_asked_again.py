@@ -20,8 +20,8 @@ from long_form import shortly
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_table import contact_sets, smooth_rig
 from rig_on_wire import on_two_amplifiers
 from several_fingers import LEFT, RIGHT

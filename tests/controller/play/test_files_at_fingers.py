@@ -16,8 +16,8 @@ from model.answer.answer_report import Timing
 from model.answer.stimulus import STRONGEST
 from model.config.fields import Circle
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from several_fingers import LEFT, Fingers, fingers_on, table
 from sim.far_ends.opening import Wire
 from virtual_loop import in_virtual_time

@@ -31,8 +31,8 @@ from model.arrays import ComplexArray
 from model.config.fields import Circle
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from sim.far_ends.opening import Wire
 from virtual_loop import run_virtual
 

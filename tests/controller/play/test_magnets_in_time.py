@@ -20,8 +20,8 @@ from model.answer.stimulus import Finger, Stimulus
 from model.arrays import ComplexArray, Point
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from model.transients.base_motion import Envelopes
 
 ALLOWED = 0.5e-3

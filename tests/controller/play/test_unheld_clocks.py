@@ -19,8 +19,8 @@ from drivers.protocol.table import CLOCK_UNKNOWN
 from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.rig.rig import Channel, Rig, Uncertainty
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_table import smooth_rig
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.clock import Crystal

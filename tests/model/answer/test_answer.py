@@ -19,9 +19,8 @@ from model.cli import app
 from model.errors import InputError
 from model.finger import detection_threshold
 from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
-from model.table.build import build_table
-from model.table.file import save_table
 from model.table.table import read_fingertips
+from model.table.table_file import build_table, save_table
 from only import drives, only, wants
 from only import phased as answer
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table

@@ -13,7 +13,7 @@ from model.answer.stimulus import Placement
 from model.cli import app
 from model.commands.table_cli import query
 from model.errors import InputError
-from model.table.file import save_table
+from model.table.table_file import save_table
 from only import only
 from paper_table import smooth_table
 

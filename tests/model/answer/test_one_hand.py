@@ -10,7 +10,7 @@ import pytest
 from model.answer.answer import MIN_CONTRAST_DB
 from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Stimulus
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
+from model.table.table_file import build_table
 from only import drives
 from only import phased as answer
 

@@ -20,7 +20,7 @@ from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.ensemble.draws import JUDGING_DRAWS
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.measures import SAMPLE_RATE, Transients
 from model.vibration import Excitation, Tone, base_amplitudes

@@ -16,8 +16,8 @@ from model.answer.tone_search import choose_by_numpy, choose_tones, ranked, wors
 from model.finger import THRESHOLDS
 from model.rig.rig import Uncertainty
 from model.structure.attachments import PointLoad
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from only import only
 from paper_table import contact_sets, forms_of, smooth_rig
 

@@ -11,8 +11,8 @@ from model.answer.stimulus import Finger, Placement
 from model.finger import THRESHOLDS, detection_threshold
 from model.rig.rig import Uncertainty
 from model.study.verification import draw_plates, powers_on
-from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
 from only import phased as answer
 from only import wants
 from paper_table import contact_sets, smooth_rig

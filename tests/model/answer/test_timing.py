@@ -11,7 +11,7 @@ from model.answer.stimulus import Placement
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.measures import Transients
 from model.transients.shaping import Shaper

@@ -18,7 +18,7 @@ from model.compiled.kernels import WITHOUT_KERNELS
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path
 from model.study import overview
-from model.table.file import load_table, save_table
+from model.table.table_file import load_table, save_table
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -17,8 +17,8 @@ from model.ensemble.draws import EXACT_CLOCKS, PROMISED_DRAWS, ClockErrors, Draw
 from model.errors import InputError
 from model.rig.rig import Channel, Uncertainty
 from model.study.verification import draw_plates, powers_on
-from model.table.build import build_table
 from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
 from paper_table import contact_sets, smooth_rig
 
 CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0}

@@ -16,7 +16,7 @@ from model.ensemble.draws import draw
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.verification import draw_plates, felt_on
-from model.table.build import build_table
+from model.table.table_file import build_table
 from only import only
 
 _logger = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import FINGERTIP_RADIUS, FIVE_POINTS, detection_threshold
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from paper_table import smooth_rig
 
 PLACES = ((0.09, 0.07), (0.25, 0.18))

@@ -13,7 +13,7 @@ from model.fem import assemble
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.verification import draw_plates, felt_on
-from model.table.build import build_table
+from model.table.table_file import build_table
 from only import only
 from paper_table import smooth_rig
 

@@ -11,8 +11,8 @@ from model.errors import InputError
 from model.identification import learned_plate
 from model.identification.learned_plate import LearnedTable, PlateEstimate
 from model.rig.rig import Rig, Uncertainty
-from model.table.build import build_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from settled_patterns import played, settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])

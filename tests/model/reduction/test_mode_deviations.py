@@ -16,7 +16,7 @@ from model.spectral.modes import SpectralMesh, local_compliance
 from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
 from model.study.verification import verify_table
-from model.table.build import build_table
+from model.table.table_file import build_table
 from paper_plate import LENGTH, WIDTH, make_paper_rig
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])

@@ -18,8 +18,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
-from model.table.build import TableProblem, build_table
-from model.table.following import table_following
+from model.table.table_file import TableProblem, build_table, table_following
 from paper_plate import make_paper_rig
 
 FRAME = 0.053  # kg

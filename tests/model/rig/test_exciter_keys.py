@@ -19,8 +19,7 @@ from model.rig.rig_summary import RIG, exciter_notes, excursion_notes
 from model.rig.rig_writing import rewritten_text
 from model.structure.exciter import Exciter
 from model.structure.materials import EXCITER_TYPES
-from model.table.build import build_table
-from model.table.following import table_following
+from model.table.table_file import build_table, table_following
 
 OWN = (
     "coil_mass: 1.61 g, weight: 109.29 g, q: 3, force_factor: 3.63 T m, resistance: 4.3 ohm, "

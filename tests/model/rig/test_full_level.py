@@ -23,7 +23,7 @@ from model.rig.rig import (
 from model.rig.rig_file import load_rig, parse_rig
 from model.rig.rig_summary import gain_notes
 from model.structure.attachments import footprints_of
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
 from only import only

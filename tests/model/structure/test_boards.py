@@ -24,9 +24,8 @@ from model.structure.attachments import (
 )
 from model.structure.materials import known_material
 from model.structure.plate import Material, Plate
-from model.table.build import TableProblem, solve_table
-from model.table.following import table_following
 from model.table.table import LocalizationTable
+from model.table.table_file import TableProblem, solve_table, table_following
 from model.vibration import natural_modes
 
 SIDES = {"length": 0.4, "width": 0.3}

@@ -15,7 +15,7 @@ from model.finger import detection_threshold, fingertip_points, fingertip_weight
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import Plates, draw_plates, felt_on
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.vibration import base_amplitudes
 from only import only
 from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table

@@ -16,7 +16,7 @@ from model.structure.attachments import PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import overview
 from model.study.overview import export_csv, export_mat
-from model.table.file import save_table
+from model.table.table_file import save_table
 from only import only
 from small_table import FREQUENCIES, small_table, with_strokes
 

@@ -28,7 +28,7 @@ from model.study.overview import (
     set_questions,
     summarize,
 )
-from model.table.build import build_table
+from model.table.table_file import build_table
 from paper_plate import make_paper_rig
 from small_table import small_table, with_strokes
 

@@ -11,8 +11,7 @@ from model.fem import assemble
 from model.finger import fingertip_points, fingertip_weights
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import AnswerCheck, verify_table
-from model.table.build import solve_table
-from model.table.file import load_table, save_table
+from model.table.table_file import load_table, save_table, solve_table
 from model.vibration import tone_fields
 from only import only
 from paper_plate import make_paper_rig

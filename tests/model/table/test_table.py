@@ -19,10 +19,8 @@ from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.study.verification import Plates, felt_on
-from model.table.build import TableProblem, build_table
-from model.table.following import table_following
-from model.table.raster import Raster
-from model.table.table import LocalizationTable, default_drive_frequencies, read_fingertips
+from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
+from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import Tone, tone_fields
 from only import only
 from paper_plate import make_paper_rig

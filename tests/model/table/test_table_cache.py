@@ -8,8 +8,8 @@ import pytest
 
 from model import caching
 from model.finger import Grid
-from model.table import build
-from model.table.build import cached_table
+from model.table import table_file
+from model.table.table_file import cached_table
 from paper_plate import make_paper_rig
 
 
@@ -36,13 +36,13 @@ def cache(tmp_path, monkeypatch):
 def builds(monkeypatch):
     """The problems that are solved."""
     solved = []
-    solve = build.solve_table
+    solve = table_file.solve_table
 
     def counting(problem, **options):
         solved.append(problem)
         return solve(problem, **options)
 
-    monkeypatch.setattr(build, "solve_table", counting)
+    monkeypatch.setattr(table_file, "solve_table", counting)
     return solved
 
 
@@ -91,8 +91,8 @@ def test_cached_table_is_built_again_when_its_file_is_damaged_or_foreign(builds)
 def test_cached_table_of_other_numerics_is_replaced(builds, monkeypatch, cache):
     """A table of another NUMERICS_VERSION is not used, and removed with the next that is kept."""
     with monkeypatch.context() as older:
-        older.setattr(build, "NUMERICS_VERSION", 0)
-        older.setattr(build, "_CURRENT", "table-4.0-")
+        older.setattr(table_file, "NUMERICS_VERSION", 0)
+        older.setattr(table_file, "_CURRENT", "table-4.0-")
         cached_table(RIG, **FEW)
     (cache / "table-0123456789abcdef.npz").touch()
     _, path = cached_table(RIG, **FEW)
@@ -102,7 +102,7 @@ def test_cached_table_of_other_numerics_is_replaced(builds, monkeypatch, cache):
 
 def test_cached_table_least_recently_used_is_removed(monkeypatch, cache):
     """Of three tables two stay, a read one among them."""
-    monkeypatch.setattr(build, "MAX_CACHED_TABLES", 2)
+    monkeypatch.setattr(table_file, "MAX_CACHED_TABLES", 2)
     paths = []
     for age, frequency in ((200, 60.0), (100, 70.0)):
         paths.append(cached_table(RIG, frequencies=np.array([frequency]), grid=Grid(2, 2))[1])

@@ -12,8 +12,7 @@ from model.config.fields import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid
-from model.table.build import TableProblem, solve_table
-from model.table.file import load_table, save_table
+from model.table.table_file import TableProblem, load_table, save_table, solve_table
 from model.vibration import study_convergence
 from paper_plate import make_paper_rig
 from small_table import small_problem, small_table

@@ -19,8 +19,7 @@ from model.rig import sections
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
-from model.table.build import TableProblem, solve_table
-from model.table.file import load_table, save_table
+from model.table.table_file import TableProblem, load_table, save_table, solve_table
 
 GLASS = {"name": "glass", "E": 70e9, "rho": 2500.0, "nu": 0.2}
 FILM = {"name": "film", "E": 1e6, "rho": 1000.0, "nu": 0.45}

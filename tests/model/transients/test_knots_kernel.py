@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import shaped
 from model.transients.knots import (
     Carrier,

@@ -9,7 +9,7 @@ import pytest
 from model.answer.stimulus import Placement
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig_file import load_rig
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.measures import Transients

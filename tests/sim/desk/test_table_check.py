@@ -27,9 +27,8 @@ from model.finger import detection_threshold
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.study.promise_at_sensors import CheckSettings, Promise, promises
-from model.table.build import build_table
-from model.table.file import save_table
 from model.table.table import LocalizationTable
+from model.table.table_file import build_table, save_table
 from model.vibration import tone_fields
 from sim.desk.measuring import table_check
 from sim.desk.measuring.sound_card import SoundCard

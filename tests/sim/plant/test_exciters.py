@@ -12,7 +12,7 @@ from model.arrays import FloatArray
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import raised_cosine
 from plate_in_time import lock_in
 from sim.plant.excited_plate import play

@@ -20,7 +20,7 @@ from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_p
 from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad
 from model.structure.plate import Material, Plate
-from model.table.build import build_table
+from model.table.table_file import build_table
 from model.transients.base_motion import Term
 from model.transients.measures import ONSET_WINDOW
 from only import only

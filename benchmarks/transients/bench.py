@@ -26,8 +26,7 @@ from model.structure.attachments import footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
 from model.transients.knots import steady_states
-from model.transients.measures import ENDING_WINDOW, Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import ENDING_WINDOW, Shaper, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes
 

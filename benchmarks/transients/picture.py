@@ -11,8 +11,7 @@ from model.arrays import FloatArray
 from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.transients.base_motion import Bases, ramped_ending, ramped_onset, shaped
-from model.transients.measures import SAMPLE_RATE, Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import SAMPLE_RATE, Shaper, Transients
 from model.transients.time_response import PlateInTime
 
 LASTS = 0.160  # s

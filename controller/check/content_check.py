@@ -28,7 +28,7 @@ from model.finger import decibels, fingertip_points, fingertip_weights, over_thr
 from model.quantities import percent
 from model.table.table import LocalizationTable
 from model.transients.base_motion import KNOT_STEP, rise
-from model.transients.from_rest import from_rest
+from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
 
 TOLERANCE_DB, RANGE_DB, MAX_DELAY = 3.0, 20.0, 0.010

@@ -16,7 +16,7 @@ from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray, best_of
 from model.finger import decibels
 from model.transients.base_motion import KNOT_STEP, rise
-from model.transients.swings import CLICKS_APART
+from model.transients.excursions import CLICKS_APART
 
 Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]."""

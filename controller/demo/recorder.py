@@ -21,7 +21,7 @@ from controller.play.layer_content import LayerContent
 from controller.play.observer import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from model.answer.answer import HELD_BACK
-from model.transients.measures import ONSET_WINDOW
+from model.transients.shaping import ONSET_WINDOW
 from registry import threads
 
 STEADY_WINDOW = 0.25

@@ -140,6 +140,6 @@ def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]
 
 
 def peak_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float:
-    """Contrast of the peaks [dB], as `model.transients.measures` predicts for an onset."""
+    """Contrast of the peaks [dB], as `model.transients.shaping` predicts for an onset."""
     others = np.concatenate([finger.peaks for finger in quiet])
     return float(contrast_db([target.peaks], others, [target.weights]))

@@ -11,7 +11,7 @@ from controller.effects.region import Region
 from controller.effects.strengths import Strengths
 from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
-from model.transients.swings import CLICKS_APART
+from model.transients.excursions import CLICKS_APART
 from registry.plugins import WrongResultError
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one

@@ -38,9 +38,9 @@ from model.finger import decibels, detection_threshold
 from model.structure.attachments import Source, fingertip_loads
 from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import Envelopes, rise
+from model.transients.excursions import CLICKS_APART, DECAYED, Swing
 from model.transients.knots import RISE
-from model.transients.loaded_envelopes import enveloped_accelerations
-from model.transients.swings import CLICKS_APART, DECAYED, Swing
+from model.transients.time_response import enveloped_accelerations
 from model.vibration import Excitation
 
 ONSET_RAMP = 0.040

@@ -49,8 +49,7 @@ from model.finger import (
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
-from model.transients.measures import Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import Shaper, Transients
 from registry.wording import first_problem
 
 

@@ -36,7 +36,7 @@ from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS, STRONG_DB_SL
 from model.structure.attachments import Source, check_loads
 from model.structure.plate import Plate
-from model.transients.swings import DECAYED, Swing
+from model.transients.excursions import DECAYED, Swing
 from model.vibration import Excitation, Tone
 
 MAX_POINTS = 20_000

@@ -309,8 +309,7 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     summary = plate_summary(rig)
     if summary["exciters"]:
         from model.reduction.free_plate import solve_free_plate
-        from model.transients.excursions import excursions_of
-        from model.transients.reach import reach_of
+        from model.transients.excursions import excursions_of, reach_of
 
         free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
         summary["reach"] = reach_of(rig, free).as_json()

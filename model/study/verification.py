@@ -60,7 +60,7 @@ from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.study.contrast_maps import random_contacts
 from model.table.table import LocalizationTable, read_fingertips
 from model.transients.base_motion import ramped_onset
-from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes, tone_fields
 

@@ -71,8 +71,7 @@ from model.structure.attachments import (
 from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import Dispersion
 from model.structure.plate import Plate
-from model.transients.excursions import MagnetMotions
-from model.transients.swings import Swing
+from model.transients.excursions import MagnetMotions, Swing
 from model.transients.time_response import PlateInTime, plate_in_time
 from model.vibration import Excitation, base_amplitudes
 from registry.limits import GuardLimits

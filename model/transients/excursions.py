@@ -4,17 +4,30 @@ An onset moves a magnet further than the settled vibration: the free vibration n
 resonance beats with the drive. A drive that rises or falls steadily, along whichever ramp, is a
 mean of drives that jump at different times; so it moves a magnet no further than the drive that
 jumps, with which shares of full level are counted; what comes and goes is followed
-(`model.transients.swings`). Shaped envelopes rise above their last
+(`model.transients.excursions`). Shaped envelopes rise above their last
 amplitude: of their difference to a plain ramp as much is kept as magnets allow.
+
+Levels that come and go, and how far magnets of exciters move along them.
+
+A level that swings as often as drive and magnet beat, 10 to 60 times a second, pumps the free
+vibration of the magnets: its side band is at their resonance. In the eigenvectors near the drive
+that follows step by step, exactly for straight lines; those far above follow the level at once.
+
+From which frequency a rig reaches a level over its plate, and where it falls short.
+
+At each place, as the mean over a finger that rests there, all actuators are in phase at full level,
+or at the share of it that the rig's limits and the excursion of the magnets allow answers.
 """
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, FloatArray, lattice
+from model.finger import FIVE_POINTS, STRONG_DB_SL, decibels, detection_threshold, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig
@@ -22,10 +35,66 @@ from model.rig.rig_summary import Excursions, exciters_of
 from model.structure.attachments import footprints_of
 from model.transients.base_motion import KNOT_STEP, rise
 from model.transients.knots import RISE, SAMPLES
-from model.transients.swings import DECAYED, Swing, motions_along
 from model.transients.time_response import PlateInTime, plate_in_time
 
-_STEP = 0.0005  # s
+DECAYED = 0.25
+"""Time [s] after which little is left of a free vibration of magnets."""
+
+CLICKS_APART = 0.060
+"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
+one."""
+
+_STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
+_PACES = 0.060  # s; from the shortest to the longest pause between what begins anew
+_NEAR, _BESIDE = 1.5, 50.0  # up to so many times the frequency of a drive, and so much above [Hz]
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A level over time: shares of full level, the first 0, a step [s] apart, lines between.
+
+    again: time [s] after which it may begin anew while it rings, infinite for never.
+    """
+
+    shares: tuple[float, ...]
+    step: float
+    again: float = math.inf
+
+
+def motions_along(
+    plate: "PlateInTime", rows: ComplexArray, frequency: float, swing: Swing
+) -> FloatArray:
+    """Largest motions (m,) [m] by drives at a frequency [Hz] whose full level swings, from rest.
+
+    rows (m, 2 r): motion of each in each eigenvector. Of all drives together, in those phases in
+    which the motions by each add; of what may begin anew over and over at the worst pace.
+    """
+    s = 2j * math.pi * frequency
+    settled = plate.following(np.array([s]))[0][0].T[:, :, None] * rows.T[:, None, :]
+    near = np.abs(plate.eigenvalues) < 2 * math.pi * (_NEAR * frequency + _BESIDE)
+    parts = math.ceil(swing.step / _STEP)
+    step, knots = swing.step / parts, len(swing.shares)
+    level = np.interp(np.arange(parts * (knots - 1) + 1) / parts, np.arange(knots), swing.shares)
+    rates: ComplexArray = plate.eigenvalues[near] - s
+    decays = np.exp(rates * step)
+    ends = 1 - (decays - 1) / (rates * step)
+    added = level[1:, None] * ends + level[:-1, None] * (1 - decays - ends)
+    follows = np.zeros((len(level), len(rates)), dtype=complex)
+    for number, each in enumerate(added, 1):
+        follows[number] = decays * follows[number - 1] + each
+    moved = np.tensordot(follows, settled[near], axes=1)
+    moved += level[:, None, None] * settled[~near].sum(axis=0)
+    largest = np.abs(moved).sum(axis=1).max(axis=0)
+    if swing.again < math.inf:  # phases go on from one to the next
+        for pause in np.arange(swing.again, swing.again + _PACES, _STEP):
+            count = math.ceil(pause / step)
+            spare = np.pad(moved, ((0, -len(moved) % count), (0, 0), (0, 0)))
+            anew = np.abs(spare.reshape(-1, count, *moved.shape[1:]).sum(axis=0))
+            largest = np.maximum(largest, anew.sum(axis=1).max(axis=0))
+    return np.asarray(largest)
+
+
+_EXCURSIONS_STEP = 0.0005  # s
 _AFTER = 20  # steps after the last knot
 _KEPT, _SWINGS_KEPT = 16, 256
 _CHECKED = 1.0  # Hz between frequencies of a rig that are checked
@@ -65,7 +134,7 @@ class MagnetMotions:
 
         Of all together, in those phases in which the motions by each add; without fingers.
         """
-        times = np.arange(0, DECAYED, _STEP)
+        times = np.arange(0, DECAYED, _EXCURSIONS_STEP)
         decays = np.exp(np.outer(times, self.plate.eigenvalues))
         found = []
         for frequency in frequencies.tolist():
@@ -183,3 +252,89 @@ def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
     return Excursions(
         limits.level * settled, largest.max(axis=0), np.asarray(passed.any(axis=0)), allowed
     )
+
+
+MARGIN = 0.02
+"""Strip along the edges [m] that is left out."""
+
+UP_TO, STEP = 300.0, 10.0
+"""Up to where frequencies are compared, and their step [Hz]."""
+
+_SPACING = 0.012  # m
+_AT_ONCE = 40  # places
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Least level [dB SL] over the plate (f,) at frequencies (f,) [Hz], and the share of places.
+
+    shares (f,): of the places that reach `STRONG_DB_SL`.
+    """
+
+    frequencies: FloatArray
+    least_db_sl: FloatArray
+    shares: FloatArray
+
+    @property
+    def start(self) -> float | None:
+        """The lowest frequency [Hz] at which all places reach the level; None where none does."""
+        whole = self.frequencies[self.shares == 1]
+        return float(whole[0]) if len(whole) else None
+
+    @property
+    def falls_short(self) -> dict[float, float]:
+        """Share of the places that reach the level, by frequency above the start [Hz]."""
+        pairs = zip(self.frequencies.tolist(), self.shares.tolist(), strict=True)
+        start = -np.inf if self.start is None else self.start
+        return {frequency: share for frequency, share in pairs if share < 1 and frequency > start}
+
+    def as_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "level_db_sl": STRONG_DB_SL,
+            "from_hz": self.start,
+            "frequencies_hz": self.frequencies.tolist(),
+            "least_level_db_sl": self.least_db_sl.round(2).tolist(),
+            "share_of_places": self.shares.round(4).tolist(),
+        }
+
+
+def reach_of(rig: Rig, free: FreePlate) -> Reach:
+    """Reach of a rig as its file has it up to UP_TO within its limits; free: its plate."""
+    plate, limits = rig.plate, rig.limits
+    low = limits.frequency_min
+    frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, STEP)
+    margins = [(side, min(MARGIN, side / 4)) for side in (plate.length, plate.width)]
+    places = lattice(
+        *(
+            np.linspace(edge, side - edge, 1 + math.ceil((side - 2 * edge) / _SPACING))
+            for side, edge in margins
+        )
+    )
+    level = np.minimum(magnets_of(rig, free).shares(frequencies), limits.level)[:, None]
+    threshold = detection_threshold(frequencies, rig.threshold)[:, None]
+    found = []
+    for few in np.array_split(places, math.ceil(len(places) / _AT_ONCE)):
+        points, weights = fingertips_on(
+            few, length=plate.length, width=plate.width, rule=FIVE_POINTS
+        )
+        fields = free.acceleration(
+            rig.eras, frequencies, points.reshape(-1, 2), loads=rig.masses
+        ).reshape(len(frequencies), len(rig.eras), *weights.shape)
+        phases = fields[..., 0].conj() / np.abs(fields[..., 0])
+        together = np.abs((fields * phases[..., None]).sum(axis=1))
+        felt = level * (together * weights).sum(axis=-1)
+        found.append(felt / _held(rig, free, few, frequencies) / threshold)
+    levels = decibels(np.concatenate(found, axis=1))
+    return Reach(frequencies, levels.min(axis=1), (levels >= STRONG_DB_SL).mean(axis=1))
+
+
+def _held(rig: Rig, free: FreePlate, places: FloatArray, frequencies: FloatArray) -> FloatArray:
+    """By which factor a finger at a place lowers the motion there, 1 + D R of either, (f, p)."""
+    if rig.fingertip is None:
+        return np.ones((len(frequencies), len(places)))
+    attached = (*rig.eras, *rig.masses)
+    between, _ = free.receptances(places, places[:1], frequencies, loads=attached)
+    stiffness = rig.fingertip.dynamic_stiffness(2 * np.pi * frequencies)
+    own = np.diagonal(between, axis1=-2, axis2=-1)
+    return np.abs(1 + stiffness[:, None] * own)

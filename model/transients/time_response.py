@@ -13,20 +13,49 @@ with time.
 Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
 base jumped (ramp 0): displacement and velocity of the plate are continuous through every change.
+
+The plate from rest under bases that move along samples of band-limited signals.
+
+Between samples a signal is the trigonometric polynomial through them, to each of whose sinusoids
+the plate in time has a closed-form solution; a free vibration makes up for what all of them are at
+time 0. So no step size enters, as elsewhere in `model.transients`.
+
+Drives along an envelope, on a plate under fingers, by a numerical Laplace transform.
+
+A plate under fingers has other modes, whose solution takes as long as several answers of a table.
+At a complex frequency s fingers are a change of low rank of the plate on its ERAs, whose modes are
+known: with displacements u0 of the fingers if they weighed nothing, receptances G between them and
+their dynamic stiffness D, they hold the plate by the forces
+
+    (1 + D G)^-1 D u0.
+
+The demodulated response less its quasi-static part, which a slow envelope would give, is inverted
+on a line s = i omega + sigma + i nu by a discrete Fourier transform: what comes after the time that
+is followed returns as exp(-sigma period). For long envelopes the plate is solved every half hertz,
+linear between, and as far as smooth ones have a spectrum, which ends along a raised cosine.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, stretches
-from model.structure.attachments import FingertipLoad, PointLoad, Source, footprints_of
-from model.transients.base_motion import BaseMotions
+from model.structure.attachments import (
+    Fingertip,
+    FingertipLoad,
+    PointLoad,
+    Source,
+    coupled_forces,
+    footprints_of,
+)
+from model.transients.base_motion import BaseMotions, rise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,3 +335,133 @@ def _inverse(vectors: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(vectors))
     except np.linalg.LinAlgError:
         return np.full_like(vectors, np.nan)
+
+
+_AT_ONCE = 512  # frequencies or samples, at some kilobytes each
+
+
+def from_rest(
+    plate: PlateInTime,
+    signals: FloatArray,
+    shapes: FloatArray,
+    *,
+    sample_rate: float,
+    factors: ComplexArray,
+) -> FloatArray:
+    """Acceleration [m/s²] at the times of the samples, the first at time 0, (n, p).
+
+    signals (eras, n) in full strokes, sampled at sample_rate [Hz]; shapes (p, r) of the reduced
+    plate at points; factors (eras,): gain and phase of each ERA. Displacement and velocity of the
+    plate are 0 at time 0; as with a ramp of 0, a base that jumps there passes on no impulse.
+    """
+    count = signals.shape[1]
+    continued = _continued(signals)
+    period = continued.shape[1]
+    spectrum: ComplexArray = factors * np.fft.rfft(continued).T
+    s = np.asarray(2j * np.pi * np.fft.rfftfreq(period, 1 / sample_rate), dtype=np.complex128)
+    points = plate.with_far_ends(shapes)
+    by_forced, by_free = (points @ plate.displacement).T, (points @ plate.free_acceleration).T
+    forced = np.empty((len(s), len(points)), dtype=complex)
+    start = np.zeros(len(plate.eigenvalues), dtype=complex)
+    for first in range(0, len(s), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        z = plate.following_all(s[some], spectrum[some])
+        forced[some] = s[some, None] ** 2 * (z @ by_forced)
+        start += 2 * z.sum(axis=0) - (z[0] if first == 0 else 0)
+    free = -plate.to_free @ (plate.vectors @ start).real / period
+    ringing = [
+        ((free * np.exp(np.outer(times, plate.decay))) @ by_free).real
+        for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _AT_ONCE)
+    ]
+    return np.asarray(np.fft.irfft(forced, period, axis=0)[:count] + np.concatenate(ringing))
+
+
+def _continued(signals: FloatArray) -> FloatArray:
+    """Signals (eras, n) that go on from their last samples and fade to rest, (eras, 2 n - 1).
+
+    What comes later moves nothing before; a jump would show between samples. An odd number of
+    samples has no frequency of half their rate.
+    """
+    count = signals.shape[1]
+    onward = 2 * signals[:, -1:] - signals[:, -2::-1]
+    fading = 1 - rise(np.arange(1.0, count), count)
+    return np.hstack([signals, fading * onward])
+
+
+_DAMPING = 5.0  # sigma times the period, by which what is late has grown
+
+_RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; of what is long, to each side
+
+_GUARD = 12
+"""Steps after the end that are left out: before a jump at the start the plate seems to ring, for no
+spectrum is without an end, and that comes round there, where it has grown most."""
+
+
+def enveloped_accelerations(
+    plate: PlateInTime,
+    bases: ComplexArray,
+    frequency: float,
+    *,
+    points: FloatArray,
+    fingers: Sequence[tuple[FloatArray, Fingertip]],
+    envelope: FloatArray,
+    step: float,
+) -> ComplexArray:
+    """Demodulated accelerations (n + 1, p) [m/s²] along an envelope from rest; the last is steady.
+
+    plate: without fingers; bases (eras,): motions [m] at a frequency [Hz], times the envelope (n,),
+    whose values are a step [s] apart; points (p, r): shapes; fingers: shape (r,) under each and its
+    load. At the times of the envelope.
+    """
+    asked, envelope = len(envelope), np.pad(envelope, (0, _GUARD))
+    count = len(envelope)
+    growth = np.exp(_DAMPING / count * np.arange(count))
+    transform, nu = np.fft.fft(envelope / growth), np.fft.fftfreq(count, step)
+    lines = np.sort(nu)
+    if 1 / (count * step) < _RESOLUTION:
+        lines = np.arange(-_LONG_BAND, _LONG_BAND + _RESOLUTION, _RESOLUTION)
+    s = np.asarray(2j * math.pi * (frequency + np.append(lines, 0.0)), dtype=complex)
+    s[:-1] += _DAMPING / (count * step)
+    found = _held_by(plate, s, bases, frequency, points, fingers)
+    steady = found[-1]
+    ends = np.sin(np.pi * np.minimum(1 - np.abs(lines / lines[0]), 0.5)) ** 2
+    transient = ((found[:-1] - steady) * ends[:, None]).astype(np.complex64)
+    is_near = np.abs(nu) <= lines[-1]
+    after = np.clip(np.searchsorted(lines, nu[is_near]), 1, len(lines) - 1)
+    share = ((lines[after] - nu[is_near]) / (lines[after] - lines[after - 1])).astype(np.float32)
+    between = share[:, None] * transient[after - 1] + (1 - share[:, None]) * transient[after]
+    every = np.zeros((count, len(steady)), dtype=np.complex64)
+    every[is_near] = transform[is_near, None].astype(np.complex64) * between
+    found = fft.ifft(every, axis=0) * growth[:, None].astype(np.float32)
+    found += envelope[:, None].astype(np.float32) * steady.astype(np.complex64)
+    return np.append(found[:asked], steady[None], axis=0)
+
+
+def _held_by(
+    plate: PlateInTime,
+    s: ComplexArray,
+    bases: ComplexArray,
+    frequency: float,
+    points: FloatArray,
+    fingers: Sequence[tuple[FloatArray, Fingertip]],
+) -> ComplexArray:
+    """Accelerations (m, p) at complex frequencies s (m,) by bases (eras,), held by fingers."""
+    single, p, k = np.complex64, len(points), len(fingers)
+    gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
+    driven = np.array([gains * bases * each for each in (plate.by_drive, plate.by_rate)])
+    shapes = plate.with_far_ends(np.vstack([points, *(shape for shape, _ in fingers)]))
+    at = (shapes @ plate.displacement).astype(single)  # (p + k, 2 r)
+    forced = (shapes[p:] @ plate.forced.T).astype(single)  # (k, 2 r)
+    modal = (1 / (s[:, None] - plate.eigenvalues)).astype(single)
+    sources = np.concatenate([(driven @ plate.participation.T).astype(single), forced])
+    moved = modal @ (sources[:, None] * at).reshape(-1, at.shape[1]).T
+    moved = moved.reshape(len(s), 2 + k, p + k).astype(complex)
+    by_drive = moved[:, 0] + s[:, None] * moved[:, 1]
+    found = by_drive[:, :p]
+    if fingers:
+        stiffness = np.column_stack([tip.dynamic_stiffness(-1j * s) for _, tip in fingers])
+        receptance = moved[:, 2:, p:].swapaxes(1, 2)
+        applied = (stiffness * by_drive[:, p:])[:, :, None]
+        forces = coupled_forces(receptance, stiffness, applied)[:, :, 0]  # (m, k)
+        found = found - (forces[:, None] @ moved[:, 2:, :p])[:, 0]
+    return np.asarray(found * (s**2)[:, None])

@@ -32,8 +32,8 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Source
 from model.transients.base_motion import Bases, ramped_onset, shaped
-from model.transients.from_rest import from_rest
-from model.transients.measures import ONSET_WINDOW
+from model.transients.shaping import ONSET_WINDOW
+from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
 from sim.plant import second_harmonic
 from sim.plant.fingers import Record, felt_peaks, fit_tones

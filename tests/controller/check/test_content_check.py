@@ -25,7 +25,7 @@ from model.finger import (
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
-from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import SAMPLE_RATE, Transients
 from paper_table import smooth_rig
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")

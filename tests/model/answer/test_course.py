@@ -14,7 +14,7 @@ from model.arrays import FloatArray, Point
 from model.errors import InputError
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.transients.base_motion import BaseEnvelope, rise, shaped
-from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone, base_amplitudes
 from paper_table import contact_sets, smooth_rig, smooth_table
 from small_table import small_table

@@ -22,7 +22,7 @@ from model.ensemble.draws import JUDGING_DRAWS
 from model.finger import detection_threshold, fingertip_points, fingertip_weights
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
-from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Excitation, Tone, base_amplitudes
 from paper_table import contact_sets, smooth_rig, smooth_table
 from small_table import small_table

@@ -13,8 +13,7 @@ from model.rig.rig import Uncertainty
 from model.structure.attachments import footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
-from model.transients.measures import Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import Shaper, Transients
 from model.transients.time_response import plate_in_time
 from only import only
 from paper_plate import make_paper_rig

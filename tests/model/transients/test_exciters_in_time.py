@@ -17,8 +17,7 @@ from model.structure.attachments import (
     rigid_body_frequencies,
 )
 from model.transients.knots import steady_states
-from model.transients.loaded_envelopes import enveloped_accelerations
-from model.transients.time_response import PlateInTime, plate_in_time
+from model.transients.time_response import PlateInTime, enveloped_accelerations, plate_in_time
 
 POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])
 FINGER = FingertipLoad(0.11, 0.09, Fingertip())

@@ -13,11 +13,12 @@ from model.transients.knots import (
     Carrier,
     FingerResponses,
     ending_by_numpy,
+    ending_knots,
     onset_by_numpy,
+    onset_knots,
+    quiet_weight,
 )
-from model.transients.knots_kernel import ending_knots, onset_knots, quiet_weight
-from model.transients.measures import Transients
-from model.transients.shaping import Shaper, of_eras, responses_at
+from model.transients.shaping import Shaper, Transients, of_eras, responses_at
 from model.vibration import Tone
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

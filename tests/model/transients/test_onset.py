@@ -32,8 +32,7 @@ from model.transients.knots import (
     solve_carrier,
     while_ending,
 )
-from model.transients.measures import Transients
-from model.transients.shaping import responses_at
+from model.transients.shaping import Transients, responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone
 from paper_plate import make_paper_rig

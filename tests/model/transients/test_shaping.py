@@ -12,8 +12,7 @@ from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
 from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset, shaped
 from model.transients.knots import ONSET_KNOTS, steady_states
-from model.transients.measures import Transients
-from model.transients.shaping import Shaper
+from model.transients.shaping import Shaper, Transients
 from model.vibration import Excitation, Tone
 from only import only
 from plate_in_time import make_plate_in_time

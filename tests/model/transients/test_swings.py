@@ -11,8 +11,13 @@ from exciter_rig import exciter_rig
 from model.answer.answer import swings_of_pulse
 from model.answer.stimulus import Course
 from model.reduction.free_plate import solve_free_plate
-from model.transients.excursions import MagnetMotions, magnets_of
-from model.transients.swings import CLICKS_APART, Swing, motions_along
+from model.transients.excursions import (
+    CLICKS_APART,
+    MagnetMotions,
+    Swing,
+    magnets_of,
+    motions_along,
+)
 
 K, C, M, BL, R, VOLTS = 3189.2, 0.7553, 0.10929, 3.63, 4.4, 3.0008
 """Of the exciter of 25 mm at 1 W, from its sheet: 27 Hz and a quality of 5 on a held coil."""

@@ -8,7 +8,7 @@ import pytest
 from model.finger import fingertip_points
 from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_onset
 from model.transients.knots import hat_accelerations
-from model.transients.measures import SAMPLE_RATE, Transients
+from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone
 from plate_in_time import make_plate_in_time, stepped_acceleration
 

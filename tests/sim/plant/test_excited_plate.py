@@ -22,7 +22,7 @@ from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
 from model.transients.base_motion import BaseEnvelope, shaped
-from model.transients.measures import Transients
+from model.transients.shaping import Transients
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone
 from sim.plant.excited_plate import Playback, Vibration, play

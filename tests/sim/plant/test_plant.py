@@ -22,7 +22,7 @@ from model.structure.attachments import Era, FingertipLoad
 from model.structure.plate import Material, Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term
-from model.transients.measures import ONSET_WINDOW
+from model.transients.shaping import ONSET_WINDOW
 from only import only
 from paper_plate import make_paper_rig
 from sim.plant.plant import Plant

@@ -11,9 +11,12 @@
     └── CommandError (ValueError)         an invalid request; the caller's fault
 
 Backends translate exceptions of their libraries into these and keep the cause.
+
+Counters of a wire.
 """
 
 import re
+from dataclasses import dataclass
 
 
 class DriverError(Exception):
@@ -86,3 +89,21 @@ class CommandError(DriverError, ValueError):
 def system_message(error: BaseException) -> str:
     """Return the operating system's message of an error, without its number."""
     return re.sub(r"^.*\[Errno -?\d+\] ", "", str(error), flags=re.DOTALL)
+
+
+@dataclass
+class WireCounters:
+    """Frames counted by a backend since its wire was opened.
+
+    invalid_frames: frames with a wrong checksum, length, form or version, and events that cannot be
+    decoded; unexpected_frames: valid frames that no request was waiting for, such as late replies;
+    events: unsolicited messages. remark: what came last since a request in place of its reply, and
+    what to check.
+    """
+
+    frames_out: int = 0
+    frames_in: int = 0
+    invalid_frames: int = 0
+    unexpected_frames: int = 0
+    events: int = 0
+    remark: str = ""

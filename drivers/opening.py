@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.ports.port import Port
+from drivers.ports import Port
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
 from drivers.wires.wire import Wire

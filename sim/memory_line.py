@@ -16,8 +16,7 @@ from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 from drivers.errors import CommandError, LinkError
-from drivers.line_kinds import SIMULATED
-from drivers.urls import AmplifierUrl
+from drivers.urls import SIMULATED, AmplifierUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.serial_line.host import SerialWire
 from model.errors import InputError

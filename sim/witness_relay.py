@@ -15,7 +15,7 @@ from drivers.errors import CommandError, LinkError
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.config import WireKind
 from drivers.judge.watching.witness import Witness
-from drivers.ports.serial_port import open_port
+from drivers.ports import open_port
 from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError

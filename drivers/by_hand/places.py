@@ -18,7 +18,7 @@ from serial.tools.list_ports import comports
 
 from drivers.by_hand.reaching import identified
 from drivers.errors import DriverError, FrameError, LinkTimeout
-from drivers.ports.serial_port import remedy_of
+from drivers.ports import remedy_of
 from drivers.protocol.records import Values
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
 from drivers.wires.can_bus.canopen import BITRATE, cob_id

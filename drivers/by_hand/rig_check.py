@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.line_kinds import BUS_ERROR, CLOCK_ERRORS, line_kind_of
 from drivers.protocol.table import QUANTITIES
 from drivers.protocol.timing import (
     MAX_LOSS_DETECTION_TIME,
     check_watchdog,
     loss_detection_time,
 )
+from drivers.urls import BUS_ERROR, CLOCK_ERRORS, line_kind_of
 from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
 from drivers.wires.wire import reply_words, request_words

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol, TypeAlias
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.records import Values
 from drivers.protocol.timing import ATTEMPTS
 from drivers.wires.wire import Event, OtherHost, Several

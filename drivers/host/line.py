@@ -15,7 +15,7 @@ from drivers import trace
 from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
-from drivers.ports.port import OpenPort
+from drivers.ports import OpenPort
 from drivers.protocol.records import Values
 from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.protocol.timing import ATTEMPTS, FAST, REPLY_TIMEOUT

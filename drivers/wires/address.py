@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
 from drivers.errors import LinkError
-from drivers.ports.port import Port
+from drivers.ports import Port
 from drivers.wires.wire import Wire
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeAlias
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.records import (
     TEXT_MAX,
     Bits,

@@ -5,7 +5,7 @@ A wire has an address made of a URL, a port of bytes, and one of the three proto
 """
 
 from drivers.errors import CommandError, LinkError
-from drivers.ports.port import Port
+from drivers.ports import Port
 from drivers.wires.address import WireAddress
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames, unpack_frames

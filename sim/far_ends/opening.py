@@ -17,8 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import CommandError
-from drivers.line_kinds import KIND_OF_PORT
-from drivers.urls import ADDRESS, BAUD, RTU_BAUD, Place
+from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Place
 from drivers.wires.can_bus.canopen import BITRATE
 from drivers.wires.known import address_of
 from model.errors import InputError

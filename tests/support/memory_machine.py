@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drivers.errors import LinkError
-from drivers.ports.port import PORT_OPENER
+from drivers.ports import PORT_OPENER
 from registry import threads
 from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop

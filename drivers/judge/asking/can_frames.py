@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import cast
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import (
     Answer,

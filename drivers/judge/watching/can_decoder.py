@@ -7,7 +7,7 @@ masters read, concern no rule. Other text is ignored.
 import re
 from collections import deque
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import (
     DecodedFrame,

@@ -17,9 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, final
 
 from drivers.errors import LinkError
-from drivers.ports.port import Port
-from drivers.ports.serial_port import open_port
-from drivers.ports.tcp import NETWORK_DELAY
+from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.timing import BOOT_TIME
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress

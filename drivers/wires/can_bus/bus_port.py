@@ -11,7 +11,7 @@ from typing import Any, final
 import can
 
 from drivers.errors import LinkError, system_message
-from drivers.ports.device_port import FAILURES, DevicePort
+from drivers.ports import FAILURES, DevicePort
 from drivers.wires.can_bus.canopen import ERROR_ID, CanFrame
 from drivers.wires.can_bus.frames import REQUEST, pack_frames, unpack_frames
 from registry.threads import in_thread

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.table import MAX_WORDS
 from drivers.wires.can_bus.canopen import BLOCK, CanFrame
 

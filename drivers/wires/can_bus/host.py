@@ -5,7 +5,7 @@ Its bytes are packed frames (`drivers.wires.can_bus.frames`), for a port that ta
 
 from collections import deque
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BROADCAST,

@@ -9,10 +9,8 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.counters import WireCounters
-from drivers.ports.port import Port
-from drivers.ports.serial_port import open_port
-from drivers.ports.tcp import NETWORK_DELAY
+from drivers.errors import WireCounters
+from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
 from drivers.protocol.timing import BOOT_TIME

@@ -6,10 +6,8 @@ serial:///dev/ttyUSB0?baud=921600&address=1, or on a server serial+tcp://HOST:PO
 import random
 from collections.abc import Callable
 
-from drivers.counters import WireCounters
-from drivers.ports.port import Port
-from drivers.ports.serial_port import open_port
-from drivers.ports.tcp import NETWORK_DELAY
+from drivers.errors import WireCounters
+from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.table import (
     BY_NUMBER,

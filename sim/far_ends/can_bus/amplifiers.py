@@ -6,7 +6,7 @@ Frames come and go packed (`drivers.wires.can_bus.frames`), those of a message t
 import struct
 from collections.abc import Mapping
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
 from drivers.protocol.table import (

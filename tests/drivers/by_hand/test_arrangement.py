@@ -5,7 +5,7 @@ import math
 import pytest
 
 from drivers.by_hand.rig_check import Arrangement, arrangement_of
-from drivers.line_kinds import CLOCK_ERRORS, SIMULATED
+from drivers.urls import CLOCK_ERRORS, SIMULATED
 from sim.transport.line_kinds import LINE_KINDS, PROMPT
 
 STATED = 5e-6 / math.sqrt(3)

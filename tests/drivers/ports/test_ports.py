@@ -16,11 +16,9 @@ from unittest.mock import Mock
 import pytest
 import serial
 
+from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
-from drivers.ports import serial_port, tcp
-from drivers.ports.port import Port
-from drivers.ports.serial_port import SerialPort
-from drivers.ports.tcp import open_connection
+from drivers.ports import Port, SerialPort, open_connection
 from drivers.urls import Place
 from virtual_loop import in_virtual_time
 
@@ -35,8 +33,8 @@ def test_device_is_opened_alone_with_low_latency_and_its_settings(
     far, near = os.openpty()
     made = Mock()
     made.return_value.fileno.return_value = near
-    monkeypatch.setattr(serial_port.serial, "Serial", made)
-    serial_port._open_device(Place(device, baud=19_200, parity="O", stop=2))
+    monkeypatch.setattr(ports.serial, "Serial", made)
+    ports._open_device(Place(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
@@ -54,9 +52,7 @@ async def test_port_that_fails_amid_its_opening_is_released(
     name = os.ttyname(near)
 
     async def open_it() -> Port:
-        return await serial_port.open_port(
-            Place(name, baud=9600), lambda data: None, lambda cause: None
-        )
+        return await ports.open_port(Place(name, baud=9600), lambda data: None, lambda cause: None)
 
     def fail(port: serial.Serial) -> None:
         raise OSError(errno.EIO, "gone")
@@ -155,7 +151,7 @@ async def test_connection_timeout_has_a_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The connection is neither accepted nor refused."""
-    monkeypatch.setattr(tcp, "_CONNECT_TIMEOUT", 0.0)
+    monkeypatch.setattr(ports, "_CONNECT_TIMEOUT", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
         with pytest.raises(LinkError, match=rf"127.0.0.1:{port}: .*check the address"):
@@ -181,7 +177,7 @@ async def test_next_address_of_a_host_is_tried(first: str, monkeypatch: pytest.M
         return ["fd00::1", "192.0.2.1"]
 
     monkeypatch.setattr(loop, "create_connection", connecting)
-    monkeypatch.setattr(tcp, "_addresses", found)
+    monkeypatch.setattr(ports, "_addresses", found)
     began = loop.time()
     connection = await open_connection("amplifier.test", 502, lambda _: None, losses.append)
     assert loop.time() - began == pytest.approx(0.25 if first == "hangs" else 0.0, abs=0.01)
@@ -212,8 +208,8 @@ async def test_link_local_address_keeps_its_zone(
     """RFC 4007."""
     of_name = ("fe80::1", 0, 0, 4000), ("fd00::1", 0, 0, 0), ("192.0.2.1", 0)
     found = [(0, 0, 0, "", address) for address in of_name]
-    monkeypatch.setattr(tcp.socket, "getaddrinfo", lambda *args, **kwargs: found)
-    assert await tcp._addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
+    monkeypatch.setattr(ports.socket, "getaddrinfo", lambda *args, **kwargs: found)
+    assert await ports._addresses("amplifier.test") == ["fe80::1%4000", "fd00::1", "192.0.2.1"]
 
 
 def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:

@@ -11,8 +11,8 @@ from typing import Any
 import can
 import pytest
 
-from drivers.ports import serial_port
-from drivers.ports.port import Port
+from drivers import ports
+from drivers.ports import Port
 from drivers.urls import Place
 from drivers.wires.can_bus import bus_port
 from registry import threads
@@ -57,7 +57,7 @@ class _HangingRead(_Hanging):
 HEARD: list[bytes] = []
 OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
     "port": partial(
-        serial_port.open_port,
+        ports.open_port,
         Place("/dev/ttyUSB9", baud=9600),
         lambda data: None,
         lambda what: None,
@@ -76,7 +76,7 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
     """The device that is opened; released after the test."""
     device: _Hanging = request.param()
-    monkeypatch.setattr(serial_port, "_open_device", device.open)
+    monkeypatch.setattr(ports, "_open_device", device.open)
     monkeypatch.setattr(can, "Bus", lambda **how: device.open())
     monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
     HEARD.clear()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from drivers.line_kinds import CLOCK_ERRORS
+from drivers.urls import CLOCK_ERRORS
 from model.cli import app
 from model.rig.rig import Channel, Uncertainty
 from model.rig.rig_file import example_rig_path

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.counters import WireCounters
+from drivers.errors import WireCounters
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.protocol.table import MESSAGES

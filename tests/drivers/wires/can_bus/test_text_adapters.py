@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import LinkError
 from drivers.opening import Lines
-from drivers.ports.port import PORT_OPENER
+from drivers.ports import PORT_OPENER
 from drivers.wires.can_bus import address
 from drivers.wires.can_bus.address import SlcanAddress, TextPort
 from drivers.wires.can_bus.canopen import CanFrame

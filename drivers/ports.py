@@ -1,0 +1,449 @@
+"""What carries bytes: serial ports of this machine, and TCP connections.
+
+The ports that wires take from the machine, replaceable for tests in virtual time.
+
+Frames, retries and timeouts are the same whoever opens a port. TCP connections belong to the event
+loop.
+
+An open device as a port: read by the event loop, or by a thread where it cannot be watched.
+
+TCP connections as ports: of Modbus, of serial servers and of CAN adapters behind one.
+
+Opening of what carries bytes: serial ports and USB adapters of this machine, and TCP ports.
+
+A serial port never blocks the event loop. A frame that it does not take at once follows as soon as
+it takes it, unless a newer frame replaces the rest of it: what the line delivers late must not
+delay a stop.
+"""
+
+import asyncio
+import contextlib
+import errno
+import ipaddress
+import os
+import select
+import socket
+import threading
+from abc import ABC, abstractmethod
+from asyncio.staggered import staggered_race
+from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
+from functools import partial
+from typing import ClassVar, Protocol, TypeAlias, cast, final
+
+import serial
+
+from drivers.errors import LinkError, LinkTimeout, system_message
+from drivers.urls import Place
+from registry.threads import close_in_thread, in_thread
+
+
+class OpenPort(Protocol):
+    """What a line needs of a port that is open; it is told of data and loss."""
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether it has not taken all bytes yet."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes without waiting, as soon as the line takes them; LinkError if it is lost.
+
+        They replace the unsent rest of earlier ones.
+        """
+
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet."""
+
+
+class Port(OpenPort, Protocol):
+    """A port of a line; data and loss are reported to the callbacks of its opening."""
+
+    def close(self) -> None:
+        """Close it; no callback is called afterwards."""
+
+    async def wait_closed(self) -> None:
+        """Wait until it is closed."""
+
+
+PortOpener: TypeAlias = Callable[
+    [str, Callable[[bytes], None], Callable[[str], None]], Awaitable[Port]
+]
+"""Opens a serial port by its name, with what takes its data and its loss; raises LinkError."""
+
+PORT_OPENER: ContextVar[PortOpener | None] = ContextVar("PORT_OPENER", default=None)
+"""Who opens serial ports in this context; None: the machine itself."""
+
+
+FAILURES: tuple[type[Exception], ...] = (OSError, ValueError, TypeError)
+"""Of a device that is gone; TypeError: of pyserial, closed during a read."""
+
+
+class DevicePort(ABC):
+    """A device of this name, which may hang; implements `Port`.
+
+    descriptor: watched by the event loop; None where a thread must read, which may block.
+    on_data: called with what is received; on_loss: called once with the cause of a loss; shut:
+    closes the device, also a lost one.
+    """
+
+    kind: ClassVar[str]
+    """What it is, in messages."""
+    failures = FAILURES
+
+    def __init__(
+        self,
+        name: str,
+        descriptor: int | None,
+        on_data: Callable[[bytes], None],
+        on_loss: Callable[[str], None],
+        shut: Callable[[], None],
+    ) -> None:
+        self.name = name
+        self.loop = asyncio.get_running_loop()
+        self.closing = threading.Event()
+        self.descriptor = descriptor
+        self._on_data, self._on_loss, self._shut = on_data, on_loss, shut
+        self._thread: threading.Thread | None = None
+        if descriptor is not None:
+            self.loop.add_reader(descriptor, self.poll)
+            return
+        self._thread = threading.Thread(target=self._run, name=f"era-read {name}", daemon=True)
+        self._thread.start()
+
+    @abstractmethod
+    def read_watched(self) -> bytes:
+        """Return what has come; raises one of `failures`."""
+
+    def read_waiting(self) -> bytes:
+        """Return what comes within a short time; raises one of `failures`. Reader thread.
+
+        Of a device without a descriptor.
+        """
+        raise NotImplementedError
+
+    def poll(self) -> None:
+        """Hand over what has come and was not read yet; a reader thread has done so."""
+        if self.descriptor is None:
+            return
+        try:
+            data = self.read_watched()
+        except self.failures as error:
+            self.lose(error)
+            return
+        self.received(data)  # whatever fails in that is no loss of the port
+
+    def received(self, data: bytes) -> None:
+        """Hand over what has come."""
+        if data and not self.closing.is_set():
+            self._on_data(data)
+
+    def lose(self, problem: Exception) -> LinkError:
+        """Close the port and report its loss, once; returns the error of a request."""
+        loss = (
+            f"{self.kind} {self.name} was lost ({problem}): check the cable and the adapter, then "
+            "open the amplifier again"
+        )
+        if not self.closing.is_set():
+            self.close()
+            self._on_loss(loss)
+        return LinkError(loss)
+
+    def close(self) -> None:
+        """Stop reading and writing; `wait_closed` closes the device."""
+        self.closing.set()
+        watched, self.descriptor = self.descriptor, None
+        if watched is not None:
+            self.loop.remove_reader(watched)
+
+    async def wait_closed(self) -> None:
+        """Wait until it is closed, but not for a device that hangs."""
+        # The system waits half a minute for a device that takes no more bytes.
+        await close_in_thread(self._close_device, name=f"era-close {self.name}")
+
+    def _close_device(self) -> None:
+        if self._thread is not None:
+            self._thread.join()
+        with contextlib.suppress(*self.failures):
+            self._shut()
+
+    def _run(self) -> None:
+        """Read until the port is closed or lost; reader thread."""
+        post = self.loop.call_soon_threadsafe
+        with contextlib.suppress(RuntimeError):  # of a closed loop
+            try:
+                while not self.closing.is_set():
+                    if data := self.read_waiting():
+                        post(self.received, data)
+            except Exception as error:  # whatever it is, nothing more is read
+                post(self.lose, error)
+
+
+NETWORK_DELAY = 1.0
+"""Time [s] after which a port gives up a connection that has not taken what was sent.
+
+What a broken network delivers later than that is not accounted for.
+"""
+_CONNECT_TIMEOUT = 1.0  # s; a hundred times the delay within a building
+_NEXT_AFTER = 0.25  # s; RFC 8305, section 5; an address that is refused is not waited for
+_NUMERIC = socket.NI_NUMERICHOST | socket.NI_NUMERICSERV
+_READ_MAX = 4096  # bytes at once; others have their turn between
+_UNSENT_MAX = 4096  # bytes; sixteen unsent frames mean a blocked connection
+
+
+async def open_connection(
+    host: str, port: int, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    """Connect to the first address of a host that accepts; LinkError with a remedy."""
+    endpoint = f"{host}:{port}"
+    try:
+        async with asyncio.timeout(_CONNECT_TIMEOUT):
+            return await _first_to_accept(host, port, _Connection(endpoint, on_data, on_loss))
+    except TimeoutError:
+        raise LinkError(
+            f"{endpoint}: no connection within {_CONNECT_TIMEOUT:g} s; check the address, the "
+            "network and that the amplifier is switched on"
+        ) from None
+    except OSError as error:
+        raise LinkError(
+            f"{endpoint}: connection refused; check the address and the port, and that the "
+            f"amplifier is switched on (the system says: {system_message(error)})"
+        ) from error
+
+
+class _Connection(asyncio.BufferedProtocol):
+    """A TCP connection."""
+
+    def __init__(
+        self, endpoint: str, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    ) -> None:
+        self._endpoint = endpoint
+        self._on_data = on_data
+        self._buffer = bytearray(_READ_MAX)
+        self._on_loss = on_loss
+        self._is_closed = self.is_made = False
+        self._transport: asyncio.Transport  # set when connected
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Send small frames at once, and give up the connection that does not take them in time.
+
+        Without it a frame waits up to 40 ms for the acknowledgement of the one before, and what a
+        broken network keeps may arrive minutes later.
+        """
+        self._transport, self.is_made = cast(asyncio.Transport, transport), True
+        connection = transport.get_extra_info("socket")
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux
+            timeout = round(1000 * NETWORK_DELAY)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        if not self._is_closed:
+            self._on_data(bytes(self._buffer[:nbytes]))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if not self._is_closed:
+            self._is_closed = True
+            why = str(exc) if exc else "closed by the other side"
+            self._on_loss(
+                f"the connection to {self._endpoint} was lost ({why}): check the amplifier and the "
+                "network, then open the amplifier again"
+            )
+
+    @property
+    def is_blocked(self) -> bool:
+        return self._transport.get_write_buffer_size() > 0
+
+    def poll(self) -> None:
+        """Nothing to do: the loop reads before it runs timers that are due later."""
+
+    def write(self, data: bytes) -> None:
+        if self._transport.get_write_buffer_size() > _UNSENT_MAX:
+            raise LinkTimeout(f"{self._endpoint}: write blocked; check the network")
+        self._transport.write(data)
+
+    def close(self) -> None:
+        self._is_closed = True
+        self._transport.abort()  # discards unsent bytes
+
+    async def wait_closed(self) -> None:
+        """Return at once: abort does not block."""
+
+
+async def _first_to_accept(host: str, port: int, connection: _Connection) -> Port:
+    """Connect to the first address of a host that accepts (RFC 8305); raises OSError."""
+    connect = asyncio.get_running_loop().create_connection
+    take = [connection].pop  # the first address that accepts has it, any other an IndexError
+    attempts = [partial(connect, take, each, port) for each in await _addresses(host)]
+    try:
+        _, index, failures = await staggered_race(attempts, _NEXT_AFTER)
+    except BaseException:
+        if connection.is_made:  # given up just after it was accepted
+            connection.close()
+        raise
+    if index is None and failures[-1] is not None:
+        raise failures[-1]
+    return connection
+
+
+async def _addresses(host: str) -> list[str]:
+    """Resolve a host name to at least one address; raises OSError."""
+    try:
+        return [str(ipaddress.ip_address(host))]
+    except ValueError:
+        # asyncio resolves in a thread that delays the end of the program.
+        found = await in_thread(
+            lambda: socket.getaddrinfo(host, None, type=socket.SOCK_STREAM), name=f"era-name {host}"
+        )
+        # With the zone of a link-local address.
+        return [socket.getnameinfo(each, _NUMERIC)[0] for *_, each in found]
+
+
+_NO_PERMISSION = (
+    "no permission; add the user to the group that owns the port "
+    "(often dialout: sudo usermod -aG dialout $USER) and log in again"
+)
+_UNKNOWN = "check its name, the plug, its speed and its parity"
+_IN_USE = "in use by another program; close that one"
+_REMEDIES = {
+    errno.ENOENT: "no such port; plug in the adapter and check its name in /dev",
+    errno.EACCES: _NO_PERMISSION,
+    errno.EPERM: _NO_PERMISSION,
+    errno.EAGAIN: _IN_USE,
+    errno.EBUSY: _IN_USE,
+}
+
+
+async def open_port(
+    place: Place, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+) -> Port:
+    """Open a device, exclusively if the system can, or connect; raises LinkError.
+
+    on_data: called with received bytes; on_loss: called once with the cause of a loss.
+    """
+    if place.host:
+        return await open_connection(place.host, place.port, on_data, on_loss)
+    name = place.device
+    opener = PORT_OPENER.get()
+    if opener is not None:
+        return await opener(name, on_data, on_loss)
+    import termios  # not on Windows
+
+    try:
+        port = await in_thread(
+            lambda: _open_device(place), name=f"era-open {name}", undo=lambda port: port.close()
+        )
+    except (OSError, ValueError, termios.error) as error:  # of pyserial
+        raise LinkError(
+            f"serial port {name} cannot be opened: {remedy_of(error)} (the system says: "
+            f"{system_message(error)})"
+        ) from error
+    return SerialPort(port, name, on_data, on_loss)
+
+
+def _open_device(place: Place) -> serial.Serial:
+    import termios
+
+    # A pseudo-terminal has no parity and may refuse all settings if one is given.
+    is_pseudo = os.path.realpath(place.device).startswith("/dev/pts/")
+    port = serial.Serial(
+        place.device,
+        baudrate=place.baud,
+        parity=serial.PARITY_NONE if is_pseudo else place.parity,
+        stopbits=place.stop,
+        exclusive=True,
+    )
+    try:
+        # USB adapters delay bytes by 16 ms unless low latency is set; most support it.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            port.set_low_latency_mode(True)
+        # DTR stays up when it is closed: a board that it restarts does so at one opening alone.
+        settings = termios.tcgetattr(port.fileno())
+        settings[2] &= ~termios.HUPCL
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+        port.reset_input_buffer()
+    except BaseException:
+        port.close()  # else it stays this program's, which could not open it again
+        raise
+    return port
+
+
+def remedy_of(error: BaseException | None) -> str:
+    """Return the remedy for an opening error by the error code of it or its cause."""
+    while error is not None:
+        code = getattr(error, "errno", None)
+        if code is not None:
+            return _REMEDIES.get(code, _UNKNOWN)
+        error = error.__cause__ or error.__context__
+    return _UNKNOWN
+
+
+@final
+class SerialPort(DevicePort):
+    """A port of pyserial, read and written by the event loop."""
+
+    kind = "serial line"
+
+    def __init__(
+        self,
+        port: serial.Serial,
+        name: str,
+        on_data: Callable[[bytes], None],
+        on_loss: Callable[[str], None],
+    ) -> None:
+        self._unsent = b""
+        super().__init__(name, port.fileno(), on_data, on_loss, port.close)
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether the port has not taken all bytes yet."""
+        return bool(self._unsent)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, as soon as the port takes them; raises LinkError."""
+        self._unsent = data
+        self._send()
+        if self._unsent and self.descriptor is not None:
+            self.loop.add_writer(self.descriptor, self._send_rest)
+
+    def close(self) -> None:
+        """Stop reading and writing; `wait_closed` closes the port."""
+        self._unsent = b""
+        if self.descriptor is not None:
+            self.loop.remove_writer(self.descriptor)
+        super().close()
+
+    def read_watched(self) -> bytes:
+        """Return what has come; OSError for the end, which an empty read of a terminal is not."""
+        if self.descriptor is None:
+            return b""
+        try:
+            data = os.read(self.descriptor, _READ_MAX)
+        except BlockingIOError:
+            return b""
+        if not data:
+            state = select.poll()
+            state.register(self.descriptor, 0)  # a hang-up is reported all the same
+            if state.poll(0):
+                raise OSError("end of file")
+        return data
+
+    def _send(self) -> None:
+        """Write what the descriptor takes; raises LinkError."""
+        if self.descriptor is None:
+            raise self.lose(OSError("it is closed"))
+        try:
+            self._unsent = self._unsent[os.write(self.descriptor, self._unsent) :]
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise self.lose(error) from error
+
+    def _send_rest(self) -> None:
+        """Send the rest, for which there is room; nothing, where a newer frame has gone whole."""
+        with contextlib.suppress(LinkError):  # reported as a loss
+            self._send()
+        if not self._unsent and self.descriptor is not None:
+            self.loop.remove_writer(self.descriptor)

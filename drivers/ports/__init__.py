@@ -1,1 +1,0 @@
-"""What carries bytes: serial ports of this machine, and TCP connections."""

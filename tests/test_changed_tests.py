@@ -50,7 +50,7 @@ def test_module_of_tests_and_page_lead_to_their_tests() -> None:
 
 def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() -> None:
     """Of a page whose marks name what writes it, which its test imports without naming the page."""
-    module, page = "drivers/protocol/table.py", "docs/reference/can.md"
+    module, page = "drivers/protocol/definition.py", "docs/reference/can.md"
     order = [*nearest([module, page])]
     beside = [each for each in order if Path("tests", module).parent in Path(each).parents]
     assert order.index("tests/docs/test_protocol_pages.py") <= len(beside) + 4

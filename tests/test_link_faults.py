@@ -18,7 +18,7 @@ import pytest
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.amplifier import Amplifier
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.timing import HEARTBEAT, loss_detection_time
+from drivers.protocol.definition import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig
 from registry import threads as clock

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.clocks.session import NAMES, make_controller, make_rig
 from drivers.host.amplifier import Amplifier
-from drivers.protocol.clock import ahead, clock_at
+from drivers.protocol.definition import ahead, clock_at
 from drivers.protocol.records import Values
 from registry import threads
 from sim.firmware.processes import find_firmware, running

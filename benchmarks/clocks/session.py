@@ -15,7 +15,7 @@ from benchmarks.setting import support
 from controller.play.loop import Controller
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
-from drivers.protocol.table import CLOCK_TURN, FEATURES
+from drivers.protocol.definition import CLOCK_TURN, FEATURES
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.protocol.definition import MESSAGES, read_request
 from drivers.protocol.sets import Assembly, is_last, unpack_layers
-from drivers.protocol.table import MESSAGES, read_request
 from drivers.wires.serial_line.frames import Frame, FrameReader, frame_length, unpack_words
 from model.rig.rig import Rig
 from sim.amplifier.contract import Amplifier

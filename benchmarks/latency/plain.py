@@ -16,9 +16,9 @@ from collections.abc import Iterator
 
 from pythonosc.osc_packet import OscPacket
 
+from drivers.protocol.definition import MESSAGES, QUANTITIES, VERSION
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
 from drivers.wires.serial_line.frames import Frame, encode_frame, pack_words
 from drivers.wires.serial_line.host import SerialAddress
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.plant.problem import FINGERS, Case
 from benchmarks.setting import RIG
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.protocol.table import QUANTITIES
 from model.finger import fingertip_points
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
 from model.rig.rig import Channel, Rig

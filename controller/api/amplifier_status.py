@@ -6,7 +6,7 @@
 from pydantic import Field, create_model
 
 from controller.api.schema import AmplifierState
-from drivers.protocol.table import READINGS
+from drivers.protocol.definition import READINGS
 
 AmplifierStatus = create_model(
     "AmplifierStatus",

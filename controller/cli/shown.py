@@ -7,7 +7,7 @@ from controller.api.client_protocol import Notification
 from controller.api.methods import StatusResult
 from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words
-from drivers.protocol.table import READINGS
+from drivers.protocol.definition import READINGS
 from model.quantities import counted
 
 

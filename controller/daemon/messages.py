@@ -37,7 +37,7 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import LinkStatistics
 from drivers.host.members import is_lost
 from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     FAULTS,
     QUANTITIES,
     READINGS,

@@ -15,7 +15,7 @@ from drivers.errors import CommandError, CommandRefused
 from drivers.host.reports import CLOCK_SETTLING
 from drivers.host.sensors import Reading, measure_tones
 from drivers.opening import Lines
-from drivers.protocol.timing import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.calibration.responses import Responses
 from model.ensemble.draws import MAX_HELD

@@ -13,7 +13,7 @@ from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.definition import QUANTITIES
 from model.rig.rig import Rig
 from model.vibration import Excitation
 

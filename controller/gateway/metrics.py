@@ -23,7 +23,7 @@ from controller.api.schema import (
     LearningState,
 )
 from drivers.host.reports import ReportKind
-from drivers.protocol.table import READINGS
+from drivers.protocol.definition import READINGS
 
 _Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]
 """Name, meaning, values by what the labels are, and labels of a metric."""

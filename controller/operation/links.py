@@ -23,8 +23,8 @@ from controller.play.observer import Observers
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import GroupState
+from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, NO_CHANNEL, name_of
 from model.errors import InputError
 from registry import threads
 from registry.threads import pauses

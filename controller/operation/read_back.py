@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from drivers.host.amplifier import Amplifier
+from drivers.protocol.definition import FAULTS, STATES, name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, STATES, name_of
 
 READ_BACK_INTERVAL = 0.02  # s
 

@@ -14,7 +14,7 @@ from typing import Self
 from controller.play.pieces import MAX_STEP
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.protocol.table import MAX_WORDS, QUANTITIES
+from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from model.answer.answer import Layer, Limits, amplitudes_of
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.errors import InputError

@@ -23,7 +23,7 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.group import Group
-from drivers.protocol.timing import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT
 from model.answer.answer import Limits
 from model.quantities import counted
 from model.structure.plate import Plate

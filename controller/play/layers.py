@@ -30,8 +30,8 @@ from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
-from drivers.protocol.table import QUANTITIES
 from model.answer import answer
 from model.answer.answer import FADE_RAMP
 from model.answer.answer_report import Timing

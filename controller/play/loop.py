@@ -13,7 +13,7 @@ from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.feeding import UNREACHED, Stopped
 from drivers.host.group import Group, GroupState
 from drivers.opening import Lines
-from drivers.protocol.timing import REPLY_TIMEOUT
+from drivers.protocol.definition import REPLY_TIMEOUT
 from model.answer.answer_report import Timing
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError

@@ -18,7 +18,7 @@ from controller.play.selection import Selector
 from controller.sources.contacts import Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
-from drivers.protocol.timing import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT
 from model.answer.answer import FADE_RAMP, Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import prepare_answers, query

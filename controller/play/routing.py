@@ -17,8 +17,8 @@ import numpy as np
 from controller.play.capabilities import EnvelopeSupport
 from controller.play.pieces import Piece
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
-from drivers.protocol.table import QUANTITIES
 from model import vibration as physics
 from model.answer import answer
 from model.answer.answer import FADE_RAMP

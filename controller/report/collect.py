@@ -27,8 +27,8 @@ from controller.daemon.config_sections import DaemonSection
 from controller.effects.layout_file import LayoutSection
 from controller.operation.dumps import DUMP_PATTERN
 from drivers.errors import LinkError
+from drivers.protocol.definition import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from drivers.protocol.records import Record, Rows
-from drivers.protocol.table import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from model.config.document import read_document
 from model.errors import InputError
 from model.rig.sections import RigSection

@@ -6,7 +6,7 @@ Frames are words: what a word means depends on the message. ASCII only, as DBC r
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     EVENT,
     FAULTS,
     HELLO,

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.definition import MESSAGES
 from drivers.wires.can_bus.canopen import CANOPEN, cob_id
 from word_names import word_names
 

@@ -1,15 +1,13 @@
 """The protocol as data, for machines on serial lines and Modbus: docs/reference/amplifier.json.
 
-Every number is that of `drivers.protocol.table` or of the wire that has it.
+Every number is that of `drivers.protocol.definition` or of the wire that has it.
 """
 
 import json
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Real, Record, Rest, Rows, Text
-from drivers.protocol.sets import MAX_PARTS, PART_WORDS
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     AHEAD_MAX,
     CLOCK_TURN,
     CLOCK_UNKNOWN,
@@ -39,6 +37,8 @@ from drivers.protocol.table import (
     VERSION,
     sensor_reading,
 )
+from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Real, Record, Rest, Rows, Text
+from drivers.protocol.sets import MAX_PARTS, PART_WORDS
 from drivers.wires.modbus.frames import AREA, BOX, IDENTITY_COUNT, READ, REPLY, WRITE
 from drivers.wires.modbus.frames import IDENTITY as IDENTITY_REGISTER
 from drivers.wires.serial_line.frames import PAYLOAD_MAX

@@ -12,7 +12,7 @@ from controller.api.calls import BY_HAND, signature_of
 from controller.api.methods import Method
 from controller.api.schema import Empty
 from controller.daemon.methods import ApiService
-from drivers.protocol.table import READINGS
+from drivers.protocol.definition import READINGS
 
 _HEAD = "# Written by docs/generators/client_stub.py."
 _WIDTH = 100  # of a line, as ruff has it

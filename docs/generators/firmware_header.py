@@ -8,8 +8,7 @@ import re
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from drivers.protocol.records import Bits, Number, Record
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     AHEAD_MAX,
     CLOCK_TURN,
     COMMAND,
@@ -31,6 +30,7 @@ from drivers.protocol.table import (
     VERSION,
     Message,
 )
+from drivers.protocol.records import Bits, Number, Record
 from drivers.wires.can_bus.canopen import CANOPEN
 
 _HEAD = """\

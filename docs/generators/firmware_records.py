@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from typing import TypeGuard
 
+from drivers.protocol.definition import COMMAND, EVENT_RECORD, MESSAGES, NAK_RECORD
 from drivers.protocol.records import Bits, Field, Number, Numbers, Record, Rows
-from drivers.protocol.table import COMMAND, EVENT_RECORD, MESSAGES, NAK_RECORD
 
 _HEAD = """\
 // SPDX-License-Identifier: MIT

@@ -9,10 +9,9 @@ from dataclasses import replace
 from functools import partial
 
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.clock import clock_at, high_word
+from drivers.protocol.definition import MESSAGES, QUANTITIES, clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
-from drivers.protocol.table import MESSAGES, QUANTITIES
 from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire

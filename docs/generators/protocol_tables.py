@@ -1,22 +1,11 @@
-"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.table`."""
+"""The tables of docs/reference/{protocol,modbus,can}.md, from `drivers.protocol.definition`."""
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import get_args
 
-from drivers.protocol.records import (
-    Bits,
-    Number,
-    Numbers,
-    Real,
-    Record,
-    Rest,
-    Rows,
-    Text,
-    View,
-)
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     COMMAND,
     ENVELOPE,
     EVENT,
@@ -37,6 +26,17 @@ from drivers.protocol.table import (
     STATUS,
     STATUS_FLAGS,
     sensor_reading,
+)
+from drivers.protocol.records import (
+    Bits,
+    Number,
+    Numbers,
+    Real,
+    Record,
+    Rest,
+    Rows,
+    Text,
+    View,
 )
 from drivers.wires.can_bus.canopen import CANOPEN
 from sim.amplifier.state_table import TRANSITIONS

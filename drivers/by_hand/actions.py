@@ -24,17 +24,19 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.records import bits_of
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
+    BOOT_TIME,
     COMMAND,
     FAULTS,
     LATCHED,
     QUANTITIES,
     STATES,
+    STOP_RAMP,
+    check_watchdog,
     has_feature,
     name_of,
 )
-from drivers.protocol.timing import BOOT_TIME, STOP_RAMP, check_watchdog
+from drivers.protocol.records import bits_of
 from drivers.urls import with_address
 from registry import threads
 

@@ -31,9 +31,8 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import Priority
 from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
 from drivers.playing.contents import Layer as AmplifierLayer
+from drivers.protocol.definition import ENABLED, HEARTBEAT
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import ENABLED
-from drivers.protocol.timing import HEARTBEAT
 from registry.limits import GuardLimits
 from registry.threads import LoopThread
 

@@ -14,11 +14,11 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.limits import FREQUENCY_FLOOR
 from drivers.host.reports import REPORTS, reports_of
 from drivers.opening import Lines
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME
-from drivers.protocol.records import Number, Record, Rows, Values, bits_of
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     FAULTS,
     FEATURES,
+    HIGH_STEPS,
+    HIGH_TIME,
     MESSAGES,
     NO_CHANNEL,
     QUANTITIES,
@@ -26,8 +26,9 @@ from drivers.protocol.table import (
     STATUS,
     STATUS_FLAGS,
     name_of,
+    shortest_watchdog,
 )
-from drivers.protocol.timing import shortest_watchdog
+from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from registry import threads
 from registry.limits import GuardLimits
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from drivers.errors import CommandError, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.protocol.table import QUANTITIES
-from drivers.protocol.timing import (
+from drivers.protocol.definition import (
     MAX_LOSS_DETECTION_TIME,
+    QUANTITIES,
     check_watchdog,
     loss_detection_time,
 )

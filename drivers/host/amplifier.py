@@ -13,19 +13,20 @@ from drivers.host.feeding import Stopped
 from drivers.host.jobs import LinkStatistics, Priority
 from drivers.host.ledger import Ledger
 from drivers.host.line import Line
-from drivers.protocol.achieved import achieved_layer, achieved_problem
-from drivers.protocol.records import Values, bits_of
-from drivers.protocol.sets import LayerSet, is_newer_token
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
+    ATTEMPTS,
     ENABLED,
     LATCHED,
     QUANTITIES,
+    REPLY_TIMEOUT,
     STATES,
+    STOP_RAMP,
     VERSION,
     capability_ranges,
     has_feature,
 )
-from drivers.protocol.timing import ATTEMPTS, REPLY_TIMEOUT, STOP_RAMP
+from drivers.protocol.records import Values, bits_of
+from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem, is_newer_token
 from drivers.wires.wire import reply_words
 from registry import threads
 from registry.limits import GuardLimits

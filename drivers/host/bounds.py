@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from drivers.playing.playback import Playback
 from drivers.playing.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES
 
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 _SILENCE: Sequence[complex] = (0j,)

@@ -24,9 +24,17 @@ from statistics import median_low
 from typing import NamedTuple
 
 from drivers.host.reports import CLOCK_SETTLING, MAX_CLOCK_RATE, ClockProblem
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS, SPAN, ahead
+from drivers.protocol.definition import (
+    CLOCK_TURN,
+    CLOCK_UNKNOWN,
+    ENABLED,
+    HIGH_TIME,
+    HIGH_WORDS,
+    QUANTITIES,
+    SPAN,
+    ahead,
+)
 from drivers.protocol.records import Values
-from drivers.protocol.table import CLOCK_TURN, CLOCK_UNKNOWN, ENABLED, QUANTITIES
 
 WINDOW = 8.0
 """Seconds of readings that count: less is noisier, and over more a crystal that warms up bends."""

@@ -20,8 +20,7 @@ from drivers.host.clock import HeldClock
 from drivers.host.jobs import Priority
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members
-from drivers.protocol.table import has_feature
-from drivers.protocol.timing import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT, has_feature
 
 # s; an error that costs nothing of a promise, one that costs a tenth of a dB, and more.
 _GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6

@@ -32,7 +32,23 @@ from drivers.host.reports import (
     reports_of,
 )
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import HIGH_TIME, MAX_AHEAD
+from drivers.protocol.definition import (
+    ATTEMPTS,
+    COMMAND,
+    ENABLED,
+    ENVELOPE,
+    EVENT_RECORD,
+    FAST,
+    HIGH_TIME,
+    KNOT,
+    LAYER,
+    MAX_AHEAD,
+    MESSAGES,
+    QUANTITIES,
+    SET_WORDS,
+    STATUS,
+    STOP_RAMP,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
     PART_WORDS,
@@ -43,18 +59,6 @@ from drivers.protocol.sets import (
     pack_layers,
     parts,
 )
-from drivers.protocol.table import (
-    COMMAND,
-    ENABLED,
-    ENVELOPE,
-    EVENT_RECORD,
-    KNOT,
-    LAYER,
-    MESSAGES,
-    QUANTITIES,
-    STATUS,
-)
-from drivers.protocol.timing import ATTEMPTS, FAST, SET_WORDS, STOP_RAMP
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
 
 MAX_CONTRADICTIONS = 2

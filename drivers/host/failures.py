@@ -1,8 +1,8 @@
 """What requests of an amplifier fail with, in words: the cause, and what to do."""
 
 from drivers.errors import CommandRefused, WrongAmplifier
+from drivers.protocol.definition import FAULTS, STATES, name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, STATES, name_of
 from drivers.wires.wire import Nak
 
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.protocol.table import REACTION
+from drivers.protocol.definition import REACTION
 
 SILENCING = 0.005 + REACTION
 """From the expiry of a watchdog until the outputs are silent, at the most [s]."""

@@ -27,9 +27,8 @@ from drivers.host.jobs import Priority
 from drivers.host.joint_sets import JointSets, Played
 from drivers.host.members import Members, is_lost, outcomes
 from drivers.playing.contents import Layer
+from drivers.protocol.definition import ENABLED, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
-from drivers.protocol.table import ENABLED, QUANTITIES
-from drivers.protocol.timing import STOP_RAMP, check_watchdog
 from registry import threads
 
 _T = TypeVar("_T")

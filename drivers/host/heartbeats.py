@@ -19,9 +19,9 @@ from drivers.host.joint_sets import JointSets
 from drivers.host.line import GRACE, Line
 from drivers.host.members import Members, is_lost
 from drivers.host.moments import word_passed_by_all
+from drivers.protocol.definition import HEARTBEAT
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
-from drivers.protocol.timing import HEARTBEAT
 
 _STATUS_INTERVAL = 0.19  # s at least, between statuses that show if the watchdog runs down
 _MAX_STATUS_LOAD = 0.05  # of the line's time, for these

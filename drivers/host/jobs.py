@@ -12,8 +12,8 @@ from enum import IntEnum
 from typing import Protocol, TypeAlias
 
 from drivers.errors import WireCounters
+from drivers.protocol.definition import ATTEMPTS
 from drivers.protocol.records import Values
-from drivers.protocol.timing import ATTEMPTS
 from drivers.wires.wire import Event, OtherHost, Several
 
 MAX_WAIT = 0.05  # s; after which a request goes before newer sets and heartbeats

@@ -22,11 +22,9 @@ from drivers.host.line import Line
 from drivers.host.members import Members, need, outcomes
 from drivers.host.moments import word_passed_by_all, words_of
 from drivers.playing.contents import Layer
-from drivers.protocol.clock import moment_behind
+from drivers.protocol.definition import LATCHED, STATES, STOP_RAMP, moment_behind, name_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
-from drivers.protocol.table import LATCHED, STATES, name_of
-from drivers.protocol.timing import STOP_RAMP
 from registry import threads
 
 INTERVAL = 1 << 12

@@ -25,9 +25,9 @@ from drivers.host.limits import (
 )
 from drivers.playing.contents import Layer
 from drivers.playing.playback import Playback
+from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
-from drivers.protocol.table import QUANTITIES, has_feature
 from registry.limits import GuardLimits
 
 _LEVEL, _STEP = QUANTITIES["level"], QUANTITIES["envelope_step"]

@@ -15,9 +15,9 @@ from typing import TypeAlias
 
 from drivers.errors import CommandError, CommandRefused
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import QUANTITIES
 from registry.limits import GuardLimits
 
 FREQUENCY_FLOOR = 10.0

@@ -16,9 +16,8 @@ from drivers.errors import FrameError, LinkError, LinkTimeout, Preempted
 from drivers.host.failures import no_reply, refused_by_amplifier
 from drivers.host.jobs import Job, JobQueue, Make, Member, Priority
 from drivers.ports import OpenPort
+from drivers.protocol.definition import ATTEMPTS, BROADCAST, FAST, MESSAGES, REACTION, REPLY_TIMEOUT
 from drivers.protocol.records import Values
-from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
-from drivers.protocol.timing import ATTEMPTS, FAST, REPLY_TIMEOUT
 from drivers.trace import Direction
 from drivers.wires.wire import (
     Broken,

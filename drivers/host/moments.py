@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from drivers.host.dialogue import COMMITTING, Dialogue
-from drivers.protocol.clock import (
+from drivers.protocol.definition import (
+    AHEAD_MAX,
     HIGH_TIME,
     HIGH_WORDS,
     clock_at,
@@ -16,7 +17,6 @@ from drivers.protocol.clock import (
     moment_of,
     word_passed,
 )
-from drivers.protocol.table import AHEAD_MAX
 
 _Amplifier = TypeVar("_Amplifier", bound=Dialogue)
 _STEP = AHEAD_MAX // 2  # from a high word that is tried to the next

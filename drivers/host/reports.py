@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Literal
 
+from drivers.protocol.definition import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, QUANTITIES, STATUS_FLAGS, name_of
 
 _HOT = 70.0  # °C, above which it is said; one that must not go on reports a fault
 REPORT_LIFE = 10.0

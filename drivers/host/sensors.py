@@ -12,8 +12,7 @@ from itertools import pairwise
 from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
-from drivers.protocol.records import Record, Refusal, Rows, Values
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     NO_CHANNEL,
     QUANTITIES,
     READING_STATES,
@@ -23,6 +22,7 @@ from drivers.protocol.table import (
     name_of,
     sensor_reading,
 )
+from drivers.protocol.records import Record, Refusal, Rows, Values
 from registry import threads
 
 _MARGIN = 0.002  # s; of the amplifier's clock

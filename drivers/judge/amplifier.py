@@ -23,10 +23,9 @@ from drivers.judge.states import (
 )
 from drivers.playing.playback import Playback
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import FLAGS, TONE, Problem, achieved_problem
+from drivers.protocol.definition import ENABLED, FAULTS, LATCHED, MESSAGES, QUANTITIES
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet, is_newer_token
-from drivers.protocol.table import ENABLED, FAULTS, LATCHED, MESSAGES, QUANTITIES
+from drivers.protocol.sets import FLAGS, TONE, LayerSet, Problem, achieved_problem, is_newer_token
 
 _WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
 FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)

@@ -2,8 +2,7 @@
 
 from drivers.judge.outputs import DRIFT, Report
 from drivers.playing.uncertain import Interval
-from drivers.protocol.clock import HIGH_STEPS, MAX_AHEAD, ahead, high_word
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.definition import HIGH_STEPS, MAX_AHEAD, QUANTITIES, ahead, high_word
 
 _DRIFT = DRIFT + QUANTITIES["rate"].high
 """Of the clock, at any rate."""

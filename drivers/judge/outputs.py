@@ -10,9 +10,9 @@ from typing import Protocol, TypeAlias
 
 from drivers.playing.playback import Playback, playback_of
 from drivers.playing.uncertain import Interval, UncertainPlayback
+from drivers.protocol.definition import QUANTITIES, has_flag
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES, has_flag
 
 LATE, SAMPLE = 0.002, 0.0001  # s; by which a set may begin later: at once; at its moment
 DRIFT = 1e-3

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 from drivers.playing.uncertain import Interval
+from drivers.protocol.definition import STAGED_LIFE
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Assembly, LayerSet, is_newer_token, unpack_layers
-from drivers.protocol.table import STAGED_LIFE
 
 
 class ExpectedSet:

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 
 from drivers.judge.outputs import DRIFT, ExpectedOutputs, Report, Unclear, one_of
 from drivers.playing.uncertain import Interval
-from drivers.protocol.records import Values
-from drivers.protocol.sets import token_after
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     ENABLED,
     FAULTS,
     LATCHED,
@@ -17,6 +15,8 @@ from drivers.protocol.table import (
     has_flag,
     name_of,
 )
+from drivers.protocol.records import Values
+from drivers.protocol.sets import token_after
 
 ROUNDED = 0.002  # s; of times in milliseconds
 _TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 
 from drivers.playing.voices import Voice, cut_to, voices_after
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet
-from drivers.protocol.table import QUANTITIES
 
 __all__ = ["LAYERS_MAX", "Playback", "Voice", "playback_of"]
 

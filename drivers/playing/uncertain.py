@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 from drivers.playing.playback import LAYERS_MAX, Playback
 from drivers.playing.voices import Transition, Voice
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import QUANTITIES
 
 Interval: TypeAlias = tuple[float, float]
 _PER_LEVEL = QUANTITIES["level"].per_unit

@@ -2,7 +2,7 @@
 
     Voice: Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its last transition, in full levels
 
-Its angle is that of the amplifier's clock (`drivers.protocol.clock`), n its frequency word: it does
+Its angle is that of the amplifier's clock (`drivers.protocol.definition`), n its frequency word: it does
 not depend on when it began. Amplitudes are complex, in full levels; times [s] are of any one clock.
 Plain loops and few calls: every set is played by host and far end.
 """
@@ -15,8 +15,8 @@ from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter
 
+from drivers.protocol.definition import QUANTITIES, SHORTENED_FADE
 from drivers.protocol.sets import Command, Envelope
-from drivers.protocol.table import QUANTITIES, SHORTENED_FADE
 
 _PER_STEP = QUANTITIES["envelope_step"].per_unit
 _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit

@@ -10,6 +10,17 @@ from functools import cache
 from typing import Protocol, TypeAlias
 
 from drivers.errors import WireCounters
+from drivers.protocol.definition import (
+    EVENT,
+    EVENT_RECORD,
+    IDENTITY,
+    MAX_WORDS,
+    MESSAGES,
+    NAK_RECORD,
+    NO_CHANNEL,
+    QUANTITIES,
+    REFUSALS,
+)
 from drivers.protocol.records import (
     TEXT_MAX,
     Bits,
@@ -22,17 +33,6 @@ from drivers.protocol.records import (
     Rows,
     Text,
     Values,
-)
-from drivers.protocol.table import (
-    EVENT,
-    EVENT_RECORD,
-    IDENTITY,
-    MAX_WORDS,
-    MESSAGES,
-    NAK_RECORD,
-    NO_CHANNEL,
-    QUANTITIES,
-    REFUSALS,
 )
 
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum

@@ -28,9 +28,9 @@ from pymodbus.pdu.register_message import (
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.wires.modbus.frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
 from registry import threads
 from sim.amplifier.contract import Amplifier

@@ -10,8 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from drivers.protocol.clock import HIGH_STEPS, SPAN, clock_at
-from drivers.protocol.table import CLOCK_TURN, QUANTITIES
+from drivers.protocol.definition import CLOCK_TURN, HIGH_STEPS, QUANTITIES, SPAN, clock_at
 
 SETTLING = 10.0
 """Time constant [s] with which a crystal warms up: its error ends warm_up * SETTLING higher."""

@@ -1,6 +1,6 @@
 """One simulated amplifier: requests in, replies out; time is passed in.
 
-Requests and replies are the values of their records (`drivers.protocol.table`), integers of the
+Requests and replies are the values of their records (`drivers.protocol.definition`), integers of the
 wire. Events happen at their own time: a watchdog that expired between two calls expired when it was
 due, and what plays is a description in time (`drivers.playing.playback`), not samples.
 
@@ -14,20 +14,21 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from drivers.playing.playback import Voice, playback_of
-from drivers.protocol.clock import HIGH_WORDS, high_word
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_last, token_after
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     AHEAD_MAX,
     FAULTS,
     FEATURES,
+    HIGH_WORDS,
     MESSAGES,
     NO_CHANNEL,
     QUANTITIES,
     STATES,
     STATUS_FLAGS,
     VERSION,
+    high_word,
 )
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_last, token_after
 from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.readings import (
     DERATE_ABOVE,

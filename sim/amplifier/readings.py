@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from drivers.playing.playback import Playback
+from drivers.protocol.definition import FAULTS, FEATURES, NO_CHANNEL, QUANTITIES
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, FEATURES, NO_CHANNEL, QUANTITIES
 
 AMBIENT = 25.0  # °C
 RISE = 30.0  # K above ambient in the steady state at full stroke on every channel

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
+from drivers.protocol.definition import STAGED_LIFE
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import (
     Assembly,
@@ -15,7 +16,6 @@ from drivers.protocol.sets import (
     is_newer_token,
     unpack_layers,
 )
-from drivers.protocol.table import STAGED_LIFE
 
 Layers: TypeAlias = tuple[LayerSet, ...]
 

@@ -8,7 +8,7 @@ READY_TO_SWITCH_ON and SWITCHED_ON are passed through at once: Arm goes all the 
 
 from collections.abc import Mapping
 
-from drivers.protocol.table import MESSAGES, STATES
+from drivers.protocol.definition import MESSAGES, STATES
 
 _OFF = ("SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON")
 _KEPT_BY_STOP = ("NOT_READY", "FAULT_REACTION_ACTIVE", "FAULT")

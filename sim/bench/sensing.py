@@ -14,8 +14,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     MAX_WORDS,
     NO_CHANNEL,
     QUANTITIES,
@@ -24,6 +23,7 @@ from drivers.protocol.table import (
     UNKNOWN_PLACE,
     sensor_reading,
 )
+from drivers.protocol.records import Refusal, Values
 from model.arrays import FloatArray
 from sim.amplifier.clock import AmplifierClock
 from sim.amplifier.contract import Amplifier

@@ -7,7 +7,7 @@ with every Ping. So the plate goes on with a straight clock until that is wrong 
 import math
 from collections.abc import Mapping
 
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.definition import CLOCK_TURN
 from sim.amplifier.clock import AmplifierClock, StraightClock
 
 WRONG = 0.5e-6

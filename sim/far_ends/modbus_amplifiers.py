@@ -8,9 +8,9 @@ result, words). Not modelled: parity and collisions on a serial line.
 import math
 from collections.abc import Mapping, Sequence
 
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.wires.modbus.frames import (
     AREA,
     BOX,

@@ -6,9 +6,7 @@ On a shared line amplifiers have one address each, and send no events.
 from collections.abc import Mapping
 from contextlib import suppress
 
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_earlier_part
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     BROADCAST,
     BY_NUMBER,
     EVENT,
@@ -19,6 +17,8 @@ from drivers.protocol.table import (
     nak_of,
     read_request,
 )
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_earlier_part
 from drivers.wires.serial_line.frames import (
     NEUTRAL,
     REPLY,

@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 
 from drivers.errors import LinkError
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.definition import QUANTITIES
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig

@@ -13,7 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.protocol.table import CLOCK_TURN
+from drivers.protocol.definition import CLOCK_TURN
 from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from drivers.protocol.records import Record
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     COMMAND,
     ENVELOPE,
     EVENT,
@@ -32,6 +31,7 @@ from drivers.protocol.table import (
     STATUS_FLAGS,
     sensor_reading,
 )
+from drivers.protocol.records import Record
 
 SHEET = json.loads(
     (Path(__file__).parents[2] / "docs" / "reference" / "amplifier.json").read_text("utf-8")

@@ -10,8 +10,7 @@ from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
 from drivers.by_hand.rig_check import check_links
 from drivers.errors import CommandError
-from drivers.protocol.table import REACTION
-from drivers.protocol.timing import BOOT_TIME
+from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.known import address_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB

@@ -7,8 +7,8 @@ from amplifier_eds import eds_text
 from drivers.by_hand.reaching import status_rows
 from drivers.errors import CommandError
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
-from drivers.protocol.table import MESSAGES, QUANTITIES, STATUS
 from firmware_records import records_header
 from grown_status import LATER, WORD
 from grown_status import age as age

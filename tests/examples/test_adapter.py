@@ -20,7 +20,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.table import FAULTS, STATES
+from drivers.protocol.definition import FAULTS, STATES
 from model.arrays import FloatArray
 from registry import threads
 from registry.limits import GuardLimits

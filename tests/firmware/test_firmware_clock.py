@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hand_written as hand
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.definition import MESSAGES
 from drivers.wires.modbus.frames import framed
 from moved_firmware import CAN, MODBUS, SERIAL, SESSION, MovedFirmware, apply, request, values_of
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.protocol.clock import ahead
-from drivers.protocol.table import BY_NUMBER, READINGS
+from drivers.protocol.definition import BY_NUMBER, READINGS, ahead
 from firmware_requests import RandomHost
 from judged_line import judged
 from long_form import shortly

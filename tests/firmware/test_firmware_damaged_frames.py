@@ -15,7 +15,7 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from drivers.protocol.table import STATES, STATUS_FLAGS, VERSION
+from drivers.protocol.definition import STATES, STATUS_FLAGS, VERSION
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import REQUEST, segments
 from drivers.wires.can_bus.text import SLCAN

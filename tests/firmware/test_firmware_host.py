@@ -14,8 +14,8 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.jobs import Priority
 from drivers.host.line import Line
 from drivers.opening import Lines
+from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
-from drivers.protocol.table import FAULTS, STATES
 from firmware_programs import running_firmware
 from foreign_masters import MASTERS, drive
 from registry.limits import GuardLimits

@@ -11,7 +11,7 @@ from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.opening import Lines
-from drivers.protocol.table import FAULTS
+from drivers.protocol.definition import FAULTS
 from drivers.wires.serial_line.host import SerialWire
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path

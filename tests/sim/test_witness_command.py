@@ -21,7 +21,7 @@ from drivers.judge.watching.capture import read_capture
 from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.table import STATES
+from drivers.protocol.definition import STATES
 from era_haptics.lab.cli import app
 from model.errors import InputError
 from model.rig.rig import Rig

@@ -3,8 +3,8 @@
 from collections.abc import Collection
 
 from drivers.playing.contents import Tone
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.protocol.table import QUANTITIES
 from sim.bench.bench import Bench
 
 SESSION = 9

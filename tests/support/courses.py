@@ -19,8 +19,8 @@ from ruamel.yaml import YAML
 from chain import Chain
 from drivers import errors
 from drivers.errors import CommandError, CommandRefused
+from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import FAULTS, STATES
 from model.vibration import Tone
 from registry import threads
 from set_chain import FINGER, OTHER

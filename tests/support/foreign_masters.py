@@ -9,7 +9,7 @@ import pytest
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
-from drivers.protocol.table import STATES
+from drivers.protocol.definition import STATES
 
 TIMEOUT = 5.0  # s; far ends may be processes, on a busy machine
 STATUS = 256 * 9 + 128

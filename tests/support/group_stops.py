@@ -26,7 +26,7 @@ import sim
 from drivers.by_hand import actions
 from drivers.errors import DriverError
 from drivers.host.feeding import SILENCING, Stopped
-from drivers.protocol.timing import BOOT_TIME
+from drivers.protocol.definition import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each
 from sim.far_ends.opening import Wire

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from drivers.protocol.definition import STATUS, reading
 from drivers.protocol.records import Record, Values
-from drivers.protocol.table import STATUS, reading
 from drivers.wires.wire import reply_words
 from sim.amplifier.contract import Amplifier
 

@@ -10,8 +10,8 @@ import math
 from functools import partial
 
 from controller.sources.touch import TouchFrame
+from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values
-from drivers.protocol.table import MESSAGES, STATES
 from rig_on_wire import FarSide, after_each
 from virtual_loop import START
 from witness_config import LoopWitness, sense

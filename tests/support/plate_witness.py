@@ -20,8 +20,8 @@ from drivers.judge.watching.decoded import A_READ, HELLO, Request
 from drivers.judge.watching.host_rules import CONFIRMED, IN_FLIGHT, SILENCING, HostRules
 from drivers.judge.watching.watched_wire import RECOVERY
 from drivers.judge.watching.witness import Witness
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet, is_vibrating
-from drivers.protocol.table import QUANTITIES
 
 RULES = {
     "justified": "no vibration is commanded without a contact",

@@ -13,8 +13,8 @@ from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import STATES
 from drivers.protocol.sets import Envelope
-from drivers.protocol.table import STATES
 from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig

@@ -13,7 +13,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.definition import QUANTITIES
 from registry.limits import GuardLimits
 
 LIMITS = GuardLimits(40, 1000, 1.0)

@@ -13,7 +13,7 @@ from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.playing.contents import Layer, Tone
 from drivers.ports import NETWORK_DELAY
-from drivers.protocol.table import BY_NUMBER, HELLO
+from drivers.protocol.definition import BY_NUMBER, HELLO
 from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import REQUEST, pack_frames, unpack_frames
 from drivers.wires.can_bus.host import CanWire

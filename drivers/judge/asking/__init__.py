@@ -27,7 +27,7 @@ from drivers.judge.asking import (
 from drivers.judge.asking.check import Check, CheckResult, Report, Result, run_checks
 from drivers.judge.asking.client import Client, Late, Violation
 from drivers.judge.asking.subject import LEVEL
-from drivers.protocol.table import MAX_WORDS
+from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.known import address_of
 from registry import threads
 

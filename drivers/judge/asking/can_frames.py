@@ -22,8 +22,8 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import layer
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import HELLO, IDENTITY, MESSAGES, NAK
 from drivers.protocol.records import Values
-from drivers.protocol.table import HELLO, IDENTITY, MESSAGES, NAK
 from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import (
     NODE_MAX,

@@ -18,7 +18,7 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.subject import Subject
 from drivers.judge.states import FAULT, OFF, REACTING
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     FAULTS,
     MESSAGES,
     NO_CHANNEL,

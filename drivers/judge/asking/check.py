@@ -23,10 +23,9 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.achieved import FLAGS
+from drivers.protocol.definition import MESSAGES, QUANTITIES, VERSION
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import Command, LayerSet, unpack_layers
-from drivers.protocol.table import MESSAGES, QUANTITIES, VERSION
+from drivers.protocol.sets import FLAGS, Command, LayerSet, unpack_layers
 from registry import threads
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check

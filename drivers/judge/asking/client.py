@@ -15,8 +15,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from drivers import trace
 from drivers.errors import LinkError
+from drivers.protocol.definition import NAK_RECORD, NAMES, REACTION
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import NAK_RECORD, NAMES, REACTION
 from drivers.wires.wire import read_nak
 from registry import threads
 

@@ -8,8 +8,7 @@ from drivers.judge.asking.client import Untimed, Violation, expect, require
 from drivers.judge.asking.material import Rows, send
 from drivers.judge.asking.subject import RATE, Subject
 from drivers.judge.outputs import DRIFT
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME
-from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
+from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, HIGH_TIME, QUANTITIES
 from registry import threads
 
 _PLACE = "protocol.md#the-clock"

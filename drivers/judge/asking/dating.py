@@ -6,8 +6,7 @@ by u - r to u - s. What is common to all these intervals is short.
 
 from drivers.judge.asking.client import When
 from drivers.judge.outputs import DRIFT
-from drivers.protocol.clock import HIGH_STEPS, SPAN, ahead
-from drivers.protocol.table import CLOCK_UNKNOWN, QUANTITIES
+from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, QUANTITIES, SPAN, ahead
 
 _LONG = 5.0  # s; without a reading, after which it may have gone round
 _BESIDE = 0.0002  # s; by which levels may be older than the clock beside them

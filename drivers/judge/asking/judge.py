@@ -6,9 +6,8 @@ from functools import partial
 from drivers.judge.amplifier import ExpectedAmplifier
 from drivers.judge.asking.client import Violation, require_in_time
 from drivers.playing.uncertain import Interval
-from drivers.protocol.achieved import achieved_layer, achieved_problem
 from drivers.protocol.records import Values
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem
 
 
 class Judge(ExpectedAmplifier):

@@ -10,16 +10,16 @@ from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 from drivers.judge.asking.client import Unusable, require
-from drivers.protocol.records import Field, Number, Record, Values
-from drivers.protocol.records import Rows as RowsOf
-from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     FEATURES,
     MESSAGES,
     QUANTITIES,
     capability_ranges,
     has_feature,
 )
+from drivers.protocol.records import Field, Number, Record, Values
+from drivers.protocol.records import Rows as RowsOf
+from drivers.protocol.sets import Command, Envelope, LayerSet
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import send, stage
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
 from drivers.protocol.records import Values
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
 from drivers.wires.modbus.frames import (
     AREA,
     BOX,

@@ -9,9 +9,8 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal, require, require_in_time
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.clock import HIGH_TIME, HIGH_WORDS
+from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, QUANTITIES, has_flag
 from drivers.protocol.sets import Command, Envelope
-from drivers.protocol.table import QUANTITIES, has_flag
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange

@@ -25,8 +25,7 @@ from drivers.judge.asking.client import (
 from drivers.judge.asking.material import Rows, send, stage
 from drivers.judge.asking.serial_frames import SerialClient
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.records import Values
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     ENABLED,
     EVENT,
     EVENT_RECORD,
@@ -39,6 +38,7 @@ from drivers.protocol.table import (
     has_flag,
     name_of,
 )
+from drivers.protocol.records import Values
 from registry import threads
 
 _UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors

@@ -22,8 +22,16 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import layer, stage
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import (
+    EVENT,
+    EVENT_RECORD,
+    HELLO,
+    MAX_WORDS,
+    MESSAGES,
+    NAK,
+    VERSION,
+)
 from drivers.protocol.records import Values
-from drivers.protocol.table import EVENT, EVENT_RECORD, HELLO, MAX_WORDS, MESSAGES, NAK, VERSION
 from drivers.wires.serial_line.frames import (
     NEUTRAL,
     REPLY,

@@ -9,9 +9,9 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_within, in_batches, require
 from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import COMMAND, ENVELOPE, LAYER, QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
-from drivers.protocol.table import COMMAND, ENVELOPE, LAYER, QUANTITIES
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8

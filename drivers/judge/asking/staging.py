@@ -7,8 +7,16 @@ from drivers.judge.asking.check import driving
 from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Rows, layer, play, send, stage
 from drivers.judge.asking.subject import Subject
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, MAX_AHEAD, ahead
-from drivers.protocol.table import COMMAND, LAYER, QUANTITIES
+from drivers.protocol.definition import (
+    COMMAND,
+    HIGH_STEPS,
+    HIGH_TIME,
+    HIGH_WORDS,
+    LAYER,
+    MAX_AHEAD,
+    QUANTITIES,
+    ahead,
+)
 from registry import threads
 
 _PLACE = "protocol.md#sets"

@@ -10,8 +10,8 @@ from drivers.judge.asking.client import expect_equal
 from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import FAULTS, NO_CHANNEL, QUANTITIES
 from drivers.protocol.sets import token_after
-from drivers.protocol.table import FAULTS, NO_CHANNEL, QUANTITIES
 from registry import threads
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"

@@ -37,10 +37,20 @@ from drivers.judge.asking.material import (
 )
 from drivers.judge.outputs import SAMPLE
 from drivers.judge.states import OFF
-from drivers.protocol.clock import HIGH_STEPS, HIGH_TIME, HIGH_WORDS, ahead
+from drivers.protocol.definition import (
+    ENABLED,
+    HIGH_STEPS,
+    HIGH_TIME,
+    HIGH_WORDS,
+    MESSAGES,
+    QUANTITIES,
+    REACTION,
+    STATES,
+    ahead,
+    name_of,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
-from drivers.protocol.table import ENABLED, MESSAGES, QUANTITIES, REACTION, STATES, name_of
 from drivers.wires.wire import reply_words
 from registry import threads
 

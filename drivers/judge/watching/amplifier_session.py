@@ -15,9 +15,9 @@ from drivers.judge.watching.capture import ReportViolation
 from drivers.judge.watching.config import AmplifierConfig
 from drivers.judge.watching.watched_amplifier import WatchedAmplifier
 from drivers.playing.playback import Playback
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_newer_token
-from drivers.protocol.table import QUANTITIES
 
 _TOKENS_KEPT = 16  # of commits
 

@@ -18,7 +18,7 @@ from drivers.judge.watching.decoded import (
     request_of,
     sent_by_amplifier,
 )
-from drivers.protocol.table import EVENT, MAX_WORDS, NAMES
+from drivers.protocol.definition import EVENT, MAX_WORDS, NAMES
 from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
 from drivers.wires.can_bus.frames import Message as Words

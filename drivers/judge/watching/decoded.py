@@ -8,9 +8,7 @@ from typing import Literal, TypeAlias
 
 from drivers.judge.amplifier import FEEDING as FEEDING
 from drivers.judge.watching.capture import Direction
-from drivers.protocol.records import Record, Refusal, Values
-from drivers.protocol.sets import is_last
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     ENABLED,
     EVENT,
     EVENT_RECORD,
@@ -27,7 +25,9 @@ from drivers.protocol.table import (
     VERSION,
     read_request,
 )
-from drivers.protocol.table import HELLO as HELLO_NUMBER
+from drivers.protocol.definition import HELLO as HELLO_NUMBER
+from drivers.protocol.records import Record, Refusal, Values
+from drivers.protocol.sets import is_last
 from drivers.wires.serial_line.frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
 
 HELLO = "Hello"

@@ -8,9 +8,9 @@ from collections.abc import Collection, Mapping, Sequence
 from drivers.judge.watching.amplifier_session import AmplifierSession, Deadlines, check_set
 from drivers.judge.watching.config import TimeLimits
 from drivers.judge.watching.decoded import FEEDING, Request
+from drivers.protocol.definition import LATCHED, REACTION
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating
-from drivers.protocol.table import LATCHED, REACTION
 
 IN_FLIGHT = 0.003  # s; from the host's write until a frame is seen, of Modbus RTU at its end
 _IN_TRANSPORT = 0.010  # s; bytes may wait before they pass, while their host counts from its write

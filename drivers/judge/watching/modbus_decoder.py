@@ -20,8 +20,8 @@ from drivers.judge.watching.decoded import (
     reply_of,
     request_of,
 )
+from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, REFUSALS
 from drivers.protocol.records import Refusal
-from drivers.protocol.table import BY_NUMBER, MAX_WORDS, REFUSALS
 from drivers.wires.modbus.frames import (
     AREA,
     BOX,

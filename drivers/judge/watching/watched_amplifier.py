@@ -17,8 +17,8 @@ from drivers.judge.watching.decoded import (
     is_carried_out,
 )
 from drivers.playing.uncertain import Interval
+from drivers.protocol.definition import REACTION, REFUSALS, STATUS, name_of
 from drivers.protocol.records import Values
-from drivers.protocol.table import REACTION, REFUSALS, STATUS, name_of
 
 _LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
 

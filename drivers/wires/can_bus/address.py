@@ -18,7 +18,7 @@ from typing import Any, final
 
 from drivers.errors import LinkError
 from drivers.ports import NETWORK_DELAY, Port, open_port
-from drivers.protocol.timing import BOOT_TIME
+from drivers.protocol.definition import BOOT_TIME
 from drivers.urls import ADDRESS, AmplifierUrl
 from drivers.wires.address import PortAbove, WireAddress
 from drivers.wires.can_bus.canopen import BITRATE, BLOCK, ERROR_ID, CanFrame

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from drivers.errors import WireCounters
-from drivers.protocol.table import MAX_WORDS
+from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.can_bus.canopen import BLOCK, CanFrame
 
 REQUEST = 0x200

@@ -6,8 +6,7 @@ Its bytes are packed frames (`drivers.wires.can_bus.frames`), for a port that ta
 from collections import deque
 
 from drivers.errors import WireCounters
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     BROADCAST,
     BY_NUMBER,
     HELLO,
@@ -17,6 +16,7 @@ from drivers.protocol.table import (
     NAK,
     VERSION,
 )
+from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_bus.canopen import (
     BLOCK,
     CANOPEN,

@@ -24,8 +24,8 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
+from drivers.protocol.definition import MAX_WORDS, TEXTS
 from drivers.protocol.records import TEXT_MAX, Values
-from drivers.protocol.table import MAX_WORDS, TEXTS
 
 # It calls exceptions errors of the program; pymodbus_apply_logging_config still shows its log.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)

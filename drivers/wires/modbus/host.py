@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 from drivers.errors import WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
+from drivers.protocol.definition import BOOT_TIME, BROADCAST, MESSAGES, REACTION
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import BROADCAST, MESSAGES, REACTION
-from drivers.protocol.timing import BOOT_TIME
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.modbus.frames import (

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 from cobs import cobs
 
+from drivers.protocol.definition import MAX_WORDS, TEXTS
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import MAX_WORDS, TEXTS
 
 REPLY = 0x80
 NEUTRAL = 0

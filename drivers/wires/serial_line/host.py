@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from drivers.errors import WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
+    BOOT_TIME,
     BY_NUMBER,
     EVENT,
     HELLO,
@@ -17,7 +17,7 @@ from drivers.protocol.table import (
     NAK,
     VERSION,
 )
-from drivers.protocol.timing import BOOT_TIME
+from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.address import WireAddress
 from drivers.wires.serial_line.frames import (

@@ -7,9 +7,7 @@ import struct
 from collections.abc import Mapping
 
 from drivers.errors import WireCounters
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_earlier_part
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     BY_NUMBER,
     EVENT,
     EVENT_RECORD,
@@ -22,6 +20,8 @@ from drivers.protocol.table import (
     name_of,
     read_request,
 )
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_earlier_part
 from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
 from drivers.wires.can_bus.frames import (
     NODE_MAX,

@@ -8,7 +8,7 @@ others are refused, since nothing longer than four bytes can be written.
 import struct
 import zlib
 
-from drivers.protocol.table import MESSAGES, TEXTS
+from drivers.protocol.definition import MESSAGES, TEXTS
 from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, cob_id
 from sim.transport.far_end import AmplifierPort
 

@@ -17,7 +17,7 @@ from controller.api.jsonrpc import RpcError
 from controller.demo.run import layout_of_people
 from controller.effects.strengths import MAX_NAMES
 from daemon_bench import DaemonBench, ready_daemon
-from drivers.protocol.table import QUANTITIES
+from drivers.protocol.definition import QUANTITIES
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig

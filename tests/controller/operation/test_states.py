@@ -12,7 +12,7 @@ from controller.operation.states import (
     failed,
     step,
 )
-from drivers.protocol.table import FAULTS
+from drivers.protocol.definition import FAULTS
 
 # The whole table by hand, from the states and the fault table of the wire protocol: the next state
 # (= for the same) and the actions in order. A dot: nothing changes. Conditions have tests of their

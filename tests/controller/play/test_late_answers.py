@@ -13,7 +13,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.region import Region
 from controller.play.content import BEING_CHOSEN
 from controller.play.selection import BLOCKED, GIVEN_UP
-from drivers.protocol.timing import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT
 from model.config.fields import Rectangle
 from several_fingers import ABOVE, LAYOUT, LEFT, RIGHT, Fingers, answers_take, fingers_on, table
 from virtual_loop import in_virtual_time

@@ -17,8 +17,8 @@ from controller.play.intent import HapticIntent, Target
 from controller.play.planner import ENDED
 from controller.sources.contacts import Change, Contact, ContactTracker
 from controller.sources.touch import Touch, TouchFrame
+from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Envelope
-from drivers.protocol.table import QUANTITIES
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement
 from model.transients.base_motion import BaseEnvelope

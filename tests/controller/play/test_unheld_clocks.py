@@ -15,7 +15,7 @@ from controller.play.content import leaks_db_sl
 from controller.play.counted_clocks import CountedClocks
 from controller.sources.contacts import Contact, ContactKey
 from drivers.host.group import Group
-from drivers.protocol.table import CLOCK_UNKNOWN
+from drivers.protocol.definition import CLOCK_UNKNOWN
 from model.answer.answer_report import Timing
 from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.rig.rig import Channel, Rig, Uncertainty

@@ -11,7 +11,7 @@ from drivers.by_hand.places import identify_all
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.table import FEATURES
+from drivers.protocol.definition import FEATURES
 from drivers.trace import tracing
 from drivers.urls import with_address
 from registry.limits import GuardLimits

@@ -16,7 +16,7 @@ from drivers.by_hand.cli import app as amp_app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.table import READINGS, STATUS_FLAGS
+from drivers.protocol.definition import READINGS, STATUS_FLAGS
 from era_haptics.lab.cli import app as lab_app
 from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits

@@ -7,9 +7,8 @@ import pytest
 from drivers.errors import CommandRefused
 from drivers.host.sensors import read_measured
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.achieved import achieved_problem
 from drivers.protocol.records import Values
-from drivers.protocol.sets import Command, Envelope, LayerSet
+from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
 from sim.amplifier.readings import capabilities
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of

@@ -18,9 +18,9 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.jobs import Priority
 from drivers.playing.contents import Tone
+from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import MESSAGES, STATES
 from drivers.wires.wire import Broken
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, group_of, grouped, layer, tone, unaltered, with_group

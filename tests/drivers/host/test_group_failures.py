@@ -11,9 +11,9 @@ import pytest
 from drivers.errors import CommandRefused, DriverError, Preempted
 from drivers.host.group import Group
 from drivers.host.sensors import read_measured
+from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
-from drivers.protocol.table import MESSAGES
 from sim.amplifier.contract import Amplifier as FarEnd
 from words_line import MemoryLine, grouped, layer, losing, tone
 

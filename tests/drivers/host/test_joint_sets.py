@@ -16,8 +16,8 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
 from drivers.protocol.sets import LayerSet
-from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
 from drivers.wires.can_bus.frames import unpack_frames
 from drivers.wires.can_bus.host import CanWire
 from drivers.wires.modbus.host import ModbusWire

@@ -14,9 +14,8 @@ import pytest
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.clock import HIGH_TIME, SPAN
+from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_TIME, MESSAGES, SPAN
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.table import CLOCK_UNKNOWN, MESSAGES
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames
 from sim.amplifier.clock import AmplifierClock, Crystal

@@ -11,7 +11,7 @@ from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
 from drivers.host.jobs import Job, Priority
 from drivers.playing.contents import Layer, Tone
-from drivers.protocol.clock import word_passed
+from drivers.protocol.definition import word_passed
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames

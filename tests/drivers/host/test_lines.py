@@ -17,8 +17,8 @@ from courses import Taken, courses, follow
 from drivers.host.feeding import Stopped
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
+from drivers.protocol.definition import STATES
 from drivers.protocol.records import Values
-from drivers.protocol.table import STATES
 from words_line import KINDS, MemoryLine, group_of, losing
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.sensors import Sensor, measure_tones, read_sensors, start_reading
+from drivers.protocol.definition import READING_STATES, UNKNOWN_PLACE, sensor_reading
 from drivers.protocol.records import Values
-from drivers.protocol.table import READING_STATES, UNKNOWN_PLACE, sensor_reading
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine
 

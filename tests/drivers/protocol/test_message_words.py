@@ -4,8 +4,7 @@ import random
 
 import pytest
 
-from drivers.protocol.records import Number, Refusal, Values, WireQuantity
-from drivers.protocol.table import (
+from drivers.protocol.definition import (
     BY_NUMBER,
     IDENTITY,
     MAX_WORDS,
@@ -14,7 +13,8 @@ from drivers.protocol.table import (
     reading,
     sensor_reading,
 )
-from drivers.protocol.table import STATUS as STATUS_RECORD
+from drivers.protocol.definition import STATUS as STATUS_RECORD
+from drivers.protocol.records import Number, Refusal, Values, WireQuantity
 
 STATUS: Values = {
     **{"state": 4, "fault": 0, "flags": 1, "latch": 0, "watchdog_left": 250},

@@ -5,6 +5,7 @@ from itertools import permutations
 
 import pytest
 
+from drivers.protocol.definition import MESSAGES, STAGED_LIFE
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import (
     Assembly,
@@ -13,7 +14,6 @@ from drivers.protocol.sets import (
     parts,
     unpack_layers,
 )
-from drivers.protocol.table import MESSAGES, STAGED_LIFE
 
 STREAM = [
     *(0x0002, 20, 500),  # layer 0, two commands

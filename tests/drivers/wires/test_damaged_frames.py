@@ -6,9 +6,9 @@ import random
 import pytest
 from scipy.stats import poisson
 
+from drivers.protocol.definition import IDENTITY, MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
-from drivers.protocol.table import IDENTITY, MESSAGES
 from drivers.wires.wire import Arrival, Broken, More, Nak, Reply
 from mutation import damage
 from sim.amplifier.contract import Amplifier

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.protocol.table import FAULTS, STATES
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.amplifier.contract import Amplifier
 

@@ -8,9 +8,9 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from drivers.host.sensors import measure_tones, read_sensors
+from drivers.protocol.definition import READING_STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.protocol.table import READING_STATES
 from model.fem import assemble
 from model.rig.rig import Rig
 from plate_in_time import apart

@@ -13,7 +13,7 @@ from functools import partial
 import pytest
 
 from drivers.errors import LinkError
-from drivers.protocol.table import REFUSALS
+from drivers.protocol.definition import REFUSALS
 from drivers.wires.serial_line.frames import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
 from rig_on_wire import make_bench

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.table import FAULTS, MESSAGES, STATES, STATUS, VERSION
+from drivers.protocol.definition import FAULTS, MESSAGES, STATES, STATUS, VERSION
 from drivers.urls import ADDRESS
 from drivers.wires.serial_line.frames import Frame, encode_frame
 from model.errors import InputError

@@ -24,9 +24,9 @@ from drivers.judge.asking.client import Late, Violation, When
 from drivers.judge.asking.judge import Judge
 from drivers.judge.asking.material import layer
 from drivers.judge.asking.subject import Subject
+from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
-from drivers.protocol.table import MESSAGES
 from drivers.trace import tracing
 from drivers.wires.can_bus.frames import pack_frames, unpack_frames
 from drivers.wires.modbus.frames import framed

@@ -3,9 +3,9 @@
 import pytest
 
 from drivers.errors import WireCounters
+from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
-from drivers.protocol.table import MESSAGES
 from drivers.wires.can_bus.frames import (
     Assembler,
     Message,

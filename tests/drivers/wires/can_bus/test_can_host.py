@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import LinkError
 from drivers.host.group import Group
-from drivers.protocol.table import MESSAGES
+from drivers.protocol.definition import MESSAGES
 from drivers.wires.can_bus.canopen import CanFrame
 from drivers.wires.can_bus.frames import pack_frames, segments, unpack_frames
 from drivers.wires.can_bus.host import CanWire

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
+from drivers.protocol.definition import MESSAGES, STATUS
 from drivers.protocol.records import Values
-from drivers.protocol.table import MESSAGES, STATUS
 from drivers.wires.modbus.frames import HEAD
 from drivers.wires.modbus.host import ModbusWire
 from drivers.wires.wire import Broken, More, Nak, Reply

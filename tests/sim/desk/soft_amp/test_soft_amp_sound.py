@@ -12,7 +12,7 @@ import pytest
 from benchmarks.desk.capture import Capture
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
-from drivers.protocol.table import FAULTS, STATES
+from drivers.protocol.definition import FAULTS, STATES
 from gateway_bench import wait_for
 from model.errors import InputError
 from sim.desk.soft_amp.output import open_output

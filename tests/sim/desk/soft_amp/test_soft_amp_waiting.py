@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.opening import Lines
-from drivers.protocol.table import FAULTS, STATES
+from drivers.protocol.definition import FAULTS, STATES
 from gateway_bench import wait_for
 from installed_program import ERA
 from sound_card import BLOCK, SoftAmp, capture_on, host, jack_server

@@ -3,12 +3,19 @@
 `records` turns the messages into 16-bit words and back; a wire adds its frame. The numbers of
 states, faults and refusals, and the times of the contract, stand here too. What the messages mean
 is written in docs/decisions/0088-protocol-4.md.
+
+The clock of an amplifier as integers of the wire: 32 bits that go round once in 20 s.
+
+A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
+
+Shortest watchdog and time to detect a loss on a wire, by arithmetic; times in s.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.errors import CommandError
 from drivers.protocol.records import (
     WORD,
     Bits,
@@ -370,3 +377,102 @@ def has_flag(status: Values, name: str) -> bool:
 def name_of(names: Mapping[str, int], number: int) -> str:
     """Return the name of a number of the table, or the number."""
     return next((name for name, each in names.items() if each == number), str(number))
+
+
+SPAN = 1 << 32
+HIGH_STEPS = 1 << 16
+"""Steps of the clock in one of its high word, of which shifts and moments are whole numbers."""
+HIGH_WORDS = SPAN // HIGH_STEPS
+HIGH_TIME = CLOCK_TURN / HIGH_WORDS
+"""Seconds of a step of the high word."""
+MAX_AHEAD = AHEAD_MAX * HIGH_TIME
+"""Seconds by which a Commit may name a moment ahead."""
+_PER_SECOND = SPAN / CLOCK_TURN
+_PASSED = 0.25  # s
+
+
+def clock_at(seconds: float) -> int:
+    """Return what a clock shows that many seconds after it showed 0."""
+    return round(seconds % CLOCK_TURN * _PER_SECOND) % SPAN
+
+
+def ahead(clock: int, of: int) -> float:
+    """Return by how much [s] a clock is ahead of another, at most half a turn either way."""
+    return ((clock - of + SPAN // 2) % SPAN - SPAN // 2) / _PER_SECOND
+
+
+def word_passed(seconds: float) -> int:
+    """Return a high word that is no moment ahead at a time [s], by a clock near `clock_at`.
+
+    A quarter of a second behind: before it is steered, a clock may be some steps behind.
+    """
+    return high_word(clock_at(seconds - _PASSED))
+
+
+def moment_behind(seconds: float) -> float:
+    """Return when [s] a clock of `clock_at` next begins a high word, from a time [s] on."""
+    return seconds + (-clock_at(seconds) % HIGH_STEPS) / _PER_SECOND
+
+
+def moment_of(at: int, seconds: float) -> float | None:
+    """Return the moment [s] that a Commit names which is sent at a time; None for at once.
+
+    at: the high word of a clock of `clock_at`.
+    """
+    now = clock_at(seconds)
+    left = (at * HIGH_STEPS - now) % SPAN
+    return seconds + left / _PER_SECOND if 0 < left <= AHEAD_MAX * HIGH_STEPS else None
+
+
+def high_word(clock: int) -> int:
+    """Return the high word of a clock, as a Commit names a moment."""
+    return clock // HIGH_STEPS
+
+
+BOOT_TIME = 6.0
+"""For the first reply on a line [s], of a board that restarts when its port is opened."""
+REPLY_TIMEOUT = 0.030
+"""For a reply [s], on a wire that is fast; a heartbeat and three of these are less than 150 ms."""
+FAST = REPLY_TIMEOUT - REACTION
+"""Longest exchange [s] whose reply is here by then."""
+ATTEMPTS = 3
+"""Of a request; one less where the wire is slow."""
+STOP_RAMP = 0.005
+"""Shortest ramp without a step [s]."""
+HEARTBEAT = 0.05
+"""Interval of heartbeats [s]."""
+MAX_LOSS_DETECTION_TIME = 3 * HEARTBEAT
+"""Longest time to detect a loss without a warning [s]."""
+_HEARTBEATS = 3  # a watchdog must outlast this many intervals
+
+SET_WORDS = MESSAGES["Set"].request.words
+"""Of a part of a set, before its stream."""
+
+
+def shortest_watchdog(round_trip: float) -> float:
+    """Return the shortest watchdog for a wire with this round trip of a set."""
+    return _HEARTBEATS * HEARTBEAT + round_trip
+
+
+def check_watchdog(watchdog: float, round_trip: float) -> None:
+    """Raise CommandError for a watchdog shorter than three heartbeats and one round trip."""
+    shortest = shortest_watchdog(round_trip)
+    if not watchdog >= shortest - 1e-9:  # sums of floats
+        raise CommandError(
+            f"watchdog must be at least {shortest * 1e3:.0f} ms ({_HEARTBEATS} heartbeats of "
+            f"{HEARTBEAT * 1e3:g} ms and a round trip of {round_trip * 1e3:.1f} ms), got "
+            f"{watchdog * 1e3:g} ms; use a faster line"
+        )
+
+
+def loss_detection_time(round_trips: Iterable[float]) -> float:
+    """Return the longest time until silent amplifiers on one line are known to be so.
+
+    At the worst all fall silent right after a reply, and each is sent a set next, one after the
+    other, with all attempts: one less where it takes long. round_trips: of the longest set to each.
+    """
+    detected = HEARTBEAT
+    for round_trip in round_trips:
+        slow = (ATTEMPTS - 1) * (REPLY_TIMEOUT + round_trip - FAST)
+        detected += max(ATTEMPTS * REPLY_TIMEOUT, slow)
+    return detected

@@ -13,7 +13,7 @@ from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.playing.contents import Layer, Tone
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_line import SerialWire
 from registry import threads
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier

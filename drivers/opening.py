@@ -8,9 +8,8 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.ports import Port
-from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
-from drivers.wires.wire import Wire
+from drivers.wires.wire import Wire, WireAddress
 from registry.limits import GuardLimits
 
 

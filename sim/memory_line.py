@@ -17,8 +17,8 @@ from weakref import WeakValueDictionary
 
 from drivers.errors import CommandError, LinkError
 from drivers.urls import SIMULATED, AmplifierUrl
-from drivers.wires.address import WireAddress
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_line import SerialWire
+from drivers.wires.wire import WireAddress
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

@@ -64,7 +64,7 @@ def test_rows_name_what_there_is() -> None:
         assert [path for path in paths if not (ROOT / path).exists()] == []
         named = [command.split()[1] for command in commands if command.startswith("make ")]
         assert set(named) <= set(targets)
-    assert also(["drivers/wires/can_bus/frames.py"]) == ["make pages", "make fuzz"]
+    assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
 
 
 def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from controller.sources.touch import _SOURCES, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of
-from drivers.wires.serial_line.host import SerialAddress
+from drivers.wires.serial_line import SerialAddress
 from model.errors import InputError
 from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text

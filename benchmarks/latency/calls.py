@@ -19,7 +19,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.opening import Lines
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_line import SerialWire
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

@@ -19,8 +19,8 @@ from pythonosc.osc_packet import OscPacket
 from drivers.protocol.definition import MESSAGES, QUANTITIES, VERSION
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from drivers.wires.serial_line.frames import Frame, encode_frame, pack_words
-from drivers.wires.serial_line.host import SerialAddress
+from drivers.wires.serial_frames import Frame, encode_frame, pack_words
+from drivers.wires.serial_line import SerialAddress
 
 SETS, CHANNELS = 100, 4
 SESSION = 1

@@ -16,8 +16,7 @@ from drivers.protocol.definition import (
     STATES,
     VERSION,
 )
-from drivers.wires.can_bus.canopen import CANOPEN, cob_id
-from drivers.wires.can_bus.frames import REPLY, REQUEST, frames_of
+from drivers.wires.can_frames import CANOPEN, REPLY, REQUEST, cob_id, frames_of
 
 _HOST, _AMPLIFIER = "Host", "Amplifier"
 _TYPES = {"Hello": HELLO, **{name: each.number for name, each in MESSAGES.items()}}

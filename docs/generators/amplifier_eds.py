@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from drivers.protocol.definition import MESSAGES
-from drivers.wires.can_bus.canopen import CANOPEN, cob_id
+from drivers.wires.can_frames import CANOPEN, cob_id
 from word_names import word_names
 
 _TYPES = {"u8": 0x5, "u16": 0x6, "u32": 0x7, "text": 0x9}

@@ -39,9 +39,9 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.sets import MAX_PARTS, PART_WORDS
-from drivers.wires.modbus.frames import AREA, BOX, IDENTITY_COUNT, READ, REPLY, WRITE
-from drivers.wires.modbus.frames import IDENTITY as IDENTITY_REGISTER
-from drivers.wires.serial_line.frames import PAYLOAD_MAX
+from drivers.wires.modbus_frames import AREA, BOX, IDENTITY_COUNT, READ, REPLY, WRITE
+from drivers.wires.modbus_frames import IDENTITY as IDENTITY_REGISTER
+from drivers.wires.serial_frames import PAYLOAD_MAX
 from sim.amplifier.state_table import TRANSITIONS
 
 _SERIAL: Mapping[str, Any] = {

@@ -31,7 +31,7 @@ from drivers.protocol.definition import (
     Message,
 )
 from drivers.protocol.records import Bits, Number, Record
-from drivers.wires.can_bus.canopen import CANOPEN
+from drivers.wires.can_frames import CANOPEN
 
 _HEAD = """\
 // SPDX-License-Identifier: MIT

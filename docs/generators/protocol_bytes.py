@@ -12,10 +12,10 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
-from drivers.wires.can_bus.frames import unpack_frames
-from drivers.wires.can_bus.host import CanWire
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import unpack_frames
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import More, Wire
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

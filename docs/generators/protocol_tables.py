@@ -38,7 +38,7 @@ from drivers.protocol.records import (
     Text,
     View,
 )
-from drivers.wires.can_bus.canopen import CANOPEN
+from drivers.wires.can_frames import CANOPEN
 from sim.amplifier.state_table import TRANSITIONS
 from word_names import word_names
 

@@ -21,9 +21,7 @@ from drivers.errors import DriverError, FrameError, LinkTimeout
 from drivers.ports import remedy_of
 from drivers.protocol.records import Values
 from drivers.urls import ADDRESS, BAUD, RTU_BAUD
-from drivers.wires.can_bus.canopen import BITRATE, cob_id
-from drivers.wires.can_bus.frames import NODE_MAX
-from drivers.wires.can_bus.text import SLCAN, SLCAN_RATES, TextReader
+from drivers.wires.can_frames import BITRATE, NODE_MAX, SLCAN, SLCAN_RATES, TextReader, cob_id
 
 _BAUD = 115_200  # ignored by USB devices, which most adapters are
 _REPLY_TIMEOUT = 0.1  # s; USB adapters and their drivers delay bytes by 16 ms at most

@@ -17,9 +17,8 @@ from drivers.protocol.definition import (
     loss_detection_time,
 )
 from drivers.urls import BUS_ERROR, CLOCK_ERRORS, line_kind_of
-from drivers.wires.address import WireAddress
 from drivers.wires.known import address_of
-from drivers.wires.wire import reply_words, request_words
+from drivers.wires.wire import WireAddress, reply_words, request_words
 from registry.limits import GuardLimits
 
 _CEILING = QUANTITIES["frequency"].high

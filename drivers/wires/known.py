@@ -7,10 +7,10 @@ Entry points are of the group `era_haptics.wires`, named by scheme; each is a cl
 from collections.abc import Callable
 
 from drivers.errors import CommandError
-from drivers.wires.address import WireAddress
-from drivers.wires.can_bus.address import PythonCanAddress, SlcanAddress, SocketcandAddress
-from drivers.wires.modbus.host import ModbusAddress
-from drivers.wires.serial_line.host import SerialAddress
+from drivers.wires.can_bus import PythonCanAddress, SlcanAddress, SocketcandAddress
+from drivers.wires.modbus import ModbusAddress
+from drivers.wires.serial_line import SerialAddress
+from drivers.wires.wire import WireAddress
 from registry.plugins import PluginRegistry
 
 _WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(

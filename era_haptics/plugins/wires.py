@@ -6,13 +6,11 @@ A wire has an address made of a URL, a port of bytes, and one of the three proto
 
 from drivers.errors import CommandError, LinkError
 from drivers.ports import Port
-from drivers.wires.address import WireAddress
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
-from drivers.wires.can_bus.host import CanWire
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.host import SerialWire
-from drivers.wires.wire import Wire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_line import SerialWire
+from drivers.wires.wire import Wire, WireAddress
 
 __all__ = [
     "CanFrame",

@@ -31,7 +31,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
-from drivers.wires.modbus.frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
+from drivers.wires.modbus_frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
 from registry import threads
 from sim.amplifier.contract import Amplifier
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
-from drivers.wires.modbus.frames import (
+from drivers.wires.modbus_frames import (
     AREA,
     BOX,
     IDENTITY,
@@ -27,7 +27,7 @@ from drivers.wires.modbus.frames import (
     pack_identity,
     parse_request,
 )
-from drivers.wires.modbus.frames import Message as Pdu
+from drivers.wires.modbus_frames import Message as Pdu
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 FRAME_TIMEOUT = 0.02

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from drivers.errors import CommandError
 from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Place
-from drivers.wires.can_bus.canopen import BITRATE
+from drivers.wires.can_frames import BITRATE
 from drivers.wires.known import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice

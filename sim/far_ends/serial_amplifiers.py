@@ -19,7 +19,7 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
-from drivers.wires.serial_line.frames import (
+from drivers.wires.serial_frames import (
     NEUTRAL,
     REPLY,
     Frame,

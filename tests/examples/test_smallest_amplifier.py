@@ -12,7 +12,7 @@ import pytest
 
 import era_haptics
 from drivers.by_hand.actions import identify
-from drivers.wires.serial_line.frames import Frame, encode_frame
+from drivers.wires.serial_frames import Frame, encode_frame
 from installed_program import installed_program
 from judged_line import judged
 

@@ -13,7 +13,7 @@ import pytest
 
 import hand_written as hand
 from drivers.protocol.definition import MESSAGES
-from drivers.wires.modbus.frames import framed
+from drivers.wires.modbus_frames import framed
 from moved_firmware import CAN, MODBUS, SERIAL, SESSION, MovedFirmware, apply, request, values_of
 
 TURN = 20.0  # s

@@ -16,10 +16,8 @@ from cobs import cobs
 
 import hand_written as hand
 from drivers.protocol.definition import STATES, STATUS_FLAGS, VERSION
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import REQUEST, segments
-from drivers.wires.can_bus.text import SLCAN
-from drivers.wires.modbus.frames import framed
+from drivers.wires.can_frames import REQUEST, SLCAN, CanFrame, segments
+from drivers.wires.modbus_frames import framed
 from firmware_requests import RandomHost
 from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, values_of
 from mutation import damage

@@ -12,7 +12,7 @@ from drivers.host.group import Group
 from drivers.host.line import Line
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_line import SerialWire
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from registry import threads

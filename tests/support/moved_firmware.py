@@ -12,9 +12,8 @@ from cobs import cobs
 import hand_written as hand
 from drivers.protocol.definition import BY_NUMBER, EVENT, EVENT_RECORD, NAK, NAK_RECORD, VERSION
 from drivers.protocol.records import Record, Values
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
-from drivers.wires.can_bus.text import SLCAN, TextReader
-from drivers.wires.serial_line.frames import (
+from drivers.wires.can_frames import SLCAN, TextReader, pack_frames, unpack_frames
+from drivers.wires.serial_frames import (
     Frame,
     FrameReader,
     encode_frame,

@@ -11,8 +11,7 @@ from typing import Any
 
 import can
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from model.rig.rig import Channel
 from registry.limits import GuardLimits
 from rig_on_wire import make_bench

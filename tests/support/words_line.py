@@ -14,12 +14,11 @@ from drivers.host.line import Line
 from drivers.playing.contents import Layer, Tone
 from drivers.ports import NETWORK_DELAY
 from drivers.protocol.definition import BY_NUMBER, HELLO
-from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
-from drivers.wires.can_bus.frames import REQUEST, pack_frames, unpack_frames
-from drivers.wires.can_bus.host import CanWire
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.frames import FrameReader
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import CANOPEN, REQUEST, CanFrame, cob_id, pack_frames, unpack_frames
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_frames import FrameReader
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from registry.limits import GuardLimits
 from sim.amplifier.contract import Amplifier

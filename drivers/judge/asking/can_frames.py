@@ -24,13 +24,15 @@ from drivers.judge.asking.material import layer
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import HELLO, IDENTITY, MESSAGES, NAK
 from drivers.protocol.records import Values
-from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
-from drivers.wires.can_bus.frames import (
+from drivers.wires.can_frames import (
+    CANOPEN,
     NODE_MAX,
     NUMBER_MAX,
     REPLY,
     REQUEST,
     Assembler,
+    CanFrame,
+    cob_id,
     pack_frames,
     segments,
     unpack_frames,

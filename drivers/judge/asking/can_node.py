@@ -27,7 +27,7 @@ from drivers.protocol.definition import (
     TEXTS,
     name_of,
 )
-from drivers.wires.can_bus.canopen import CANOPEN, cob_id
+from drivers.wires.can_frames import CANOPEN, cob_id
 from registry import threads
 
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127

@@ -25,7 +25,7 @@ from drivers.judge.asking.material import send, stage
 from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
 from drivers.protocol.records import Values
-from drivers.wires.modbus.frames import (
+from drivers.wires.modbus_frames import (
     AREA,
     BOX,
     EXCEPTION,

@@ -32,7 +32,7 @@ from drivers.protocol.definition import (
     VERSION,
 )
 from drivers.protocol.records import Values
-from drivers.wires.serial_line.frames import (
+from drivers.wires.serial_frames import (
     NEUTRAL,
     REPLY,
     Frame,

@@ -19,10 +19,20 @@ from drivers.judge.watching.decoded import (
     sent_by_amplifier,
 )
 from drivers.protocol.definition import EVENT, MAX_WORDS, NAMES
-from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, CanFrame, cob_id
-from drivers.wires.can_bus.frames import NODE_MAX, REPLY, REQUEST, Assembler, frames_of
-from drivers.wires.can_bus.frames import Message as Words
-from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
+from drivers.wires.can_frames import (
+    BLOCK,
+    CANOPEN,
+    NODE_MAX,
+    REPLY,
+    REQUEST,
+    SLCAN,
+    SOCKETCAND,
+    Assembler,
+    CanFrame,
+    cob_id,
+    frames_of,
+)
+from drivers.wires.can_frames import Message as Words
 
 _MAX_REST = 512  # bytes kept of text that does not end
 _KEPT = 3 * frames_of(MAX_WORDS)  # frames of the host, which an adapter may echo

@@ -28,7 +28,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.definition import HELLO as HELLO_NUMBER
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.sets import is_last
-from drivers.wires.serial_line.frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
+from drivers.wires.serial_frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
 
 HELLO = "Hello"
 A_READ = "a read"

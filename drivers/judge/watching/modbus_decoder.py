@@ -22,7 +22,7 @@ from drivers.judge.watching.decoded import (
 )
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, REFUSALS
 from drivers.protocol.records import Refusal
-from drivers.wires.modbus.frames import (
+from drivers.wires.modbus_frames import (
     AREA,
     BOX,
     EXCEPTION,
@@ -40,7 +40,7 @@ from drivers.wires.modbus.frames import (
     response_to,
     unpack_identity,
 )
-from drivers.wires.modbus.frames import Message as Pdu
+from drivers.wires.modbus_frames import Message as Pdu
 
 _PAUSE = 0.04  # s; a longer pause ends a partial frame on RTU
 

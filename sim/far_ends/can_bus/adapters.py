@@ -7,8 +7,7 @@ effect; modes other than raw mode, extended identifiers, discovery by broadcast.
 
 import re
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.text import SLCAN, SOCKETCAND
+from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame
 from registry import threads
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.far_end import FarEnd, Send

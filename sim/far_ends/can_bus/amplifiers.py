@@ -1,6 +1,6 @@
 """The amplifiers' side of a CAN bus, without I/O.
 
-Frames come and go packed (`drivers.wires.can_bus.frames`), those of a message together.
+Frames come and go packed (`drivers.wires.can_frames`), those of a message together.
 """
 
 import struct
@@ -22,13 +22,15 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
-from drivers.wires.can_bus.canopen import CANOPEN, CanFrame, cob_id
-from drivers.wires.can_bus.frames import (
+from drivers.wires.can_frames import (
+    CANOPEN,
     NODE_MAX,
     REPLY,
     REQUEST,
     Assembler,
+    CanFrame,
     Message,
+    cob_id,
     pack_frames,
     segments,
     unpack_frames,

@@ -6,8 +6,7 @@ Not modelled: arbitration, retransmission, bus-off.
 import asyncio
 from collections.abc import Callable, Sequence
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

@@ -9,7 +9,7 @@ import struct
 import zlib
 
 from drivers.protocol.definition import MESSAGES, TEXTS
-from drivers.wires.can_bus.canopen import BLOCK, CANOPEN, cob_id
+from drivers.wires.can_frames import BLOCK, CANOPEN, cob_id
 from sim.transport.far_end import AmplifierPort
 
 TOGGLE = 0x0503_0000

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from drivers.by_hand import places
 from drivers.by_hand.cli import app
 from drivers.by_hand.places import Candidate, detect_slcan
-from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_frames import CanFrame
 from sim.far_ends.can_bus.adapters import SlcanAdapter
 from sim.far_ends.can_bus.bus import CanBus
 from sim.transport.pseudo_terminal import make_terminal

@@ -14,7 +14,7 @@ from drivers.host.clocks import Clocks
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_line import SerialWire
 from sim.amplifier.clock import AmplifierClock, Crystal
 from sim.transport.line_kinds import LINE_KINDS, LineDelays
 from virtual_loop import run_virtual

@@ -9,8 +9,8 @@ from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier as Host
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import MESSAGES
-from drivers.wires.serial_line.frames import REPLY, FrameReader, encode_frame
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities

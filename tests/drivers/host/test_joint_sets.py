@@ -18,10 +18,10 @@ from drivers.errors import (
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
 from drivers.protocol.sets import LayerSet
-from drivers.wires.can_bus.frames import unpack_frames
-from drivers.wires.can_bus.host import CanWire
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import unpack_frames
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from sim.amplifier.clock import AmplifierClock, Crystal
 from virtual_loop import in_virtual_time

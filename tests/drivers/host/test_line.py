@@ -13,10 +13,9 @@ from drivers.host.jobs import Job, Priority
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import word_passed
 from drivers.protocol.records import Refusal, Values
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames
-from drivers.wires.serial_line.frames import Frame, encode_frame
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.can_frames import CanFrame, pack_frames
+from drivers.wires.serial_frames import Frame, encode_frame
+from drivers.wires.serial_line import SerialWire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, grouped, unaltered
 

@@ -10,8 +10,8 @@ from drivers.host.feeding import SILENCING
 from drivers.host.group import Group
 from drivers.playing.contents import Layer
 from drivers.protocol.sets import Envelope
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of, grouped, layer, tone

@@ -12,7 +12,7 @@ from drivers.host.group import Group
 from drivers.playing.contents import Layer
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.sets import Envelope, LayerSet
-from drivers.wires.serial_line.frames import REPLY, FrameReader, encode_frame, pack_words
+from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words
 from virtual_loop import run_virtual
 from words_line import KINDS, Alter, MemoryLine, group_of, grouped, layer, tone, unaltered
 

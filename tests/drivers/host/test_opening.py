@@ -12,7 +12,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.ports import PORT_OPENER, Port
-from drivers.wires.can_bus.frames import unpack_frames
+from drivers.wires.can_frames import unpack_frames
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
 from word_wires import WORD_WIRES

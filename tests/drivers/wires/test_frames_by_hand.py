@@ -6,11 +6,10 @@ The checksums are by other programs: zlib and `cobs`, and the loop over bits of 
 import pytest
 
 from drivers.protocol.records import Values
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames
-from drivers.wires.can_bus.host import CanWire
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.serial_line.host import SerialWire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import CanFrame, pack_frames
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import More, Reply, Wire
 
 PART: Values = {

@@ -14,7 +14,7 @@ import pytest
 from drivers import ports
 from drivers.ports import Port
 from drivers.urls import Place
-from drivers.wires.can_bus import bus_port
+from drivers.wires import can_bus
 from registry import threads
 
 
@@ -63,7 +63,7 @@ OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
         lambda what: None,
     ),
     "adapter": partial(
-        bus_port.open_bus,
+        can_bus.open_bus,
         "can+python-can://pcan/usb",
         {"interface": "pcan"},
         HEARD.append,

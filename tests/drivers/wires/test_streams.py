@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.text import SLCAN, SOCKETCAND, TextReader
-from drivers.wires.serial_line.frames import (
+from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextReader
+from drivers.wires.serial_frames import (
     PAYLOAD_MAX,
     Frame,
     FrameReader,

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.errors import LinkError
 from drivers.protocol.definition import REFUSALS
-from drivers.wires.serial_line.frames import Frame, FrameReader, encode_frame
+from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
 from rig_on_wire import make_bench
 from sim.amplifier.contract import Amplifier

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.definition import FAULTS, MESSAGES, STATES, STATUS, VERSION
 from drivers.urls import ADDRESS
-from drivers.wires.serial_line.frames import Frame, encode_frame
+from drivers.wires.serial_frames import Frame, encode_frame
 from model.errors import InputError
 from model.rig.rig import Rig
 from registry import threads

@@ -28,9 +28,9 @@ from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
 from drivers.trace import tracing
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
-from drivers.wires.modbus.frames import framed
-from drivers.wires.serial_line.frames import FrameReader, encode_frame
+from drivers.wires.can_frames import pack_frames, unpack_frames
+from drivers.wires.modbus_frames import framed
+from drivers.wires.serial_frames import FrameReader, encode_frame
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from long_form import shortly
 from model.rig.rig import Rig

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from drivers.protocol.records import Values
-from drivers.wires.can_bus.frames import unpack_frames
+from drivers.wires.can_frames import unpack_frames
 from judged_line import KINDS, JudgedLine, judged, varied
 from long_form import shortly
 from sim.amplifier.contract import Amplifier

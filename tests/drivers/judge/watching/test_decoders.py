@@ -8,7 +8,7 @@ import pytest
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.decoded import Message, Reply, Request
 from drivers.judge.watching.watched_wire import DECODERS
-from drivers.wires.modbus.frames import framed
+from drivers.wires.modbus_frames import framed
 
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:

@@ -10,9 +10,8 @@ import can
 import pytest
 
 from drivers.errors import LinkError
-from drivers.wires.can_bus.bus_port import BusPort
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames
+from drivers.wires.can_bus import BusPort
+from drivers.wires.can_frames import CanFrame, pack_frames
 
 SET = [CanFrame(0x201, bytes([number])) for number in range(22)]
 STOP = [CanFrame(0x201, b"stop")]

@@ -2,8 +2,7 @@
 
 import pytest
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.text import SLCAN, SOCKETCAND, TextFormat, TextReader
+from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextFormat, TextReader
 
 FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 LINES = {

@@ -6,7 +6,7 @@ from drivers.errors import WireCounters
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
-from drivers.wires.can_bus.frames import (
+from drivers.wires.can_frames import (
     Assembler,
     Message,
     frames_of,

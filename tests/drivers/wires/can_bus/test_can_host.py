@@ -9,9 +9,8 @@ import pytest
 from drivers.errors import LinkError
 from drivers.host.group import Group
 from drivers.protocol.definition import MESSAGES
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, segments, unpack_frames
-from drivers.wires.can_bus.host import CanWire
+from drivers.wires.can_bus import CanWire
+from drivers.wires.can_frames import CanFrame, pack_frames, segments, unpack_frames
 from drivers.wires.wire import Arrival, Broken, Event, Nak, OtherHost, Reply, Several
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import MemoryLine, group_of

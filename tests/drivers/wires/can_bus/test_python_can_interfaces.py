@@ -7,7 +7,7 @@ import pytest
 from can.interfaces import BACKENDS
 
 from drivers.errors import CommandError, LinkError
-from drivers.wires.can_bus.address import PythonCanAddress
+from drivers.wires.can_bus import PythonCanAddress
 from drivers.wires.known import address_of
 
 OWN = ("slcan", "socketcan", "socketcand")

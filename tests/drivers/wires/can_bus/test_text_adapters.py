@@ -10,11 +10,9 @@ import pytest
 from drivers.errors import LinkError
 from drivers.opening import Lines
 from drivers.ports import PORT_OPENER
-from drivers.wires.can_bus import address
-from drivers.wires.can_bus.address import SlcanAddress, TextPort
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
-from drivers.wires.can_bus.text import SLCAN
+from drivers.wires import can_bus
+from drivers.wires.can_bus import SlcanAddress, TextPort
+from drivers.wires.can_frames import SLCAN, CanFrame, pack_frames, unpack_frames
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits
 from virtual_loop import in_virtual_time
@@ -93,7 +91,7 @@ async def test_server_that_does_not_open_the_bus_is_told(
     replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error, a closed connection, or no reply at all: with the remedy."""
-    monkeypatch.setattr(address, "_GREETING_TIMEOUT", 0.2)
+    monkeypatch.setattr(can_bus, "_GREETING_TIMEOUT", 0.2)
     async with server(*replies) as url:
         with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
             await open_port(url, lambda data: None)

@@ -6,8 +6,8 @@ import random
 import pytest
 from pymodbus.logging import Log
 
-from drivers.wires.modbus import frames
-from drivers.wires.modbus.frames import (
+from drivers.wires import modbus_frames
+from drivers.wires.modbus_frames import (
     Adu,
     AduReader,
     Read,
@@ -154,8 +154,8 @@ def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
         tried += 1
         return checked(frame)
 
-    checked = frames._checked
-    monkeypatch.setattr(frames, "_checked", counted)
+    checked = modbus_frames._checked
+    monkeypatch.setattr(modbus_frames, "_checked", counted)
     reader = AduReader(is_rtu=True, of_requests=waits, waits=waits)
     data = (noise * (1 << 18))[: 1 << 18]
     found: list[Adu] = []

@@ -6,8 +6,8 @@ import pytest
 
 from drivers.protocol.definition import MESSAGES, STATUS
 from drivers.protocol.records import Values
-from drivers.wires.modbus.frames import HEAD
-from drivers.wires.modbus.host import ModbusWire
+from drivers.wires.modbus import ModbusWire
+from drivers.wires.modbus_frames import HEAD
 from drivers.wires.wire import Broken, More, Nak, Reply
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers

@@ -5,8 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.wires.modbus.host import ModbusWire
-from drivers.wires.modbus.silent_port import SilentPort
+from drivers.wires.modbus import ModbusWire, SilentPort
 from virtual_loop import in_virtual_time
 
 BYTE = 11 / 19_200  # s

@@ -7,7 +7,7 @@ from functools import partial
 import can
 import pytest
 
-from drivers.wires.can_bus.canopen import CanFrame
+from drivers.wires.can_frames import CanFrame
 from model.rig.rig import Rig
 from rig_on_wire import make_bench
 from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient

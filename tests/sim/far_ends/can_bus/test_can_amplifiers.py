@@ -5,8 +5,7 @@ Frames are written as identifier and data in hexadecimal digits.
 
 import pytest
 
-from drivers.wires.can_bus.canopen import CanFrame
-from drivers.wires.can_bus.frames import pack_frames, unpack_frames
+from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from sim.amplifier.contract import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 

@@ -1,4 +1,6 @@
-"""The host's side of a serial line: frames of words, matched by address and sequence number.
+"""Serial lines: frames, the host's side and addresses.
+
+The host's side of a serial line: frames of words, matched by address and sequence number.
 
 serial:///dev/ttyUSB0?baud=921600&address=1, or on a server serial+tcp://HOST:PORT.
 """
@@ -8,19 +10,10 @@ from collections.abc import Callable
 
 from drivers.errors import WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
-from drivers.protocol.definition import (
-    BOOT_TIME,
-    BY_NUMBER,
-    EVENT,
-    HELLO,
-    MESSAGES,
-    NAK,
-    VERSION,
-)
+from drivers.protocol.definition import BOOT_TIME, BY_NUMBER, EVENT, HELLO, MESSAGES, NAK, VERSION
 from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
-from drivers.wires.address import WireAddress
-from drivers.wires.serial_line.frames import (
+from drivers.wires.serial_frames import (
     NEUTRAL,
     REPLY,
     Frame,
@@ -36,6 +29,7 @@ from drivers.wires.wire import (
     Reply,
     Several,
     Wire,
+    WireAddress,
     read_event,
     read_nak,
 )

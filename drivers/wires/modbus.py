@@ -1,21 +1,27 @@
-"""The host's side of Modbus, RTU and TCP: a message is written, then its reply is read.
+"""Modbus, RTU and TCP: frames, the host's side and addresses.
+
+The port of Modbus RTU, which keeps the line silent before each frame.
+
+The host's side of Modbus, RTU and TCP: a message is written, then its reply is read.
 
 modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT. Responses are matched by
 the transaction number over TCP, by unit, function and length over RTU, and by the tag. RTU goes
 over a port that keeps the line silent before each frame.
 """
 
+import asyncio
+import contextlib
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import final
 
-from drivers.errors import WireCounters
+from drivers.errors import LinkError, WireCounters
 from drivers.ports import NETWORK_DELAY, Port, open_port
 from drivers.protocol.definition import BOOT_TIME, BROADCAST, MESSAGES, REACTION
 from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, RTU_BAUD, AmplifierUrl
-from drivers.wires.address import WireAddress
-from drivers.wires.modbus.frames import (
+from drivers.wires.modbus_frames import (
     BOX,
     ECHO_SIZE,
     EXCEPTIONS,
@@ -39,20 +45,80 @@ from drivers.wires.modbus.frames import (
     response_to,
     unpack_identity,
 )
-from drivers.wires.modbus.silent_port import SilentPort
 from drivers.wires.wire import (
     WIDEST,
     Arrival,
     Broken,
     More,
     Nak,
+    PortAbove,
     Reply,
     Several,
     Wire,
+    WireAddress,
     Written,
     read_nak,
     reply_words,
 )
+
+_TO_ALL = b"\0"
+
+
+@final
+class SilentPort(PortAbove):
+    """A port that sends a frame once the line was silent for a time [s]; implements `Port`.
+
+    byte_time [s]; on_data: called with what is received. A frame waits at most for the longest
+    other one, so that noise does not keep a stop waiting, but always for one of its own.
+    Of those that wait a newer one replaces the older: its request was given up. Broadcasts stay,
+    which have no reply to wait for.
+    """
+
+    def __init__(self, silence: float, byte_time: float, on_data: Callable[[bytes], None]) -> None:
+        self._silence, self._byte_time, self._on_data = silence, byte_time, on_data
+        self._loop = asyncio.get_running_loop()
+        self._free_from = self._loop.time() + silence
+        self._sent_until = 0.0  # s; the end of the last frame of its own, and silence
+        self._waiting: list[tuple[float, bytes]] = []  # until when [s] at most, frame
+        self._timer: asyncio.TimerHandle | None = None
+
+    def write(self, data: bytes) -> None:
+        """Send a frame as soon as the line was silent; raises LinkError."""
+        latest = self._loop.time() + RTU_MAX * self._byte_time + self._silence
+        kept = [each for each in self._waiting if each[1].startswith(_TO_ALL)]
+        self._waiting = [*kept, (latest, data)]
+        self._send()
+
+    def close(self) -> None:
+        """Close it; what waits is not sent."""
+        self._waiting.clear()
+        super().close()
+
+    def received(self, data: bytes) -> None:
+        """Take what was received, and count it as noise on the line."""
+        self._free_from = max(self._free_from, self._loop.time() + self._silence)
+        self._on_data(data)
+
+    def _send(self) -> None:
+        """Send what may go now; the timer sends the rest."""
+        while self._waiting:
+            latest, frame = self._waiting[0]
+            due = max(self._sent_until, min(self._free_from, latest))
+            now = self._loop.time()
+            if now < due:
+                if self._timer is None:
+                    self._timer = self._loop.call_at(due, self._due)
+                return
+            del self._waiting[0]
+            self._sent_until = now + len(frame) * self._byte_time + self._silence
+            self._free_from = max(self._free_from, self._sent_until)
+            self.below.write(frame)
+
+    def _due(self) -> None:
+        self._timer = None
+        with contextlib.suppress(LinkError):  # the loss of the port is reported by itself
+            self._send()
+
 
 _BITS = 11  # of a byte, with start, parity and stop
 _GAP = 3.5  # characters of silence before a frame

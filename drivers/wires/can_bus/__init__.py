@@ -1,1 +1,0 @@
-"""CAN buses: frames, the host's side, addresses and adapters."""

@@ -1,1 +1,0 @@
-"""Modbus, RTU and TCP: frames, the host's side and addresses."""

@@ -1,1 +1,0 @@
-"""Serial lines: frames, the host's side and addresses."""

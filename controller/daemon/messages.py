@@ -33,10 +33,10 @@ from controller.play.observer import PlayReport, SilenceReport
 from controller.play.routing import Drive
 from controller.sources.contacts import Contact, ContactKey
 from drivers.host.amplifier import Amplifier
-from drivers.host.feeding import Stopped
-from drivers.host.jobs import LinkStatistics
-from drivers.host.members import is_lost
-from drivers.host.reports import REPORT_LIFE, REPORTS, ReportKind
+from drivers.host.clock import REPORT_LIFE, REPORTS, ReportKind
+from drivers.host.dialogue import Stopped
+from drivers.host.joint_sets import is_lost
+from drivers.host.line import LinkStatistics
 from drivers.protocol.definition import (
     FAULTS,
     QUANTITIES,

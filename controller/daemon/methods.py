@@ -61,7 +61,7 @@ from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
 from controller.sources.contacts import Contact
 from controller.sources.touch import Touch, TouchFrame
-from drivers.host.feeding import Stopped
+from drivers.host.dialogue import Stopped
 from model.compiled.kernels import why_slow
 from model.errors import InputError
 from model.finger import STRONG_DB_SL

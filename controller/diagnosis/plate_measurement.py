@@ -12,8 +12,8 @@ from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
 from controller.diagnosis.tone_player import TonePlayer
 from controller.play.routing import Drive
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.reports import CLOCK_SETTLING
-from drivers.host.sensors import Reading, measure_tones
+from drivers.host.amplifier import Reading, measure_tones
+from drivers.host.clock import CLOCK_SETTLING
 from drivers.opening import Lines
 from drivers.protocol.definition import HEARTBEAT
 from model.arrays import ComplexArray, FloatArray, best_first, best_of

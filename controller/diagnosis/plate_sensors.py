@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.errors import CommandError
-from drivers.host.amplifier import Amplifier
-from drivers.host.sensors import Reading, read_sensors
-from drivers.host.sensors import Sensor as ReportedSensor
+from drivers.host.amplifier import Amplifier, Reading, read_sensors
+from drivers.host.amplifier import Sensor as ReportedSensor
 from model.arrays import ComplexArray, FloatArray
 from model.identification.forward import Sensor
 from model.rig.rig import Channel, Rig

@@ -22,7 +22,7 @@ from controller.api.schema import (
     LatencySummary,
     LearningState,
 )
-from drivers.host.reports import ReportKind
+from drivers.host.clock import ReportKind
 from drivers.protocol.definition import READINGS
 
 _Row: TypeAlias = tuple[str, str, Mapping[Any, float | None], tuple[str, ...]]

@@ -18,8 +18,7 @@ from controller.diagnosis.plate_sensors import PlateSensor
 from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact
 from drivers.errors import DriverError, Preempted
-from drivers.host.amplifier import Amplifier
-from drivers.host.sensors import Reading, finish_reading, start_reading
+from drivers.host.amplifier import Amplifier, Reading, finish_reading, start_reading
 from model.identification.forward import RestingFinger
 from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig

@@ -34,7 +34,7 @@ from drivers.errors import (
     Preempted,
     WrongAmplifier,
 )
-from drivers.host.feeding import Stopped
+from drivers.host.dialogue import Stopped
 from registry import threads
 from registry.plugins import failure_text
 

@@ -10,7 +10,7 @@ from controller.play.intent import IntentSource
 from controller.play.planner import Planner
 from drivers.errors import LinkError
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.feeding import UNREACHED, Stopped
+from drivers.host.dialogue import UNREACHED, Stopped
 from drivers.host.group import Group, GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import REPLY_TIMEOUT

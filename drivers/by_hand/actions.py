@@ -19,10 +19,16 @@ from drivers.by_hand.reaching import (
     wire_rows,
 )
 from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
-from drivers.host.amplifier import WATCHDOG, Amplifier
-from drivers.host.feeding import Stopped
-from drivers.host.jobs import Priority
-from drivers.host.sensors import check_tones, measure_tones, read_measured, read_sensors
+from drivers.host.amplifier import (
+    WATCHDOG,
+    Amplifier,
+    check_tones,
+    measure_tones,
+    read_measured,
+    read_sensors,
+)
+from drivers.host.dialogue import Stopped
+from drivers.host.line import Priority
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import (
     BOOT_TIME,

@@ -25,11 +25,9 @@ from drivers.by_hand.reaching import (
     status_rows,
 )
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.amplifier import WATCHDOG
-from drivers.host.dialogue import Staged
-from drivers.host.feeding import Stopped
-from drivers.host.jobs import Priority
-from drivers.host.sensors import Reading, Sensor, measure_tones, read_sensors
+from drivers.host.amplifier import WATCHDOG, Reading, Sensor, measure_tones, read_sensors
+from drivers.host.dialogue import Staged, Stopped
+from drivers.host.line import Priority
 from drivers.playing.contents import Layer as AmplifierLayer
 from drivers.protocol.definition import ENABLED, HEARTBEAT
 from drivers.protocol.sets import token_after

@@ -11,8 +11,8 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from drivers.host.amplifier import Amplifier
-from drivers.host.limits import FREQUENCY_FLOOR
-from drivers.host.reports import REPORTS, reports_of
+from drivers.host.bounds import FREQUENCY_FLOOR
+from drivers.host.clock import REPORTS, reports_of
 from drivers.opening import Lines
 from drivers.protocol.definition import (
     FAULTS,

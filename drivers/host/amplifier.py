@@ -1,31 +1,55 @@
-"""One amplifier of protocol 4, whatever its wire: who it is, and its requests."""
+"""One amplifier of protocol 4, whatever its wire: who it is, and its requests.
+
+What an amplifier measures: its channels, and tones at its sensors.
+
+Nothing here needs a session, feeds the watchdog, or changes what plays.
+"""
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+import random
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
-from drivers.errors import CommandError, CommandRefused, LinkTimeout, Preempted, WrongAmplifier
-from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue
-from drivers.host.failures import contradicted, disarmed, driven_by_another
-from drivers.host.feeding import Stopped
-from drivers.host.jobs import LinkStatistics, Priority
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    FrameError,
+    LinkTimeout,
+    Preempted,
+    WrongAmplifier,
+)
+from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue, Stopped
 from drivers.host.ledger import Ledger
-from drivers.host.line import Line
+from drivers.host.line import (
+    Line,
+    LinkStatistics,
+    Priority,
+    contradicted,
+    disarmed,
+    driven_by_another,
+)
 from drivers.protocol.definition import (
     ATTEMPTS,
     ENABLED,
     LATCHED,
+    NO_CHANNEL,
     QUANTITIES,
+    READING_STATES,
     REPLY_TIMEOUT,
+    SENSOR_UNITS,
     STATES,
     STOP_RAMP,
+    UNKNOWN_PLACE,
     VERSION,
     capability_ranges,
     has_feature,
+    name_of,
+    sensor_reading,
 )
-from drivers.protocol.records import Values, bits_of
+from drivers.protocol.records import Record, Refusal, Rows, Values, bits_of
 from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem, is_newer_token
 from drivers.wires.wire import reply_words
 from registry import threads
@@ -385,3 +409,209 @@ def check_capabilities(can: Values, name: str, *, is_output: bool | None) -> Non
             f"amplifier {name}: full level must be {_FULL_LEVEL[is_output]} as in the rig file, "
             f"got {_FULL_LEVEL[has_output]}; correct the rig file, or connect another amplifier"
         )
+
+
+_MARGIN = 0.002  # s; of the amplifier's clock
+_MAX_OVERDUE = 2.0  # s; after the end of the window: an emulator stands still meanwhile
+_ROUNDING = 1e-6  # periods
+_Q = QUANTITIES
+_VIOLATION = "the amplifier does not keep the protocol"
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A sensor: its unit (a name of SENSOR_UNITS), and its range in it; frequency_max [Hz].
+
+    channel: whose actuator it sits at, or None; x, y [m]: None where unknown.
+    """
+
+    unit: str
+    channel: int | None
+    x: float | None
+    y: float | None
+    range: float
+    frequency_max: float
+
+
+@dataclass(frozen=True, slots=True)
+class SensorReading:
+    """What a sensor measured: amplitude in its unit and phase [degrees] of each tone."""
+
+    is_overloaded: bool
+    tones: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A reading: its number, its state (a name of READING_STATES), and what is left of it [s].
+
+    start: the amplifier's clock at the start of its window, on which phases count. token: of what
+    played then. sensors: empty until it is complete.
+    """
+
+    number: int
+    state: str
+    left: float
+    start: int
+    token: int
+    tones: int
+    sensors: tuple[SensorReading, ...]
+
+
+async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
+    """Read what its sensors measure, and where; empty if it has none."""
+    if not has_feature(amplifier.ledger.capabilities, "sensors"):
+        return ()
+    found: list[Sensor] = []
+    while True:
+        listed = await amplifier.request("GetSensors", {"first": len(found)}, Priority.READING)
+        found += [_sensor(each) for each in listed["sensors"]]
+        if len(found) > listed["all"]:
+            raise FrameError(f"sensors must be {listed['all']}, got {len(found)}; {_VIOLATION}")
+        is_last = len(found) > _Q["sensor"].maximum or not listed["sensors"]
+        if is_last or len(found) == listed["all"]:
+            return tuple(found)
+
+
+async def read_measured(amplifier: Amplifier) -> list[tuple[float, float]]:
+    """Read voltage [V] and current [A] of each channel; empty if it does not measure them."""
+    if not has_feature(amplifier.ledger.capabilities, "electrical"):
+        return []
+    measured = await amplifier.request("GetMeasured", {}, Priority.READING)
+    voltage, current = _Q["channel_voltage"].from_wire, _Q["channel_current"].from_wire
+    return [
+        (voltage(row["channel_voltage"]), current(row["channel_current"]))
+        for row in measured["channels"]
+    ]
+
+
+async def start_reading(
+    amplifier: Amplifier, frequencies: Sequence[float], window: float
+) -> Reading:
+    """Begin to measure tones [Hz] at all sensors, over a window [s] from now on.
+
+    Raises CommandError for tones that the window does not tell apart, CommandRefused for those
+    beyond the sensors.
+    """
+    check_tones(frequencies, window)
+    number = random.randint(_Q["reading"].minimum, _Q["reading"].maximum)  # noqa: S311  no secret
+    values: Values = {
+        **{"reading": number, "window": _Q["window"].to_wire(window)},
+        "tones": len(frequencies),
+        "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
+    }
+    found = await amplifier.request("Measure", values, Priority.READING)
+    return _reading(found, number=number, tones=len(frequencies))
+
+
+async def measure_tones(
+    amplifier: Amplifier, frequencies: Sequence[float], window: float
+) -> Reading:
+    """Measure tones [Hz] at all sensors over a window [s] from now on, and wait for its end.
+
+    Tones are in the order of the frequencies. The caller feeds the watchdog meanwhile, and has
+    waited until the plate has settled. Raises what `start_reading` and `finish_reading` raise.
+    """
+    return await finish_reading(amplifier, await start_reading(amplifier, frequencies, window))
+
+
+async def finish_reading(amplifier: Amplifier, started: Reading) -> Reading:
+    """Wait for the end of a reading, and return it with all its sensors.
+
+    Raises CommandRefused if another host has started one meanwhile, and FrameError if it does not
+    end in time or lacks sensors.
+    """
+    found = started
+    end = threads.now() + started.left + _MAX_OVERDUE
+    while found.state == "RUNNING":
+        if threads.now() > end:
+            raise FrameError(
+                f"reading {started.number} must be complete after its window, got {found.state} "
+                f"{_MAX_OVERDUE:g} s later; {_VIOLATION}"
+            )
+        await asyncio.sleep(found.left + _MARGIN)
+        found = await _same_reading(amplifier, started, 0)
+    count = (await amplifier.request("GetSensors", {"first": 0}, Priority.READING))["all"]
+    sensors = found.sensors
+    more = sensors
+    while more and len(sensors) < count:
+        more = (await _same_reading(amplifier, started, len(sensors))).sensors
+        sensors += more
+    if len(sensors) != count:
+        raise FrameError(f"reading must have all {count} sensors, got {len(sensors)}; {_VIOLATION}")
+    return replace(found, sensors=sensors)
+
+
+def check_tones(frequencies: Sequence[float], window: float) -> None:
+    """Raise CommandError for tones [Hz] that a window [s] does not tell apart."""
+    limit = _Q["tone_count"].maximum
+    if not 1 <= len(frequencies) <= limit:
+        raise CommandError(f"a reading must have 1 to {limit} tones, got {len(frequencies)}")
+    apart = min(after - before for before, after in pairwise([0.0, *sorted(frequencies)]))
+    if not apart * window >= 1 - _ROUNDING:
+        raise CommandError(
+            f"window must be at least a period of each frequency and of the differences between "
+            f"them, 1/({apart:g} Hz), got {window:g} s"
+        )
+
+
+async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> Reading:
+    """Read the reading that was started, its sensors from one on."""
+    found = await amplifier.request("GetReading", {"first": first}, Priority.READING)
+    return _reading(found, number=started.number, tones=started.tones)
+
+
+def _sensor(values: Values) -> Sensor:
+    channel = values["channel"]
+    return Sensor(
+        name_of(SENSOR_UNITS, values["unit"]),
+        None if channel == NO_CHANNEL else channel,
+        _place(values["x"]),
+        _place(values["y"]),
+        values["range"],
+        _Q["frequency"].from_wire(values["frequency_max"]),
+    )
+
+
+def _place(at: int) -> float | None:
+    return None if at == UNKNOWN_PLACE else _Q["place"].from_wire(at)
+
+
+def _reading(values: Values, *, number: int, tones: int) -> Reading:
+    """Read a reading of a number of tones, with its sensors.
+
+    Raises CommandRefused for a reading of another number, FrameError for other tones.
+    """
+    if values["reading"] != number:
+        raise CommandRefused(
+            f"reading {number} was replaced by {values['reading'] or 'none'}: another host "
+            "measures, or the amplifier has restarted; measure again"
+        )
+    if values["tones"] != tones:
+        raise FrameError(
+            f"reading {number} must have {tones} tones, got {values['tones']}; {_VIOLATION}"
+        )
+    count = values["count"]
+    record = Record(Rows("sensors", count, sensor_reading(tones)))
+    try:
+        rows = record.unpack(values["sensors"], is_strict=False)["sensors"] if count else []
+    except Refusal as refusal:
+        raise FrameError(f"reading: {refusal}; {_VIOLATION}") from None
+    return Reading(
+        values["reading"],
+        name_of(READING_STATES, values["state"]),
+        _Q["window_left"].from_wire(values["window_left"]),
+        values["window_start"],
+        values["token"],
+        tones,
+        tuple(
+            SensorReading(
+                bool(row["flags"] & 1),
+                tuple(
+                    (tone["amplitude"], _Q["phase"].from_wire(tone["phase"]))
+                    for tone in row["tones"]
+                ),
+            )
+            for row in rows
+        ),
+    )

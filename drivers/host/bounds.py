@@ -4,17 +4,31 @@ A set plays from an unknown moment in the next tenth of a second: the voices are
 `drivers.playing.voices` after a commit that is that uncertain. Along a straight line in the complex
 plane a magnitude is a convex function of the way, so that sums are largest where each transition
 is at one of its points.
+
+What a set may contain: limits in force, layers as the wire rounds them, and limits over time.
+
+Limits are the least of rig, amplifier, channels and ceilings. Levels, frequencies and phases are
+rounded to the nearest step, ramps upward, and `valid_for` never to 0, which means without end; what
+the wire cannot have, or limits forbid, is refused. Envelopes come in integers of the wire.
 """
 
 import math
+from array import array
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import chain, pairwise, product, zip_longest
-from typing import NamedTuple
+from operator import index
+from typing import NamedTuple, TypeAlias
 
+from drivers.errors import CommandError, CommandRefused
+from drivers.playing.contents import Layer, Tone
 from drivers.playing.playback import Playback
 from drivers.playing.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
 from drivers.protocol.definition import QUANTITIES
-from drivers.protocol.sets import LayerSet
+from drivers.protocol.records import Values, WireQuantity
+from drivers.protocol.sets import Command, LayerSet
+from registry.limits import GuardLimits
 
 _PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
 _SILENCE: Sequence[complex] = (0j,)
@@ -188,3 +202,309 @@ def _steepest_of(starts: Sequence[complex], way: Transition) -> tuple[float, flo
     course = (*way.knots, way.last)
     ways = (*product(starts, course[:1]), *pairwise(course))
     return steepest(ways, way.step, is_cosine=not way.knots)
+
+
+FREQUENCY_FLOOR = 10.0
+"""Below it a plate on springs only moves as a rigid body, and nothing is felt [Hz]."""
+RATE_CEILING = 2000.0
+"""No wire carries more sets a second, so a higher rate can only be a runaway loop."""
+DUTY_WINDOW = 10.0
+"""Window of the duty limit [s]; short against the thermal time constant of an amplifier."""
+COMMIT_DELAY = 0.1
+"""Longest time [s] from sending a set until it is played: three attempts of 30 ms each."""
+_RATE_WINDOW = 1.0  # s
+_SLACK = 1e-6  # of a step; sums of floats
+
+Vibration: TypeAlias = tuple[float | None, float]
+"""Earliest start [s] of a vibration, None without one, and its latest end [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireLimits:
+    """What a set may contain: frequencies and levels of the wire; slew, power as in GuardLimits."""
+
+    frequency_min: int
+    frequency_max: int
+    level: int
+    slew: float
+    power: float
+
+
+def wire_limits(configured: GuardLimits, capabilities: Values) -> WireLimits:
+    """Combine configured limits with an amplifier's and its channels'.
+
+    Where channels differ the least of all holds for each, since a pattern needs all. Raises
+    CommandError for limits that are no numbers, or leave nothing to play.
+    """
+    for name in ("frequency_min", "frequency_max", "level"):
+        if not math.isfinite(value := getattr(configured, name)):
+            raise CommandError(f"{name} of the limits must be a finite number, got {value}")
+    for name in ("slew", "power", "on_time", "duty", "rate"):
+        if not (value := getattr(configured, name)) > 0:
+            raise CommandError(f"{name} limit must be positive, got {value:g}")
+    reported = [capabilities, *capabilities["limits"]]
+    frequency, level = QUANTITIES["frequency"], QUANTITIES["level"]
+    lowest = max(FREQUENCY_FLOOR, configured.frequency_min)
+    limits = WireLimits(
+        max(-_whole_steps(-lowest, frequency), *(each["frequency_min"] for each in reported)),
+        min(
+            _whole_steps(configured.frequency_max, frequency),
+            *(each["frequency_max"] for each in reported),
+        ),
+        min(
+            _whole_steps(min(configured.level, 1.0), level),
+            *(each["level_max"] for each in reported),
+        ),
+        configured.slew,
+        configured.power,
+    )
+    if limits.frequency_min > limits.frequency_max:
+        low, high = (
+            frequency.from_wire(end) for end in (limits.frequency_min, limits.frequency_max)
+        )
+        raise CommandError(
+            f"limits of rig and amplifier must leave a frequency range, got {low:g} to {high:g} "
+            "Hz; widen limits.frequency in the rig file or use another amplifier"
+        )
+    if limits.level < 0:
+        raise CommandError(f"level limit must be at least 0, got {configured.level:g}")
+    return limits
+
+
+def _whole_steps(value: float, quantity: WireQuantity) -> int:
+    """Round a value down to a step of the wire."""
+    return math.floor(value * quantity.per_unit + _SLACK)
+
+
+TOLERANCE = 1 + 1e-9
+"""Factor by which a sum of floats may exceed a limit."""
+_LEVEL, _PHASE = QUANTITIES["level"], QUANTITIES["phase"]
+_RAMP, _VALID_FOR = QUANTITIES["ramp"], QUANTITIES["valid_for"]
+_FREQUENCY = QUANTITIES["frequency"]
+_VALID_FOR_MAX = _VALID_FOR.high
+_NO_KNOTS = ((0, 0),)
+
+
+class Rounding:
+    """Rounds layers for one amplifier. limits: in force; capabilities: values of its record."""
+
+    def __init__(self, limits: WireLimits, capabilities: Values) -> None:
+        self._limits, self._can = limits, capabilities
+        self._channels: int = capabilities["channels"]
+        self._layers: int = capabilities["layers"]
+        self._ramp_max = _RAMP.from_wire(capabilities["ramp_max"])
+        self.achieved: dict[tuple[int, int], int] = {}
+        """Frequencies that the amplifier plays in place of others, by channel and frequency."""
+
+    def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
+        """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
+        rounded: list[LayerSet] = []
+        numbers: list[int] = []
+        for layer in layers:
+            number, ramp, valid_for = index(layer.number), layer.ramp, layer.valid_for
+            if not 0 <= number < self._layers:
+                raise CommandRefused(f"layer must be 0 to {self._layers - 1}, got {number!r}")
+            if not 0 <= ramp <= self._ramp_max:  # nor NaN
+                raise CommandRefused(f"ramp must be 0 to {self._ramp_max:g} s, got {ramp!r} s")
+            if not 0 <= valid_for <= _VALID_FOR_MAX:
+                raise CommandRefused(
+                    f"valid_for must be 0 to {_VALID_FOR_MAX:g} s, got {valid_for!r} s"
+                )
+            if layer.renew and (layer.tones or layer.after):
+                raise CommandRefused("renew must be without tones and after")
+            if layer.after and not layer.tones:
+                raise CommandRefused("after must be with tones")
+            commands = self._commands(layer.tones)
+            rounded.append(
+                LayerSet(
+                    number,
+                    min(math.ceil(ramp * _RAMP.per_unit - _SLACK), self._can["ramp_max"]),
+                    max(round(valid_for * _VALID_FOR.per_unit), 1) if valid_for else 0,
+                    tuple(commands.values()),
+                    bool(layer.after),
+                    bool(layer.renew),
+                )
+            )
+            numbers.append(number)
+        if len(set(numbers)) < len(numbers):
+            raise CommandRefused(f"a set must have each layer once, got {numbers}")
+        return tuple(rounded)
+
+    def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
+        """Return the commands of tones by channel; few calls, since every set has some."""
+        limits, commands, shaped = self._limits, dict[int, Command](), list[Tone]()
+        for tone in tones:
+            channel, level, onset = index(tone.channel), tone.level, tone.onset
+            if not 0 <= channel < self._channels:
+                raise CommandRefused(
+                    f"channel must be 0 to {self._channels - 1}, got {channel!r}", channel=channel
+                )
+            if channel in commands:
+                raise refused(channel, "must occur once in a layer")
+            if not 0 <= level * _LEVEL.per_unit < limits.level + 0.5:  # a step of the wire; nor NaN
+                raise self._level_refused(channel, "level", level)
+            if not (math.isfinite(tone.frequency) and math.isfinite(tone.phase)):
+                values = f"{tone.frequency!r} Hz and {tone.phase!r} degrees"
+                raise refused(channel, f"frequency and phase must be finite numbers, got {values}")
+            frequency = round(tone.frequency * _FREQUENCY.per_unit)
+            if level == 0 and onset is None:
+                frequency = limits.frequency_min
+            if not limits.frequency_min <= frequency <= limits.frequency_max:
+                low, high = map(_FREQUENCY.from_wire, (limits.frequency_min, limits.frequency_max))
+                raise refused(
+                    channel, f"frequency must be {low:g} to {high:g} Hz, got {tone.frequency:g} Hz"
+                )
+            phase = round(tone.phase * _PHASE.per_unit)
+            if not _PHASE.minimum <= phase <= _PHASE.maximum:
+                phase = _PHASE.to_wire(float(tone.phase))
+            commands[channel] = Command(
+                channel,
+                self.achieved.get((channel, frequency), frequency),
+                min(round(level * _LEVEL.per_unit), limits.level),
+                phase,
+                bool(tone.keep_phase),
+                bool(tone.skip_ending),
+                onset,
+                tone.ending,
+            )
+            if onset is not None or tone.ending is not None:
+                shaped.append(tone)
+        if shaped:
+            self._check_envelopes(shaped)
+        return commands
+
+    def _level_refused(self, channel: int, name: str, level: float) -> CommandRefused:
+        highest = self._limits.level / _LEVEL.per_unit
+        return refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
+
+    def _check_envelopes(self, tones: Sequence[Tone]) -> None:
+        """Raise CommandRefused for an envelope of a tone that is not allowed."""
+        low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
+        limit = self._can["knots"]
+        for tone in tones:
+            for shape in (tone.onset, tone.ending):
+                if shape is None:
+                    continue
+                if not low <= (step := shape.step) <= high:
+                    raise refused(
+                        tone.channel,
+                        f"step of an envelope must be {low} to {high} (0.1 ms), got {step}",
+                    )
+                if (count := len(shape.knots)) > limit:
+                    raise refused(
+                        tone.channel, f"knots of an envelope must be at most {limit}, got {count}"
+                    )
+                try:
+                    levels, phases = zip(*(shape.knots or _NO_KNOTS), strict=True)
+                    array("q", (*levels, *phases))  # which has no numbers with a fraction
+                except (TypeError, ValueError) as error:
+                    raise refused(
+                        tone.channel, f"knots of an envelope must be pairs of integers: {error}"
+                    ) from error
+                if not 0 <= min(levels) <= (peak := max(levels)) <= self._limits.level:
+                    raise self._level_refused(
+                        tone.channel, "level of a knot", peak / _LEVEL.per_unit
+                    )
+                if not _PHASE.minimum <= min(phases) <= max(phases) <= _PHASE.maximum:
+                    raise refused(tone.channel, "phase of a knot must be -180 to 179.99 degrees")
+
+
+def refused(channel: int, text: str) -> CommandRefused:
+    """Return the error of a channel that must not play something: why, as `X must be Y`."""
+    return CommandRefused(f"channel {channel}: {text}", channel=channel)
+
+
+class Budget:
+    """Sets sent and the longest time they may vibrate; times [s] are arguments."""
+
+    def __init__(self, limits: GuardLimits) -> None:
+        self._limits, self._rate = limits, min(limits.rate, RATE_CEILING)
+        self.is_unlimited = limits.on_time == math.inf and limits.duty >= 1
+        self._duty_time = limits.duty * DUTY_WINDOW if limits.duty < 1 else math.inf
+        allowed = max(1, int(self._rate * _RATE_WINDOW))
+        # Sets that were delayed on their way arrive closer together than they were sent.
+        self._window = max(_RATE_WINDOW, allowed / self._rate) + COMMIT_DELAY
+        self._sent: deque[float] = deque(maxlen=allowed)
+        self._vibrations: deque[tuple[float, float]] = deque()  # ended ones: start, end
+        self._start: float | None = None  # earliest start of the current one
+        self._end = 0.0  # its latest end
+
+    def remaining(self, now: float, *, fade: float, delay: float) -> float:
+        """Longest valid_for [s] of a vibration that is sent now, infinite if unlimited.
+
+        fade [s]: how long it takes to end after that; delay [s]: allowance until it is played,
+        while the current vibration goes on. Raises CommandRefused if no time is left or the rate is
+        exceeded.
+        """
+        if len(self._sent) == self._sent.maxlen and now < self._sent[0] + self._window:
+            raise CommandRefused(
+                f"rate must be at most {self._rate:g} command sets a second; send fewer, "
+                "the limit stops runaway loops",
+                until=self._sent[0] + self._window,
+            )
+        if self.is_unlimited:
+            return math.inf
+        is_vibrating = self._start is not None and now < self._end
+        spent = fade + (delay if is_vibrating else 0.0)
+        used = now - self._start if is_vibrating and self._start is not None else 0.0
+        return min(
+            _left("on-time limit", used, self._limits.on_time, spent),
+            _left(f"duty limit over {DUTY_WINDOW:g} s", self._used(now), self._duty_time, spent),
+        )
+
+    def fade_left(self, now: float) -> float:
+        """Longest time [s] in which the current vibration may fade if silence is sent now."""
+        if self._start is None or now >= self._end:
+            return math.inf
+        used = max(self._used(now) - self._duty_time, now - self._start - self._limits.on_time)
+        return max(0.0, -used - COMMIT_DELAY)
+
+    def sent(self, now: float, *, lasts: float) -> Vibration | None:
+        """Note a set that vibrates for at most a time [s], fade included; what vibrated before."""
+        self._sent.append(now)
+        if self.is_unlimited:
+            return None
+        self._close(now)
+        before = self._start, self._end
+        if self._start is None:
+            self._start, self._end = now, now
+        self._end = max(self._end, now + COMMIT_DELAY + lasts)
+        return before
+
+    def restore(self, before: Vibration | None) -> None:
+        """Note that the set sent last was refused; before: as `sent` returned."""
+        if before is not None:
+            self._start, self._end = before
+
+    def confirm(self, sent_at: float, now: float, *, end: float) -> None:
+        """Note that the set sent at a time [s] plays, and ends at another at the latest."""
+        self._close(now)
+        if self._start is None and now < end:
+            self._start = sent_at
+        self._end = end
+
+    def _close(self, now: float) -> None:
+        """Store the current vibration once it has ended."""
+        if self._start is not None and self._end <= now:
+            self._vibrations.append((self._start, self._end))
+            self._start = None
+        while self._vibrations and self._vibrations[0][1] < now - DUTY_WINDOW:
+            self._vibrations.popleft()
+
+    def _used(self, now: float) -> float:
+        """Vibration time within the window before now [s]."""
+        opened = now - DUTY_WINDOW
+        current = () if self._start is None else ((self._start, min(now, self._end)),)
+        spans = [end - max(start, opened) for start, end in (*self._vibrations, *current)]
+        return sum((max(0.0, span) for span in spans), start=0.0)
+
+
+def _left(name: str, used: float, limit: float, spent: float) -> float:
+    """Return the time [s] of a limit that is not spent; CommandRefused if none."""
+    left = limit - used - spent
+    if left <= 0:
+        raise CommandRefused(
+            f"{name} of {limit:.3g} s reached ({used:.3g} s used, {spent:.3g} s to end); pause the "
+            "vibration"
+        )
+    return left

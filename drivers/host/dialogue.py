@@ -1,4 +1,12 @@
-"""What one amplifier was sent and has replied: sets, ledger, watchdog, latch, contradictions."""
+"""What one amplifier was sent and has replied: sets, ledger, watchdog, latch, contradictions.
+
+Until when an amplifier may play: when its watchdog was fed, and what confirms its silence.
+
+Moments at which sets start, as a Commit names them to the clocks of several amplifiers.
+
+A clock that is steered shows the host's time. One that is not has its own, by its readings: the
+word that names a moment to it is another, and what has passed for others may be ahead for it.
+"""
 
 import asyncio
 import logging
@@ -6,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from drivers.errors import (
     CommandError,
@@ -17,22 +25,27 @@ from drivers.errors import (
     Overtaken,
     Preempted,
 )
-from drivers.host.clock import HeldClock
-from drivers.host.failures import contradicted, disarmed, driven_by_another
-from drivers.host.feeding import UNREACHED, Feeding, Stopped
-from drivers.host.jobs import LinkStatistics, Priority
-from drivers.host.ledger import Ledger
-from drivers.host.limits import COMMIT_DELAY
-from drivers.host.line import Line
-from drivers.host.reports import (
+from drivers.host.bounds import COMMIT_DELAY
+from drivers.host.clock import (
     REPORT_LIFE,
     REPORTS,
+    HeldClock,
     ReportKind,
     armed_problem,
     reports_of,
 )
+from drivers.host.ledger import Ledger
+from drivers.host.line import (
+    Line,
+    LinkStatistics,
+    Priority,
+    contradicted,
+    disarmed,
+    driven_by_another,
+)
 from drivers.playing.contents import Layer
 from drivers.protocol.definition import (
+    AHEAD_MAX,
     ATTEMPTS,
     COMMAND,
     ENABLED,
@@ -40,14 +53,20 @@ from drivers.protocol.definition import (
     EVENT_RECORD,
     FAST,
     HIGH_TIME,
+    HIGH_WORDS,
     KNOT,
     LAYER,
     MAX_AHEAD,
     MESSAGES,
     QUANTITIES,
+    REACTION,
     SET_WORDS,
     STATUS,
     STOP_RAMP,
+    clock_at,
+    high_word,
+    moment_of,
+    word_passed,
 )
 from drivers.protocol.records import Values
 from drivers.protocol.sets import (
@@ -60,6 +79,97 @@ from drivers.protocol.sets import (
     parts,
 )
 from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
+
+SILENCING = 0.005 + REACTION
+"""From the expiry of a watchdog until the outputs are silent, at the most [s]."""
+
+
+@dataclass
+class Feeding:
+    """When its watchdog was fed, as far as the host knows: what may have, and what surely did.
+
+    delay, is_kept: of the wire; watchdog [s]. may: when [s] the last request that may have fed went
+    out. plays: the last such that does not also silence it, arrives: when it arrives unless it is
+    delayed: how long the amplifier may play follows from it. fade [s]: longest ramp since, of a
+    silence without reply, a stop or a disarm. since, confirmed_at: when the last request that
+    surely did went out, and its reply came.
+    """
+
+    delay: float = 0.0
+    is_kept: bool = False
+    watchdog: float = 0.0
+    may: float = -math.inf
+    plays: float = -math.inf
+    arrives: float = -math.inf
+    fade: float = 0.0
+    since: float = -math.inf
+    confirmed_at: float = -math.inf
+
+    @property
+    def lost_from(self) -> float:
+        """When the watchdog has silenced it, and one that does not reply is lost [s].
+
+        A request without reply may still be under way; what is confirmed came before its reply, and
+        not always in the time of the line: a busy machine may have kept it.
+        """
+        is_confirmed = self.plays <= self.since
+        arrival = self.confirmed_at if is_confirmed else self.arrives + self.delay
+        return arrival + self.watchdog + self.fade + SILENCING
+
+    @property
+    def may_play_until(self) -> float:
+        """When the watchdog must have silenced it, even where it is fed once more [s].
+
+        What an adapter has kept comes at any time, all at once: after the watchdog without effect.
+        Of several attempts without reply one may have arrived, and the next been kept.
+        """
+        may_be_fed_again = self.is_kept and self.plays > self.since
+        return self.lost_from + (self.watchdog if may_be_fed_again else 0.0)
+
+    def tells(self, sent_at: float) -> bool:
+        """Whether a status asked for at a time [s] would show a watchdog that stands still."""
+        return self.may <= self.since and sent_at - self.confirmed_at > REACTION
+
+    def problem(self, left: float, sent_at: float, now: float) -> str | None:
+        """Describe an impossible time that is left [s] in a reply to a request; None if possible.
+
+        sent_at: of the request, which is not one that feeds; now: of the reply.
+        """
+        lowest = self.watchdog - (now - self.since) - REACTION
+        # One that may have fed and was not confirmed may have come just before this request.
+        fed_at = self.confirmed_at if self.may <= self.since else sent_at
+        highest = min(self.watchdog, self.watchdog - (sent_at - fed_at)) + REACTION
+        if lowest <= left <= highest:
+            return None
+        return f"watchdog left must be {max(lowest, 0):.3f} to {highest:.3f} s, got {left:.3f} s"
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """What an amplifier may play: confirmed silent, or until when [s] it may play, and why.
+
+    may_play_until: infinite where nothing is known to silence it.
+    """
+
+    is_confirmed: bool
+    may_play_until: float
+    cause: str = ""
+
+    def rows(self, now: float) -> dict[str, Any]:
+        """Return it in words at a time [s]: `silence`, `may_play_for_s` and `cause`."""
+        left = self.may_play_until - now
+        silence = "may_play" if left > 0 else "watchdog_elapsed"
+        is_bounded = not self.is_confirmed and left < math.inf
+        return {
+            "silence": "confirmed_silent" if self.is_confirmed else silence,
+            "may_play_for_s": round(max(left, 0.0), 3) if is_bounded else None,
+            "cause": self.cause,
+        }
+
+
+UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
+"""What is known of an amplifier before its first reply."""
+
 
 MAX_CONTRADICTIONS = 2
 """Contradictions in a row that are a fault; a single one may be a moment between two sets."""
@@ -469,3 +579,33 @@ class Dialogue:
             self._ledger.resolve(token, now)
         if self._admitted is not None and self._admitted.token == token:
             self._admitted = None
+
+
+_Amplifier = TypeVar("_Amplifier", bound=Dialogue)
+_STEP = AHEAD_MAX // 2  # from a high word that is tried to the next
+
+
+def words_of(moment: float, amplifiers: Sequence[_Amplifier]) -> dict[_Amplifier, int]:
+    """Return the high words of the clocks of amplifiers at a moment [s], the nearest ones."""
+    word = high_word(clock_at(moment + HIGH_TIME / 2))
+    return {
+        each: word if each.clock.can_be_steered else high_word(clock_at(_shown(each, moment)))
+        for each in amplifiers
+    }
+
+
+def word_passed_by_all(now: float, amplifiers: Sequence[Dialogue]) -> int:
+    """Return a high word that is no moment ahead for amplifiers, now [s] and a little later."""
+    at = word_passed(now)
+    others = [each for each in amplifiers if not each.clock.can_be_steered]
+    times = [_shown(each, now + later) for each in others for later in (0.0, COMMITTING)]
+    for _ in range(HIGH_WORDS // _STEP):
+        if all(moment_of(at, time) is None for time in times):
+            break
+        at = (at - _STEP) % HIGH_WORDS
+    return at
+
+
+def _shown(amplifier: Dialogue, time: float) -> float:
+    """Return what the clock of an amplifier shows at a time [s], to the nearest high word."""
+    return time + amplifier.clock.lead(time) + HIGH_TIME / 2

@@ -4,28 +4,215 @@ At one moment on all, or on none: by one broadcast on a line that they share, on
 moment that is ahead for the slowest. On one amplifier it plays with its last part. A token is newer
 than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000 sets
 would take the next one for an older one. It commits an empty one before.
+
+The amplifiers of a group: which reply, which are lost, which of several errors counts.
+
+Their stops and disarms are begun at once, and go on to their end.
+
+The clocks of all amplifiers of a plate: how well they agree, and what more is read of them.
+
+Where heartbeats alone do not show clocks well enough, on USB of full speed or in a busy network,
+statuses are read between them, the seldomer the better these are known, and given up for whatever
+is sent next. On a line that several share one Mark lets all keep the clock of the same byte, so
+that what delays it is common to all of them.
 """
 
 import asyncio
 import math
-from collections.abc import Awaitable, Mapping, Sequence
+import re
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from operator import attrgetter
+from statistics import median
+from typing import Any, ParamSpec, TypeVar, cast
 
-from drivers.errors import CommandRefused, DriverError, Overtaken, Preempted
+from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import IsPreempted, Staged
-from drivers.host.jobs import Priority
+from drivers.host.clock import HeldClock
+from drivers.host.dialogue import IsPreempted, Staged, Stopped, word_passed_by_all, words_of
 from drivers.host.ledger import is_silence
-from drivers.host.line import Line
-from drivers.host.members import Members, need, outcomes
-from drivers.host.moments import word_passed_by_all, words_of
+from drivers.host.line import GRACE, Line, Priority
 from drivers.playing.contents import Layer
-from drivers.protocol.definition import LATCHED, STATES, STOP_RAMP, moment_behind, name_of
+from drivers.protocol.definition import (
+    HEARTBEAT,
+    LATCHED,
+    STATES,
+    STOP_RAMP,
+    has_feature,
+    moment_behind,
+    name_of,
+)
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, token_after
 from registry import threads
+
+_T = TypeVar("_T")
+_P = ParamSpec("_P")
+_REPEAT_INTERVAL = 0.005  # s; in addition to the time in which a reply is awaited
+need, _lost_from = attrgetter("feeding.since"), attrgetter("feeding.lost_from")
+_silence_cause = attrgetter("silence_cause")
+
+
+class Members:
+    """Amplifiers by name, which is that of each."""
+
+    def __init__(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        self.amplifiers = dict(amplifiers)
+        self.epoch = 0
+        """Stops, disarms and closes so far: nothing from before arms, plays or feeds after one."""
+        self.has_joint_set = False
+        """Whether they have a set that several lines are to play: no clock is read meanwhile."""
+        self.gives_up_at = math.inf
+        """When [s] nothing is repeated any more, since all is being closed."""
+        self.silencing: set[asyncio.Future[Any]] = set()
+        """Stops and disarms that go on."""
+        self._broadcasts: dict[Line, asyncio.Future[Values]] = {}  # of stops
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """Their lines, each once, in the order of the amplifiers, so that runs can be repeated."""
+        return tuple(dict.fromkeys([each.line for each in self.amplifiers.values()]))
+
+    @property
+    def by_need(self) -> list[Amplifier]:
+        """All, first the one that was fed longest ago: replies may come late."""
+        return sorted(self.amplifiers.values(), key=need)
+
+    @property
+    def degraded(self) -> tuple[str, ...]:
+        """Names of amplifiers that do not reply but may still play; nothing new is played then."""
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return tuple([each.name for each in mute if not is_lost(each)])
+
+    @property
+    def lost_by(self) -> Mapping[str, str]:
+        """Causes by name of amplifiers that must be silent without a reply, or without a line."""
+        return {
+            name: each.line.loss or each.silence_cause or ""
+            for name, each in self.amplifiers.items()
+            if is_lost(each)
+        }
+
+    @property
+    def lost_from(self) -> float:
+        """When [s] the next beat stops all, since one that does not reply must be silent."""
+        mute = filter(_silence_cause, self.amplifiers.values())
+        return min(map(_lost_from, mute), default=math.inf)
+
+    @property
+    def last_sent_at(self) -> float:
+        """When [s] a set or silence was last sent to any amplifier."""
+        return max((each.played_at for each in self.amplifiers.values()), default=-math.inf)
+
+    def check_none_since(self, before: int) -> None:
+        """Raise Preempted if a stop, disarm or close has come since an epoch."""
+        if self.epoch != before:
+            raise Preempted(
+                "amplifiers were disarmed, stopped or closed meanwhile; arm again if that is still "
+                "wanted"
+            )
+
+    def is_degraded_only(self, error: BaseException) -> bool:
+        """Whether an error says no more than that an amplifier does not reply for now."""
+        return isinstance(error, LinkTimeout) and not self.lost_by
+
+    async def all(self, requests: Sequence[Awaitable[_T]]) -> list[_T]:
+        """Await all requests to their ends, then raise the most severe error."""
+        return self.checked(await outcomes(requests))
+
+    def checked(self, results: list[_T | BaseException]) -> list[_T]:
+        """Return results; raises the most severe error.
+
+        A lost link is first; last are what others have preempted and, after it, a degraded link.
+        """
+        if errors := [each for each in results if isinstance(each, BaseException)]:
+            raise min(errors, key=self._severity)
+        return cast("list[_T]", results)
+
+    def _severity(self, error: BaseException) -> int:
+        if self.is_degraded_only(error):
+            return 3
+        if isinstance(error, Preempted):  # by the cause, which is to be told
+            return 2
+        return 0 if isinstance(error, LinkError) else 1
+
+    async def retried(self, amplifier: Amplifier, request: Callable[[], Awaitable[_T]]) -> _T:
+        """Repeat a request until it is answered, the amplifier is lost, or all is being closed."""
+        while True:
+            try:
+                return await request()
+            except LinkTimeout:
+                if is_lost(amplifier) or threads.now() > self.gives_up_at:
+                    raise
+                await asyncio.sleep(_REPEAT_INTERVAL)
+
+    def silence(
+        self, work: Callable[_P, Coroutine[Any, Any, _T]], *args: _P.args, **kwargs: _P.kwargs
+    ) -> Coroutine[Any, Any, _T]:
+        """Start a stop or disarm, which goes on to its end whatever is cancelled meanwhile."""
+        task = asyncio.ensure_future(work(*args, **kwargs))  # begun wherever it was made
+        self.silencing.add(task)
+        task.add_done_callback(self.silencing.discard)
+        return _to_completion(task)
+
+    def broadcast_stop(self, line: Line, ramp: float) -> None:
+        """Request a stop of all amplifiers of a line along a ramp [s], unless one is queued."""
+        queued = self._broadcasts.get(line)
+        if queued is None or queued.done():
+            first = next(iter(self.amplifiers.values()))
+            sent = line.submit(None, Priority.STOP, "Stop", {"ramp": first.wire_ramp(ramp)})
+            # What each amplifier says afterwards decides.
+            sent.add_done_callback(lambda sent: sent.cancelled() or sent.exception())
+            self._broadcasts[line] = sent
+
+    async def stopped(
+        self, stops: Mapping[str, "asyncio.Future[Stopped]"]
+    ) -> Mapping[str, Stopped]:
+        """Await stops by name; of one that failed by itself it is said what it may play."""
+        said: dict[str, Stopped] = {}
+        for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
+            if isinstance(result, BaseException):
+                cause = f"{type(result).__name__}: {result}"
+                result = self.amplifiers[name].what_may_play(cause)
+            said[name] = result
+        return said
+
+
+async def _to_completion(task: "asyncio.Future[_T]") -> _T:
+    """Await work, however often the caller is cancelled meanwhile; re-raise that at the end."""
+    cancellation = None
+    while not task.done():
+        try:
+            await asyncio.wait({task})
+        except asyncio.CancelledError as error:
+            cancellation = error
+    if cancellation is not None:
+        task.exception()  # retrieved: what has failed is said by the amplifiers
+        raise cancellation
+    return task.result()
+
+
+async def outcomes(requests: Sequence[Awaitable[_T]]) -> list[_T | BaseException]:
+    """Await all requests to their ends; returns the result or the error of each."""
+    if len(requests) > 1:
+        return await asyncio.gather(*requests, return_exceptions=True)
+    results = list[_T | BaseException]()
+    for request in requests:  # without a further iteration of the event loop
+        try:
+            results.append(await request)
+        except Exception as error:
+            results.append(error)
+    return results
+
+
+def is_lost(amplifier: Amplifier) -> bool:
+    """Whether it cannot be reached: its line is gone, or it is mute beyond its watchdog."""
+    if amplifier.silence_cause is None or amplifier.line.loss is not None:
+        return amplifier.line.loss is not None
+    return threads.now() >= amplifier.feeding.lost_from
+
 
 INTERVAL = 1 << 12
 """Tokens after which the gaps are looked at again."""
@@ -254,3 +441,170 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
 async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
+
+
+# s; an error that costs nothing of a promise, one that costs a tenth of a dB, and more.
+_GOOD, _FAIR, _POOR = 5e-6, 8e-6, 12e-6
+_MAX_LOAD = 0.2  # of the line's time, for readings beside heartbeats
+_INTERVAL = 0.01  # s, at least, between these; half where an error is poor, longer where near good
+_SETTLING = 0.2  # s, at most, for readings before clocks are needed
+_FRAME = 1e-3  # s, of USB: readings come at all its phases, however steady the heartbeats are
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a circle evenly
+
+
+class Clocks:
+    """The clocks of the amplifiers of a group, whose lines are open."""
+
+    def __init__(self, members: Members) -> None:
+        self._members, self._amplifiers = members, members.amplifiers
+        self._are_alike = True  # and so are their lines
+        self._dither = 0.0
+        self._readings: dict[Amplifier, asyncio.Future[Any]] = {}
+        self._turns: dict[Line, Iterator[Amplifier]] = {}
+        self._marked: set[Line] = set()  # all on which know Mark, and are several
+        self._firsts: dict[Line, HeldClock | None] = {}  # to which the others of a line are held
+
+    def follow(self) -> None:
+        """Know all from now on: one alone, or by which lines and amplifiers they differ."""
+        every = self._amplifiers.values()
+        self._are_alike = len({_kind(each) for each in every}) == 1
+        for line in self._members.lines:
+            of_line = [each for each in every if each.line is line]
+            self._turns[line] = cycle(of_line)
+            know_mark = [has_feature(each.ledger.capabilities, "mark") for each in of_line]
+            if len(of_line) > 1 and all(know_mark):
+                self._marked.add(line)
+        for each in every:
+            each.clock.is_alone = len(every) == 1
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """Errors of the clocks against each other [s rms] by amplifier; infinite: not held.
+
+        That which an amplifier states, that of what is seen of its clock, and where lines or
+        amplifiers differ half of the shortest exchange less its bits, of which no exchange shows
+        how it is shared by its two ways. 0 for one alone.
+        """
+        every = self._amplifiers
+        if len(every) < 2:
+            return dict.fromkeys(every, 0.0)
+        now = next(iter(every.values())).line.time()
+        held = [each for each in every.values() if each.clock.error(now) < math.inf]
+        is_common = len(self._members.lines) == 1
+        is_common &= sum(not each.clock.is_compared for each in held) == 1
+        leads = {each: each.clock.lead(now) for each in every.values()}
+        common = median([leads[each] for each in held] or [0.0])
+        # So that the rms of what is known is no less than that of their differences.
+        wider = math.sqrt(len(held) / max(len(held) - 1, 1))
+        return {
+            name: math.hypot(
+                each.clock.error(now, off=wider * (leads[each] - common), is_common=is_common),
+                0.0 if self._are_alike else each.clock.shortest / 2,
+            )
+            for name, each in every.items()
+        }
+
+    async def settle(self) -> None:
+        """Read clocks that are known poorly time and again, before anything plays: it costs none.
+
+        No more once one does not reply, or a stop or disarm has come.
+        """
+        lines = self._members.lines if len(self._amplifiers) > 1 else ()
+        now = asyncio.get_running_loop().time()
+        try:
+            async with asyncio.TaskGroup() as settling:
+                for line in lines:
+                    settling.create_task(self._settle(line, now + _SETTLING))
+        except* DriverError:  # as arming says, too
+            pass
+
+    async def _settle(self, line: Line, until: float) -> None:
+        of_line = [
+            each
+            for each in self._amplifiers.values()
+            if each.line is line and each.clock.can_be_steered
+        ]
+        before = self._members.epoch
+        while (now := line.time()) < until:
+            if max([each.clock.scatter(now) for each in of_line], default=0.0) <= _GOOD:
+                break
+            if line in self._marked:
+                self._compare(of_line, now)
+                await line.submit(None, Priority.READING, "Mark", {})
+            for each in of_line:
+                if line.time() >= until or self._members.epoch != before:
+                    return
+                await each.read_status(Priority.READING)
+                await asyncio.sleep(self.later())
+
+    def _compare(self, of_line: Sequence[Amplifier], now: float) -> None:
+        """Hold clocks of a line to one as long as nothing ails it, else to the best known."""
+        line = of_line[0].line
+        before = self._firsts.get(line)
+
+        def rank(one: HeldClock) -> tuple[bool, bool, bool, float]:
+            # One that has jumped is led back by itself: no other follows it.
+            error = one.error(now)
+            return error == math.inf, one.problem(now) is not None, one is not before, error
+
+        best = min([each.clock for each in of_line], key=rank)
+        first = self._firsts[line] = best if best.error(now) < math.inf else None
+        for each in of_line:
+            each.clock.compare(None if each.clock is first else first)
+
+    def look(self, by_line: Mapping[Line, Sequence[Amplifier]]) -> None:
+        """Read clocks of lines beside their heartbeats, which go out next: more where needed.
+
+        Of all lines as often: how far the lowest of some readings is above a lead depends on it.
+        """
+        if len(self._amplifiers) == 1:
+            return
+        loop, worst, busy = asyncio.get_running_loop(), 0.0, dict[Line, float]()
+        now, unmarked = loop.time(), list[tuple[Line, Sequence[Amplifier]]]()
+        for line, of_line in by_line.items():
+            takes = [each.exchange_time("GetStatus") for each in of_line]
+            shown = [each.counts.last_round_trip or 0.0 for each in of_line]
+            busy[line] = sum(map(max, takes, shown))
+            if line in self._marked:
+                self._compare(of_line, now)
+                # Behind the heartbeats: what waits for a reply is sent in step with frames.
+                later = self.later(_INTERVAL + busy[line])
+                loop.call_later(later, line.submit, None, Priority.HEARTBEAT, "Mark", {})
+                continue
+            unmarked.append((line, of_line))
+            for each in of_line:
+                if each.clock.can_be_steered:
+                    worst = max(worst, each.clock.scatter(now))
+        if worst <= _GOOD:
+            return
+        longer = max((_FAIR - _GOOD) / (worst - _GOOD), 1.0)
+        least = _INTERVAL * (longer if worst <= _POOR else 0.5)
+        for line, of_line in unmarked:
+            if line.late <= GRACE:
+                # Each by itself: one behind the reply to another is sent in step with frames.
+                interval = max(least, busy[line] / _MAX_LOAD) / len(of_line)
+                for number in range(1, int(HEARTBEAT / interval)):
+                    loop.call_later(
+                        self.later(number * interval), self._read, next(self._turns[line])
+                    )
+
+    def later(self, duration: float = 0.0) -> float:
+        """Return a duration [s] and some of a frame."""
+        self._dither = (self._dither + _GOLDEN) % 1.0
+        return duration + self._dither * _FRAME
+
+    def _read(self, amplifier: Amplifier) -> None:
+        """Read the status of an amplifier that replies, can be steered and is not being read."""
+        reading = self._readings.get(amplifier)
+        is_free = amplifier.clock.can_be_steered and (reading is None or reading.done())
+        is_heard = amplifier.silence_cause is None and amplifier.line.loss is None
+        if is_free and is_heard and not self._members.has_joint_set:
+            self._readings[amplifier] = amplifier.read_status(Priority.READING)
+
+
+def _kind(amplifier: Amplifier) -> tuple[Any, ...]:
+    """Return what amplifiers and lines have in common whose requests are as late at the least."""
+    line, of = amplifier.line, amplifier.identity
+    device = re.match(r"/.*/(\D*)", line.name)  # without its number; none for a network
+    made = of.get("vendor"), of.get("product"), of.get("firmware")
+    return type(line.wire), device and device[1], made

@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from drivers.errors import CommandRefused
-from drivers.host.bounds import Bounds
-from drivers.host.limits import (
+from drivers.host.bounds import (
     COMMIT_DELAY,
     TOLERANCE,
+    Bounds,
     Budget,
     Rounding,
     Vibration,

@@ -11,8 +11,7 @@ import pytest
 
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Amplifier
-from drivers.host.jobs import Priority
-from drivers.host.line import Line
+from drivers.host.line import Line, Priority
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values

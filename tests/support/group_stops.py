@@ -25,7 +25,7 @@ import rig_on_wire
 import sim
 from drivers.by_hand import actions
 from drivers.errors import DriverError
-from drivers.host.feeding import SILENCING, Stopped
+from drivers.host.dialogue import SILENCING, Stopped
 from drivers.protocol.definition import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each

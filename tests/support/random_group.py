@@ -11,7 +11,7 @@ from typing import Any, Self
 from chain import Chain
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
-from drivers.host.jobs import Priority
+from drivers.host.line import Priority
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import STATES
 from drivers.protocol.sets import Envelope

@@ -18,7 +18,7 @@ from controller.diagnosis.plate_measurement import (
 from controller.diagnosis.plate_sensors import PlateSensor
 from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
-from drivers.host.sensors import Reading, SensorReading, measure_tones
+from drivers.host.amplifier import Reading, SensorReading, measure_tones
 from drivers.opening import Lines
 from model.answer.plan import query
 from model.answer.stimulus import Placement

@@ -11,7 +11,7 @@ from controller.operation.states import DaemonEvent, DaemonState, Trigger
 from controller.play.loop import Controller
 from courses import courses, follow
 from drivers.errors import CommandRefused
-from drivers.host.feeding import Stopped
+from drivers.host.dialogue import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from registry import threads

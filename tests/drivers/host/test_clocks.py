@@ -10,8 +10,8 @@ import pytest
 
 from drivers.errors import LinkDegraded, Preempted
 from drivers.host.clock import HeldClock
-from drivers.host.clocks import Clocks
 from drivers.host.group import Group
+from drivers.host.joint_sets import Clocks
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO
 from drivers.wires.serial_line import SerialWire

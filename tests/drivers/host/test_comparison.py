@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from drivers.errors import CommandRefused
-from drivers.host.sensors import read_measured
+from drivers.host.amplifier import read_measured
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem

@@ -16,7 +16,7 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
-from drivers.host.jobs import Priority
+from drivers.host.line import Priority
 from drivers.playing.contents import Tone
 from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from drivers.errors import CommandRefused, DriverError, Preempted
+from drivers.host.amplifier import read_measured
 from drivers.host.group import Group
-from drivers.host.sensors import read_measured
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.errors import DriverError, LinkTimeout
-from drivers.host.feeding import SILENCING
+from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.playing.contents import Layer
 from drivers.protocol.sets import Envelope

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from courses import Taken, courses, follow
-from drivers.host.feeding import Stopped
+from drivers.host.dialogue import Stopped
 from drivers.host.group import Group
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import STATES

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import CommandError, CommandRefused, FrameError
-from drivers.host.sensors import Sensor, measure_tones, read_sensors, start_reading
+from drivers.host.amplifier import Sensor, measure_tones, read_sensors, start_reading
 from drivers.protocol.definition import READING_STATES, UNKNOWN_PLACE, sensor_reading
 from drivers.protocol.records import Values
 from virtual_loop import in_virtual_time

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from drivers.host.sensors import measure_tones, read_sensors
+from drivers.host.amplifier import measure_tones, read_sensors
 from drivers.protocol.definition import READING_STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts

@@ -6,7 +6,7 @@ from controller.api.client_protocol import Notification as Notification
 from controller.api.client_protocol import Unreachable as Unreachable
 from controller.api.jsonrpc import NotSilent as NotSilent
 from controller.api.jsonrpc import RpcError as RpcError
-from drivers.by_hand.blocking import BlockingAmplifier as BlockingAmplifier
+from drivers.by_hand.actions import BlockingAmplifier as BlockingAmplifier
 from drivers.errors import CommandRefused as CommandRefused
 from drivers.errors import DriverError as DriverError
 from drivers.errors import LinkError as LinkError

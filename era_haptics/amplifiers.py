@@ -1,7 +1,7 @@
 """Amplifiers of a rig for scripts: opened by the rig's URLs and limits."""
 
 from controller.play.routing import route
-from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing.contents import Layer as AmplifierLayer
 from era_haptics.arguments import expect_rig
 from era_haptics.drive import Played, layers_of

@@ -23,7 +23,7 @@ from controller.sources.touch import (
     open_source,
     turned,
 )
-from drivers.by_hand.rig_check import check_links
+from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, read_document
 from model.config.fields import Validation

@@ -93,7 +93,7 @@ def discover(
     json_: Json = False,
 ) -> None:
     """List serial ports, CAN interfaces and the amplifiers on them."""
-    from drivers.by_hand.places import discover as discovered
+    from drivers.by_hand.reaching import discover as discovered
 
     result, problems = run(discovered(url or [], probes=probe, slcan=slcan), trace)
     if json_:

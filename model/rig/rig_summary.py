@@ -524,7 +524,7 @@ def _notes(era: Source, low: float, high: float) -> list[str]:
     ]
 
 
-_ARRANGEMENT = "drivers.by_hand.rig_check:arrangement_of"
+_ARRANGEMENT = "drivers.by_hand.reaching:arrangement_of"
 _COST = "model.study.overview:clock_cost"
 _LOST_DB = 0.1  # contrast that is worth a warning
 
@@ -568,7 +568,7 @@ def clock_costs(rig: Rig, urls: Mapping[str, str]) -> tuple[str, list[str], dict
     return "", [said + remedy, *unsteered], {"clocks": data}
 
 
-_CHECK = "drivers.by_hand.rig_check:check_links"
+_CHECK = "drivers.by_hand.reaching:check_links"
 """By name: this package does not import the one beside it.
 
 Of URLs by the amplifier's name, numbers of channels that are wired, and the rig's limits; it gives

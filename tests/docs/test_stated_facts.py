@@ -8,7 +8,7 @@ import pytest
 import model
 from controller.sources.contacts import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
-from drivers.by_hand.rig_check import check_links
+from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError
 from drivers.protocol.definition import BOOT_TIME, REACTION
 from drivers.wires.known import address_of

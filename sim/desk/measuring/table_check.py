@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import contents
 from model.answer.answer import Layer

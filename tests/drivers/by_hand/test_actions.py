@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivers.by_hand import actions
-from drivers.by_hand.places import identify_all
+from drivers.by_hand.reaching import identify_all
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from drivers.by_hand.rig_check import Arrangement, arrangement_of
+from drivers.by_hand.reaching import Arrangement, arrangement_of
 from drivers.urls import CLOCK_ERRORS, SIMULATED
 from sim.transport.line_kinds import LINE_KINDS, PROMPT
 

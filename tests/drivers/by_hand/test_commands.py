@@ -11,7 +11,7 @@ import pytest
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner, Result
 
-from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.by_hand.actions import BlockingAmplifier
 from drivers.by_hand.cli import app as amp_app
 from drivers.errors import CommandError, CommandRefused, LinkError
 from drivers.judge.asking import Report
@@ -74,7 +74,7 @@ def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
 
 def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error names fault and remedy."""
-    monkeypatch.setattr("drivers.by_hand.blocking.HEARTBEAT", 0.15)
+    monkeypatch.setattr("drivers.by_hand.actions.HEARTBEAT", 0.15)
     with BlockingAmplifier(DRAWN, limits=LIMITS) as amplifier:
         amplifier.arm(0.1)
         with pytest.raises(CommandRefused, match=r"WATCHDOG.*clear"):
@@ -209,7 +209,7 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
 def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason stands with the port."""
     port = ListPortInfo("/dev/no-such-port")
-    monkeypatch.setattr("drivers.by_hand.places.comports", lambda: [port])
+    monkeypatch.setattr("drivers.by_hand.reaching.comports", lambda: [port])
     result = invoke("discover")
     assert result.exit_code == 0, result.output
     assert "no such port" in result.stdout

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.by_hand.rig_check import check_links
+from drivers.by_hand.reaching import check_links
 from registry.limits import GuardLimits
 
 BUS = "can+socketcan://can0"

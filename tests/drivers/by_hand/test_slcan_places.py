@@ -9,9 +9,9 @@ import pytest_asyncio
 from serial.tools.list_ports_common import ListPortInfo
 from typer.testing import CliRunner
 
-from drivers.by_hand import places
+from drivers.by_hand import reaching
 from drivers.by_hand.cli import app
-from drivers.by_hand.places import Candidate, detect_slcan
+from drivers.by_hand.reaching import Candidate, detect_slcan
 from drivers.wires.can_frames import CanFrame
 from sim.far_ends.can_bus.adapters import SlcanAdapter
 from sim.far_ends.can_bus.bus import CanBus
@@ -64,7 +64,7 @@ async def adapter() -> AsyncIterator[Adapter]:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The adapter is on a machine that may be busy: it is given time to reply."""
-    monkeypatch.setattr(places, "_REPLY_TIMEOUT", 5.0)
+    monkeypatch.setattr(reaching, "_REPLY_TIMEOUT", 5.0)
 
 
 async def test_other_device_receives_two_characters(adapter: Adapter) -> None:
@@ -99,7 +99,7 @@ async def test_discover_probes_adapters_on_request_only(
     protocol is tried on it; without the option no such command goes out.
     """
     port = adapter.terminal.port
-    monkeypatch.setattr("drivers.by_hand.places.comports", lambda: [ListPortInfo(port)])
+    monkeypatch.setattr("drivers.by_hand.reaching.comports", lambda: [ListPortInfo(port)])
     options = ["--slcan"] if is_probed else ["--no-probe"]
     arguments = ["amp", "discover", "--json", *options]
     result = await asyncio.to_thread(CliRunner().invoke, app, arguments)

@@ -15,7 +15,7 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
-from drivers.by_hand.blocking import BlockingAmplifier
+from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
 from drivers.playing.contents import Layer

@@ -16,7 +16,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.wires.serial_line import SerialWire
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 CHANNELS = 4

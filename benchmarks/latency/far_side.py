@@ -11,7 +11,7 @@ from drivers.protocol.definition import MESSAGES, read_request
 from drivers.protocol.sets import Assembly, is_last, unpack_layers
 from drivers.wires.serial_frames import Frame, FrameReader, frame_length, unpack_words
 from model.rig.rig import Rig
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 BAUD = 921_600

@@ -16,7 +16,7 @@ from drivers.playing.playback import Voice
 from model.arrays import FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig
-from sim.amplifier.clock import StraightClock
+from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
 from sim.plant import second_harmonic
 from sim.plant.imperfections import Imperfections, realised

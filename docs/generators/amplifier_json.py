@@ -42,7 +42,7 @@ from drivers.protocol.sets import MAX_PARTS, PART_WORDS
 from drivers.wires.modbus_frames import AREA, BOX, IDENTITY_COUNT, READ, REPLY, WRITE
 from drivers.wires.modbus_frames import IDENTITY as IDENTITY_REGISTER
 from drivers.wires.serial_frames import PAYLOAD_MAX
-from sim.amplifier.state_table import TRANSITIONS
+from sim.amplifier.simulated_amplifier import TRANSITIONS
 
 _SERIAL: Mapping[str, Any] = {
     "line": {"baud": 921_600, "data_bits": 8, "parity": "none", "stop_bits": 1},

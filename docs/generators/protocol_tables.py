@@ -39,7 +39,7 @@ from drivers.protocol.records import (
     View,
 )
 from drivers.wires.can_frames import CANOPEN
-from sim.amplifier.state_table import TRANSITIONS
+from sim.amplifier.simulated_amplifier import TRANSITIONS
 from word_names import word_names
 
 _REPLIES: Mapping[str, Record] = {

@@ -21,7 +21,7 @@ from typing import Protocol
 from drivers.playing.playback import Voice
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from drivers.protocol.records import Refusal, Values
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
 

@@ -33,7 +33,7 @@ from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
 from drivers.wires.modbus_frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
 from registry import threads
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 
 UNIT, BAUD = 1, 115_200
 STEP = 0.001  # s; between looks at the watchdog

@@ -25,8 +25,8 @@ from model.structure.attachments import FingertipLoad, PointLoad, Source, check_
 from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import threads
-from sim.amplifier.clock import AmplifierClock, StraightClock
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import AmplifierClock, StraightClock
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.sensing import REACH, Probe, Sensing
 from sim.bench.straight_clocks import StraightClocks
 from sim.plant import second_harmonic

@@ -25,8 +25,8 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Refusal, Values
 from model.arrays import FloatArray
-from sim.amplifier.clock import AmplifierClock
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import AmplifierClock
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.plant.accelerometer import Accelerometer, positions, readings
 
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 
 from drivers.protocol.definition import CLOCK_TURN
-from sim.amplifier.clock import AmplifierClock, StraightClock
+from sim.amplifier.readings import AmplifierClock, StraightClock
 
 WRONG = 0.5e-6
 """Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""

@@ -30,7 +30,7 @@ from model.structure.exciter import Actuator
 from model.study.verification import draw_plates
 from model.transients.base_motion import Motion, Term
 from model.vibration import finer_mesh
-from sim.amplifier.clock import Crystal
+from sim.amplifier.readings import Crystal
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from drivers.playing.playback import Voice
 from model.transients.base_motion import Term, along_lines, raised_cosine
-from sim.amplifier.clock import StraightClock
+from sim.amplifier.readings import StraightClock
 
 
 def motion_of(

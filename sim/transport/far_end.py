@@ -9,7 +9,7 @@ from typing import Self, TypeAlias, cast
 
 from drivers.errors import LinkError
 from registry import threads
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults.fault_window import Faults
 from sim.transport.line import TwoWayLine

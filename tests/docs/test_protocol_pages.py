@@ -15,7 +15,7 @@ from drivers.judge.asking import CHECKS
 from drivers.playing.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from protocol_bytes import BYTES
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.can_bus.word_objects import ObjectServer
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"

@@ -15,7 +15,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 MODULE = Path(__file__).parents[2] / "examples" / "plugins" / "wire" / "unix_wire.py"

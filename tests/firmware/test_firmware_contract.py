@@ -14,7 +14,7 @@ from firmware_requests import RandomHost
 from judged_line import judged
 from long_form import shortly
 from moved_firmware import LINES, RATE, FirmwareEnd, MovedFirmware, Pair, Sent
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 
 REQUESTS = 600
 TOLERANCE = 3e-4  # of full level: 16-bit samples, and fixed point in up to 16 voices

@@ -23,7 +23,7 @@ from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import SCALED
 from rig_files import write_rig
 from rig_on_wire import WIRES, far_side
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.plant.accelerometer import Accelerometer
 from virtual_loop import run_virtual
 

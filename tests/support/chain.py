@@ -26,7 +26,7 @@ from plate_witness import OperatorCommand
 from registry import threads
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.opening import Wire
 from sim.faults.fault_window import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections

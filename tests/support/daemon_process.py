@@ -35,7 +35,7 @@ from installed_program import ERA
 from model.table.table_file import save_table
 from patient_daemon import PROGRAM
 from rig_on_wire import FarSide
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 
 FEEDING = ("Ping", "Set", "Commit", "Silence", "Arm", "Disarm", "Stop")
 """What a host that is alive sends while something may play."""

@@ -11,7 +11,7 @@ import pytest
 from drivers.protocol.definition import STATUS, reading
 from drivers.protocol.records import Record, Values
 from drivers.wires.wire import reply_words
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 
 LATER = reading("later_voltage", "of another supply", -1200, 6000, 100, "V", is_added=True)
 WORD = 1201

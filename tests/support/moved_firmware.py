@@ -22,7 +22,7 @@ from drivers.wires.serial_frames import (
 )
 from model.arrays import FloatArray
 from registry import threads
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 RATE = 16000

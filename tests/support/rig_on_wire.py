@@ -17,8 +17,8 @@ from memory_machine import MemoryMachine, live_in_memory
 from model.rig.rig import Channel, Rig
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import AmplifierSummary
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.opening import Wire, open_wires

@@ -16,7 +16,7 @@ from model.rig.rig import Channel
 from registry.limits import GuardLimits
 from rig_on_wire import make_bench
 from set_table import make_rig
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers

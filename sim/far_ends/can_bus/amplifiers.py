@@ -35,7 +35,7 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
-from sim.amplifier.contract import SILENCING_RAMP
+from sim.amplifier.simulated_amplifier import SILENCING_RAMP
 from sim.far_ends.can_bus.word_objects import ObjectServer
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 

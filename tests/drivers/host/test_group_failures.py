@@ -14,7 +14,7 @@ from drivers.host.group import Group
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
-from sim.amplifier.contract import Amplifier as FarEnd
+from sim.amplifier.simulated_amplifier import Amplifier as FarEnd
 from words_line import MemoryLine, grouped, layer, losing, tone
 
 

@@ -12,8 +12,8 @@ from drivers.protocol.definition import MESSAGES
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
-from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
+from sim.amplifier.simulated_amplifier import Amplifier
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, LIMITS, MemoryLine, group_of, unaltered
 

@@ -23,7 +23,7 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
-from sim.amplifier.clock import AmplifierClock, Crystal
+from sim.amplifier.readings import AmplifierClock, Crystal
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of, unaltered
 

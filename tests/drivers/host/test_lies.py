@@ -17,7 +17,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_TIME, MESSAGES, SPAN
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames
-from sim.amplifier.clock import AmplifierClock, Crystal
+from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.far_ends import serial_amplifiers
 from virtual_loop import in_virtual_time, run_virtual
 from words_line import KINDS, Alter, MemoryLine, group_of, unaltered

@@ -11,7 +11,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.wires.wire import Arrival, Broken, More, Nak, Reply
 from mutation import damage
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from words_line import KINDS
 
 DEFAULT_COUNT = 4000

@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import pytest
 
-from sim.amplifier.clock import AmplifierClock, Crystal
+from sim.amplifier.readings import AmplifierClock, Crystal
 
 PER_SECOND = 214_748_364.8
 

@@ -7,8 +7,8 @@ import pytest
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from sim.amplifier.clock import AmplifierClock, Crystal
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.amplifier.simulated_amplifier import Amplifier
 
 ARM = {"session": 7, "watchdog": 250, "shift": 0}
 OFF, *_, ENABLED = list(STATES)[1:5]

@@ -12,7 +12,7 @@ from drivers.playing.contents import Tone
 from drivers.playing.voices import Transition, Voice
 from model.rig.rig import Channel, Rig
 from plate_in_time import lock_in
-from sim.amplifier.clock import AmplifierClock, Crystal
+from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import Bench
 from sim.bench.straight_clocks import WRONG, StraightClocks
 from sim.plant.imperfections import Imperfections

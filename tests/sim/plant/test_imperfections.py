@@ -22,7 +22,7 @@ from model.errors import InputError
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import Fingertip, PointLoad
 from plate_in_time import lock_in
-from sim.amplifier.clock import StraightClock
+from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.imperfections import (
     ChannelErrors,

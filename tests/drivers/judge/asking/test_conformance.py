@@ -35,8 +35,8 @@ from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from long_form import shortly
 from model.rig.rig import Rig
 from registry import threads
-from sim.amplifier.contract import Amplifier
 from sim.amplifier.readings import capabilities
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_loop import VirtualLoop, in_virtual_time

@@ -9,7 +9,7 @@ from drivers.protocol.records import Values
 from drivers.wires.can_frames import unpack_frames
 from judged_line import KINDS, JudgedLine, judged, varied
 from long_form import shortly
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}

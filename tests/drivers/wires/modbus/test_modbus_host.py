@@ -9,7 +9,7 @@ from drivers.protocol.records import Values
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.modbus_frames import HEAD
 from drivers.wires.wire import Broken, More, Nak, Reply
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from virtual_loop import in_virtual_time
 from words_line import MemoryLine, unaltered

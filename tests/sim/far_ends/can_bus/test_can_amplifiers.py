@@ -6,7 +6,7 @@ Frames are written as identifier and data in hexadecimal digits.
 import pytest
 
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.can_bus.amplifiers import CanAmplifiers
 
 START = (0x000, "0100")

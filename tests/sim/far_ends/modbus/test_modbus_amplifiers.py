@@ -8,7 +8,7 @@ import pytest
 
 from foreign_masters import MASTERS, drive
 from registry import threads
-from sim.amplifier.contract import Amplifier
+from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.transport.pseudo_terminal import make_terminal
 

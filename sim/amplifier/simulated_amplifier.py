@@ -6,12 +6,24 @@ due, and what plays is a description in time (`drivers.playing.playback`), not s
 
 Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
 where the sum of layers is limited.
+
+State table: which request is allowed in which state, and the state that follows.
+
+Any other request is refused (WRONG_STATE). Transitions without a request are in the amplifier:
+OPERATION_ENABLED to FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once
+silent; SWITCHED_ON, entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence.
+READY_TO_SWITCH_ON and SWITCHED_ON are passed through at once: Arm goes all the way.
+
+Sets of a simulated amplifier: collected from their parts, checked as a whole, staged, committed.
+
+All numbers are integers of the wire; see drivers.protocol.sets.
 """
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol, TypeAlias
 
 from drivers.playing.playback import Voice, playback_of
 from drivers.protocol.definition import (
@@ -22,20 +34,29 @@ from drivers.protocol.definition import (
     MESSAGES,
     NO_CHANNEL,
     QUANTITIES,
+    STAGED_LIFE,
     STATES,
     STATUS_FLAGS,
     VERSION,
     high_word,
 )
 from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import is_last, token_after
-from sim.amplifier.clock import AmplifierClock
+from drivers.protocol.sets import (
+    Assembly,
+    Command,
+    LayerSet,
+    is_last,
+    is_newer_token,
+    token_after,
+    unpack_layers,
+)
 from sim.amplifier.readings import (
     DERATE_ABOVE,
     DERATED,
     FAULT_ABOVE,
     GOOD_BELOW,
     LIMITED,
+    AmplifierClock,
     AmplifierSummary,
     FaultRecord,
     ThermalState,
@@ -46,8 +67,141 @@ from sim.amplifier.readings import (
     measured,
     with_readings,
 )
-from sim.amplifier.set_intake import Layers, SetIntake, derated
-from sim.amplifier.state_table import TRANSITIONS
+
+_OFF = ("SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON")
+_KEPT_BY_STOP = ("NOT_READY", "FAULT_REACTION_ACTIVE", "FAULT")
+_PLAYING = ("Set", "Commit", "Silence")
+_CHANGING = (*_PLAYING, "Arm", "Disarm", "Stop", "Clear", "SetAddress")
+
+TRANSITIONS: Mapping[tuple[str, str], str] = {
+    **{(state, name): state for state in STATES for name in MESSAGES if name not in _CHANGING},
+    **{("OPERATION_ENABLED", name): "OPERATION_ENABLED" for name in _PLAYING},
+    **{
+        (state, "Arm"): "OPERATION_ENABLED" for state in (*_OFF, "SWITCHED_ON", "OPERATION_ENABLED")
+    },
+    # Silencing is allowed in every state, and never clears a latched stop or fault.
+    **{(state, "Disarm"): state for state in STATES},
+    ("OPERATION_ENABLED", "Disarm"): "SWITCHED_ON",
+    **{(state, "Stop"): "QUICK_STOP_ACTIVE" for state in STATES if state not in _KEPT_BY_STOP},
+    **{(state, "Stop"): state for state in _KEPT_BY_STOP},
+    **{(state, "Clear"): state for state in STATES},
+    ("QUICK_STOP_ACTIVE", "Clear"): "SWITCH_ON_DISABLED",
+    ("FAULT", "Clear"): "SWITCH_ON_DISABLED",
+    **{(state, "SetAddress"): state for state in _OFF},
+}
+"""The state after a request, by state and name of the request."""
+
+
+Layers: TypeAlias = tuple[LayerSet, ...]
+
+
+class SetIntake:
+    """Takes the parts of sets, and keeps the one that is whole until it is committed.
+
+    capabilities: values of its record. committed: token of the set committed last, 0 for none.
+    One set is under way at most: collected, or staged.
+    """
+
+    def __init__(self, capabilities: Values) -> None:
+        self.capabilities = capabilities
+        self.committed = 0
+        self._parts = Assembly()  # of the set under way
+        self._staged: Layers | None = None  # of the same, once it is whole
+
+    def keep(self, part: Values, now: float) -> bool:
+        """Take a part but the last at a time [s]; returns whether it is kept."""
+        token, under_way = part["token"], self._under_way(now)
+        is_newer = token != under_way and is_newer_token(token, under_way)
+        is_under_way = token == under_way and self._staged is None
+        if not (is_newer_token(token, self.committed) and (is_newer or is_under_way)):
+            return False
+        if is_newer:
+            self._staged = None
+        return self._parts.keep(part, now)
+
+    def take(self, part: Values, now: float) -> Layers | int:
+        """Take the last part of a set that was not committed, at a time [s].
+
+        Returns the layers that are staged now, or the number of the first part that is missing.
+        Raises Refusal, which drops the parts of this set alone, and only where that is whole.
+        """
+        token, under_way = part["token"], self._under_way(now)
+        is_under_way = token == under_way
+        if is_under_way and self._staged is not None:  # it came again
+            return self._staged
+        for other in (self.committed, 0 if is_under_way else under_way):
+            if not is_newer_token(token, other):
+                raise Refusal(f"token must be newer than {other}, got {token}", "BAD_TOKEN")
+        if part["index"] >= part["parts"]:
+            raise Refusal(f"index must be below {part['parts']}, got {part['index']}")
+        if is_under_way and part["parts"] != self._parts.count:
+            raise Refusal(f"parts must be {self._parts.count} as before, got {part['parts']}")
+        stream = self._parts.whole(part)
+        if isinstance(stream, int):
+            return stream
+        try:
+            layers = self._checked(stream)
+        except Refusal:
+            if is_under_way:
+                self.drop()
+            raise
+        if not is_under_way:
+            self._parts = Assembly(token, part["parts"], now)
+        self._staged = layers
+        return layers
+
+    def commit(self, token: int, now: float) -> Layers | None:
+        """Return the layers of the staged set; None where it was committed before.
+
+        Raises Refusal if none is staged under this token.
+        """
+        if token == self.committed:
+            return None
+        if token != self._under_way(now):
+            raise Refusal(f"no set is staged under token {token}", "BAD_TOKEN")
+        if self._staged is None:
+            raise Refusal(f"all parts of set {token} must come first", "INCOMPLETE")
+        layers, self.committed = self._staged, token
+        self.drop()
+        return layers
+
+    def drop(self) -> None:
+        """Discard what is not committed."""
+        self._parts, self._staged = Assembly(), None
+
+    def forget(self) -> None:
+        """Discard all, with the token committed last."""
+        self.drop()
+        self.committed = 0
+
+    def _under_way(self, now: float) -> int:
+        """Return the token of the set that is collected or staged, 0 for none."""
+        if now - self._parts.began > STAGED_LIFE:
+            self.drop()
+        return self._parts.token
+
+    def _checked(self, stream: Sequence[int]) -> Layers:
+        if len(stream) > self.capabilities["set_words"]:
+            room = self.capabilities["set_words"]
+            raise Refusal(f"a set must have at most {room} words", "BAD_LENGTH")
+        return unpack_layers(stream, self.capabilities)
+
+
+def derated(layers: Sequence[LayerSet], factor: float) -> tuple[LayerSet, ...]:
+    """Return the layers with all levels, also of knots, times a factor."""
+
+    def command_of(command: Command) -> Command:
+        return replace(
+            command,
+            level=round(command.level * factor),
+            onset=command.onset and command.onset.scaled(factor),
+            ending=command.ending and command.ending.scaled(factor),
+        )
+
+    return tuple(
+        replace(layer, commands=tuple(map(command_of, layer.commands))) for layer in layers
+    )
+
 
 SILENCING_RAMP = 0.005  # s; a fault must be silent 5 ms after the watchdog expires
 _FAULTS_KEPT = 16

@@ -13,8 +13,7 @@ from drivers.playing.voices import Transition, Voice
 from model.rig.rig import Channel, Rig
 from plate_in_time import lock_in
 from sim.amplifier.readings import AmplifierClock, Crystal
-from sim.bench.bench import Bench
-from sim.bench.straight_clocks import WRONG, StraightClocks
+from sim.bench.bench import WRONG, Bench, StraightClocks
 from sim.plant.imperfections import Imperfections
 from sim.plant.voiced_base import motion_of
 

@@ -13,7 +13,7 @@ from model.errors import InputError
 from sim.desk.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
-    from sim.control.context import SimulationContext
+    from sim.control import SimulationContext
     from sim.far_ends.opening import Wire
     from sim.plant.accelerometer import Accelerometer
     from sim.process.simulation import Simulation
@@ -123,8 +123,8 @@ def sim(
         from model.config.fields import parse_point
         from model.rig.rig_file import load_rig
         from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
-        from sim.faults.fault_window import FaultFile, load_faults
-        from sim.firmware.processes import find_firmware
+        from sim.faults import FaultFile, load_faults
+        from sim.firmware import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
         from sim.transport.line_kinds import PROMPT

@@ -25,8 +25,7 @@ from model.rig.rig_file import load_rig
 from registry import threads
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
-from sim.control.context import SimulationContext
-from sim.control.server import control_socket
+from sim.control import SimulationContext, control_socket
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line import TwoWayLine

@@ -25,7 +25,7 @@ from registry import threads as clock
 from registry.threads import no_long_collections
 from rig_on_wire import WIRES, HostedRig, rig_on_wire
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultKind, FaultWindow
+from sim.faults import FaultKind, FaultWindow
 from virtual_loop import in_virtual_time
 
 WATCHDOG = 0.25  # s

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from soak import run_seed
 from soak_chain import Trace, run_plan
 from soak_plan import (

@@ -16,7 +16,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.protocol.definition import ahead, clock_at
 from drivers.protocol.records import Values
 from registry import threads
-from sim.firmware.processes import find_firmware, running
+from sim.firmware import find_firmware, running
 
 _JUDGED = 10  # exchanges with the shortest times: one in so many
 

@@ -10,7 +10,7 @@ from drivers.protocol.sets import is_last
 from registry import threads
 from sim.amplifier.readings import AMBIENT, DERATE_ABOVE, FAULT_ABOVE
 from sim.bench.bench import Bench
-from sim.faults.fault_window import Faults, FaultWindow
+from sim.faults import Faults, FaultWindow
 
 
 class AmplifierDevice:

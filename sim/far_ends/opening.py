@@ -26,7 +26,7 @@ from sim.far_ends.can_bus.adapters import BUS_NAME, SlcanAdapter, SocketcandClie
 from sim.far_ends.can_bus.bus import BusNodes, CanBus
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.faults.fault_window import Faults
+from sim.faults import Faults
 from sim.transport.far_end import HOST, TcpEnd, TerminalEnd
 from sim.transport.line_kinds import LINE_NAMES, PROMPT, delays_of
 

@@ -17,11 +17,10 @@ from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
-from sim.control.context import SimulationContext
-from sim.control.server import control_socket
+from sim.control import SimulationContext, control_socket
 from sim.far_ends.opening import Wire, open_wires
-from sim.faults.fault_window import FaultFile
-from sim.firmware.processes import FirmwareBench, running
+from sim.faults import FaultFile
+from sim.firmware import FirmwareBench, running
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Position
 from sim.plant.imperfections import Imperfections

@@ -8,7 +8,7 @@ from rich.text import Text
 from model.arrays import FloatArray, lattice
 from model.vibration import G
 from sim.bench.bench import Bench
-from sim.control.context import SimulationContext
+from sim.control import SimulationContext
 
 WINDOW = 0.2  # s; of the peaks shown for fingers
 _SHADES = " ·-+*#@"

@@ -11,7 +11,7 @@ from drivers.errors import LinkError
 from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.faults.fault_window import Faults
+from sim.faults import Faults
 from sim.transport.line import TwoWayLine
 from sim.transport.line_kinds import LineDelays
 from sim.transport.pseudo_terminal import make_terminal

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 from registry import threads
-from sim.faults.fault_window import Faults, Toward
+from sim.faults import Faults, Toward
 from sim.transport.line_kinds import LineDelays
 
 _PIECE = 0.01  # s; of the wire's time, of what arrives at once

@@ -42,7 +42,7 @@ from daemon_process import (
 )
 from examples.make_touches import tuio_datagram
 from kills import PLACES, kill_everywhere
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from tuio_messages import free_port, panel
 
 pytestmark = pytest.mark.real_time

@@ -17,7 +17,7 @@ from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from gateway_bench import UNCONFIRMED, RawWebSocket, ScriptedDaemon, gateway_process
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 

@@ -34,7 +34,7 @@ from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 
 NAMES = ("a", "b", "c", "d")

@@ -19,7 +19,7 @@ from registry import threads
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import LIMITS, layer, make_bench
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from sim.memory_line import MemoryPort
 from virtual_loop import in_virtual_time
 

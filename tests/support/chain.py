@@ -28,7 +28,7 @@ from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultKind, FaultWindow
+from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections
 from sim.witness_relay import parse_endpoint
 from witness_config import LoopWitness

@@ -24,7 +24,7 @@ from drivers.protocol.records import Refusal, Values
 from model.vibration import Tone
 from registry import threads
 from set_chain import FINGER, OTHER
-from sim.faults.fault_window import FaultKind
+from sim.faults import FaultKind
 from virtual_loop import run_virtual
 
 Step = str | Mapping[str, Any]

@@ -28,8 +28,7 @@ from sim.far_ends.opening import Wire
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Felt
 from sim.plant.imperfections import draw_imperfections
-from sim.sensors.recorder import Accelerometers
-from sim.sensors.recording import Recording
+from sim.sensors import Accelerometers, Recording
 from virtual_loop import run_virtual
 
 Place = tuple[float, float]

@@ -30,7 +30,7 @@ from drivers.protocol.definition import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultKind, FaultWindow, Toward
+from sim.faults import FaultKind, FaultWindow, Toward
 from virtual_loop import Stuck, VirtualLoop, run_virtual
 
 _SHARED = ("a", "b")

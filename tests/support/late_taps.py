@@ -28,7 +28,7 @@ from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import run_virtual
 
 WIRES: Mapping[str, Wire] = {

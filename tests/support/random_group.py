@@ -19,7 +19,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.opening import Wire
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import VirtualLoop
 
 _CHANNELS, _LAYERS = 2, 4

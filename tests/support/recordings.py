@@ -8,7 +8,7 @@ import numpy as np
 import pyuff
 from scipy.io import wavfile
 
-from sim.sensors.recording import Recording
+from sim.sensors import Recording
 
 
 def read_recording(path: Path) -> Recording:

@@ -22,7 +22,7 @@ from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.opening import Wire, open_wires
-from sim.faults.fault_window import Faults
+from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
 from virtual_loop import VirtualLoop
 

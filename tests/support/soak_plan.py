@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from sim.faults.fault_window import FaultKind, FaultWindow
+from sim.faults import FaultKind, FaultWindow
 from sim.transport.line_kinds import PROMPT
 
 KINDS: Mapping[str, Sequence[int | None]] = {

@@ -16,7 +16,7 @@ from drivers.judge.watching.config import (
 from plate_witness import OperatorCommand, PlateTimes, PlateWitness
 from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from sim.witness_relay import parse_endpoint
 from virtual_loop import VirtualLoop
 

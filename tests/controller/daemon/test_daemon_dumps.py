@@ -20,7 +20,7 @@ from controller.operation.dumps import (
 )
 from courses import Planted
 from daemon_bench import PLACE, DaemonBench, error_code, holding, ready_daemon, until
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 
 

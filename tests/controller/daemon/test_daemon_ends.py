@@ -29,7 +29,7 @@ from drivers.host.amplifier import WATCHDOG
 from registry import threads
 from rig_files import TWO_AMPLIFIERS
 from several_fingers import answers_take
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)

@@ -25,7 +25,7 @@ from daemon_bench import (
     until_state,
 )
 from rig_files import TWO_AMPLIFIERS
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 
 

@@ -30,7 +30,7 @@ from drivers.errors import LinkError
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
 from registry import threads
-from sim.faults.fault_window import FaultWindow
+from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 
 FIGURES = ("contrast_db", "transient_contrast_db", "level_db_sl")

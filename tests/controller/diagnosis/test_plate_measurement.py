@@ -34,7 +34,7 @@ from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifier
 from sim.bench import bench
 from sim.far_ends.opening import Wire
 from sim.plant.accelerometer import Accelerometer
-from sim.sensors.recorder import Accelerometers
+from sim.sensors import Accelerometers
 from virtual_loop import run_virtual
 
 TONES = np.arange(60.0, 480.0, 35.0)

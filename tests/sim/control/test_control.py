@@ -18,9 +18,7 @@ from drivers.playing.contents import Tone
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.bench.bench import Bench
-from sim.control.context import SimulationContext
-from sim.control.operations import carry_out
-from sim.control.server import LINE_MAX, control_socket
+from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
 from sim.plant.imperfections import Imperfections, PlateErrors
 
 

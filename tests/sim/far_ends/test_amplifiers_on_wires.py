@@ -24,7 +24,7 @@ from rig_on_wire import (
     rig_on_wire,
 )
 from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
-from sim.faults.fault_window import FaultKind, FaultWindow
+from sim.faults import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 
 DEFAULTS = Wire("serial")

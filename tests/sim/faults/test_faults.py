@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from model.errors import InputError
-from sim.faults.fault_window import FaultKind, Faults, FaultWindow, load_faults
+from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.process.virtual_time import STEP, SteppedLoop
 from sim.transport.line import Line
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from model.errors import InputError
-from sim.firmware import processes
-from sim.firmware.processes import ending_with_parent, frequencies_in
+from sim import firmware
+from sim.firmware import ending_with_parent, frequencies_in
 
 RATE = 16_000.0
 
@@ -37,17 +37,17 @@ def test_missing_firmware_is_told_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a checkout the command that builds it, elsewhere that a checkout is needed."""
-    monkeypatch.setattr(processes, "FOLDER", tmp_path / "out" / "firmware")
+    monkeypatch.setattr(firmware, "FOLDER", tmp_path / "out" / "firmware")
     with pytest.raises(InputError, match="checkout"):
-        processes.find_firmware()
+        firmware.find_firmware()
     (tmp_path / "firmware").mkdir()
     with pytest.raises(InputError, match="make firmware"):
-        processes.find_firmware()
+        firmware.find_firmware()
 
 
 PARENT = """
 import subprocess, sys, time
-from sim.firmware.processes import ending_with_parent
+from sim.firmware import ending_with_parent
 child = [sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"]
 subprocess.Popen(ending_with_parent(child))
 time.sleep(60)

@@ -21,7 +21,7 @@ from model.rig.rig_file import example_rig_path
 from recordings import read_recording
 from rig_files import write_rig
 from sim.bench.bench import Bench
-from sim.control.context import SimulationContext
+from sim.control import SimulationContext
 from sim.process.view import PlateView, draw
 
 ROOT = example_rig_path().parent.parent

@@ -14,8 +14,7 @@ from model.rig.rig import Rig
 from recordings import read_recording
 from sim.bench.bench import Bench
 from sim.plant.accelerometer import Accelerometer, readings
-from sim.sensors.recorder import Recorder
-from sim.sensors.recording import Recording, write_recording
+from sim.sensors import Recorder, Recording, write_recording
 
 RATE = 5000.0
 
@@ -110,7 +109,7 @@ def test_recorder_stops_at_its_maximum_size(
     coarse_rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Further samples are dropped, and is_full is set."""
-    monkeypatch.setattr("sim.sensors.recorder.max_values", lambda path: 1000)
+    monkeypatch.setattr("sim.sensors.max_values", lambda path: 1000)
     bench = Bench(coarse_rig, now=0.0)
     sensors = [Accelerometer("P1", 0.1, 0.08), Accelerometer("P2", 0.1, 0.1)]
     recorder = Recorder(bench, tmp_path / "run.csv", sensors=sensors, fingers=[])

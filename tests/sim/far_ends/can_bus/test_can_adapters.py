@@ -12,7 +12,7 @@ from model.rig.rig import Rig
 from rig_on_wire import make_bench
 from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
 from sim.far_ends.can_bus.bus import CanBus
-from sim.faults.fault_window import Faults
+from sim.faults import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd
 
 TIMEOUT = 60.0  # s; for a loaded machine, not an expectation

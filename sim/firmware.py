@@ -1,4 +1,6 @@
-"""The firmware as a process for each amplifier, and a bench whose plate is moved by its samples.
+"""The project's firmware in the place of simulated amplifiers: its samples move the plate.
+
+The firmware as a process for each amplifier, and a bench whose plate is moved by its samples.
 
 `make firmware` builds it from the sources of a checkout; it is not part of the wheel.
 """

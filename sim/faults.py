@@ -1,4 +1,6 @@
-"""Fault windows: which fault is active on an amplifier or its wire, and when; and files of them:
+"""Fault injection into amplifiers and wires.
+
+Fault windows: which fault is active on an amplifier or its wire, and when; and files of them:
 
 seed: 7                      # makes faults reproducible
 faults:

@@ -1,0 +1,641 @@
+"""Control of a running simulation over a socket: fingers, sensors, faults and time.
+
+What requests of the control socket must hold; other keys are ignored unless a form says so.
+
+The running simulation: its bench, devices, sensors and recording.
+
+Control operations on fingers, sensors, recordings and the plate.
+
+Operations of the control socket, version 3: one JSON object per line in each direction.
+
+    {"op": "hello"}                            {"protocol": "era-sim-control", "version": 3,
+                                                "clock": "wall" or "virtual", "ops": [...],
+                                                "urls": {NAME: URL}}
+    {"op": "state"}                            {"time_s": t, "fingers": {ID: [x, y]},
+                                                "amplifiers": {NAME: {"state", "fault", "token",
+                                                "high_voltage", "levels"}}}
+
+    fingers, positions [x, y] in metres
+    {"op": "fingers", "fingers": {ID: [x, y]}, "observers": [ID, ...], "loads": {ID: factor}}
+                                               replace all fingers; observers load nothing, others
+                                               as the rig's fingertip times their load:
+                                               {"ok": true, "time_s"}
+    {"op": "touch", "finger": ID, "at_m": [x, y], "load": factor}      add one; "move": move one
+    {"op": "lift", "finger": ID}                       remove one
+    {"op": "felt", "since_s": t0, "until_s": t1}
+        {"fingers": {ID: {"points_m": [[x, y], ...], "weights": [one per point, sum 1],
+                          "frequencies_hz": [f, ...],
+                          "amplitude_m_s2": [[one per point], one row per frequency],
+                          "peak_m_s2": [one per point]}}}
+
+    sensors
+    {"op": "sensors", "sensors": {NAME: {"at_m": [x, y], "noise_m_s2_rthz", "reach_m_s2",
+                                         "resolution_m_s2", "scale"}}}
+                                                       replace all sensors; only at_m is required
+    {"op": "signals", "since_s": t0, "until_s": t1}    {"sample_rate_hz", "start_s",
+                                                        "sensors": {NAME: {"at_m", "m_s2": [...]}}}
+    {"op": "tones", "since_s", "until_s", "frequencies_hz": [f, ...]}
+        {"sensors": {NAME: {"at_m", "real_m_s2": [one per frequency], "imag_m_s2": [...]}}}
+        least squares over the signals; Im[a exp(i omega t)], t on the simulation's clock
+
+    {"op": "plate", "modulus": factor, "stiffness": {ERA: factor}, "masses": [[x, y, kg], ...]}
+                                               change the plate as it was at first, at rest; a key
+                                               left out is as at first: {"ok": true, "time_s"}
+
+    {"op": "inject_fault", "fault": ..., "lasts": ..., ...}   keys as in a fault file, begins now
+    {"op": "faults"}                                   {"faults": {NAME: [{"fault", "begin_s",
+                                                           "end_s" or null, "is_on"}]}}
+    {"op": "recover", "amplifier": NAME}               end all faults; of all without a name
+    {"op": "step", "seconds": s}                       advance virtual time: {"time_s": t}
+    {"op": "record", "file": PATH}                     record the present sensors and fingers
+    {"op": "finish"}                                   write it: {"file", "seconds", "is_full"}
+
+Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. Felt, signals
+and tones cover the last ten seconds. An invalid request returns {"error": TEXT}
+and changes nothing.
+
+The control socket: JSON lines over a Unix socket that only its owner may open.
+
+The operations are documented in `sim.control`.
+"""
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import socket
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Collection,
+    Coroutine,
+    Mapping,
+    Sequence,
+)
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeAlias, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from drivers.errors import LinkError
+from model.answer.stimulus import check_on_plate
+from model.errors import InputError
+from model.structure.attachments import PointLoad
+from registry import threads
+from registry.wording import first_problem
+from sim.bench.amplifier_device import AmplifierDevice
+from sim.bench.bench import Bench
+from sim.faults import parse_fault
+from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Position, measure_vibration
+from sim.plant.imperfections import PlateErrors
+from sim.sensors import Accelerometers, Recorder, Recording
+
+Request: TypeAlias = dict[str, Any]
+
+_MAX_STEP = 3600.0  # s of virtual time in one request
+_MAX_TONES = 64
+_MAX_KEY = 60  # characters of a key in an error
+_At = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]  # [x, y] in m
+_Positive = Annotated[FiniteFloat, Field(gt=0)]
+_Mass = Annotated[tuple[FiniteFloat, FiniteFloat, _Positive], Field(strict=False)]
+
+
+class _Form(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True)
+
+
+_T = TypeVar("_T", bound=_Form)
+
+
+def read(form: type[_T], request: Request) -> _T:
+    """Read a request by its form; raises InputError with the key."""
+    try:
+        return form.model_validate(request)
+    except ValidationError as error:
+        key, problem = first_problem(error)
+        raise InputError(f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")) from None
+
+
+class Fingers(_Form):
+    """All fingers: positions, those without weight, and loads times that of the rig's fingertip."""
+
+    fingers: dict[str, _At]
+    observers: list[str] = []
+    loads: dict[str, FiniteFloat] = {}
+
+    @model_validator(mode="after")
+    def _are_of_fingers(self) -> Self:
+        if not {*self.observers, *self.loads} <= self.fingers.keys():
+            raise ValueError("observers and loads must be of these fingers")
+        return self
+
+
+class Finger(_Form):
+    """One finger by its id."""
+
+    finger: Annotated[str, Field(min_length=1, max_length=40)]
+
+
+class Touch(Finger):
+    """One finger, where it is, and its load if it has another one."""
+
+    at_m: _At
+    load: FiniteFloat | None = None
+
+
+class Window(_Form):
+    """A window of time [s]."""
+
+    since_s: FiniteFloat
+    until_s: FiniteFloat
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if self.since_s >= self.until_s:
+            raise ValueError("since_s must be less than until_s")
+        return self
+
+
+class Tones(Window):
+    """Frequencies [Hz] within a window."""
+
+    frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)]
+
+
+class Sensor(_Form):
+    """A place, and fields of an `Accelerometer`; nothing else."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    at_m: _At
+    noise_density: FiniteFloat = Field(0.0, alias="noise_m_s2_rthz")
+    reach: FiniteFloat = Field(0.0, alias="reach_m_s2")
+    resolution: FiniteFloat = Field(0.0, alias="resolution_m_s2")
+    scale: FiniteFloat = 1.0
+
+
+class Sensors(_Form):
+    """All sensors by name."""
+
+    sensors: dict[str, Sensor]
+
+
+class File(_Form):
+    """A file to record to."""
+
+    file: Annotated[str, Field(min_length=1)]
+
+
+class PlateChange(_Form):
+    """Factors of the plate as it was at first, and masses [x, y, kg]; nothing else."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    op: str
+    modulus: _Positive = 1.0
+    stiffness: dict[str, _Positive] = {}
+    masses: list[_Mass] = []
+
+
+class Step(_Form):
+    """Virtual time to go on by [s]."""
+
+    seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
+
+
+@dataclass
+class SimulationContext:
+    """A bench with its devices on wires and their URLs, both by name.
+
+    step: advances virtual time [s], None in real time; recorder: None while nothing is recorded.
+    """
+
+    bench: Bench
+    devices: Mapping[str, AmplifierDevice] = field(default_factory=dict)
+    urls: Mapping[str, str] = field(default_factory=dict)
+    step: Callable[[float], Coroutine[Any, Any, None]] | None = None
+    recorder: Recorder | None = None
+    accelerometers: Accelerometers = field(init=False)
+    first_plate: PlateErrors = field(init=False)
+    _solving: asyncio.Task[None] | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        """Start without sensors, from the plate as it is."""
+        self.accelerometers = Accelerometers(self.bench)
+        self.first_plate = self.bench.imperfections.plate
+
+    def start_solving(self) -> None:
+        """Solve the plate under the newest fingers in a thread, so that amplifiers go on replying.
+
+        At once in virtual time.
+        """
+        if self.step is not None:
+            return  # the first who reads the plate solves it
+        if self._solving is None or self._solving.done():
+            self._solving = asyncio.create_task(self.solved(math.inf), name="solve the plate")
+
+    async def solved(self, until: float) -> None:
+        """Solve the plate under the fingers up to a time [s], or wait until it is."""
+        while (placement := self.bench.unsolved) is not None and placement.time <= until:
+            # An error is raised once more where the plate is read.
+            await asyncio.gather(asyncio.to_thread(placement.solved), return_exceptions=True)
+
+    async def stop_solving(self) -> None:
+        """Leave what is unsolved."""
+        if self._solving is not None:
+            self._solving.cancel()
+            await asyncio.wait({self._solving})
+
+    def record(self, path: Path) -> None:
+        """Start recording the present sensors and fingers; InputError while another one runs."""
+        if self.recorder is not None:
+            raise InputError(f"already recording {self.recorder.path}; finish it first")
+        self.recorder = Recorder(
+            self.bench,
+            path,
+            sensors=self.accelerometers.sensors,
+            fingers=tuple(self.bench.fingers.layout.positions),
+        )
+
+    def stop_recording(self) -> Recorder:
+        """Stop recording; returns the recorder to be finished. InputError if there is none."""
+        recorder, self.recorder = self.recorder, None
+        if recorder is None:
+            raise InputError("no recording is running")
+        recorder.stop()
+        return recorder
+
+    def devices_of(self, amplifier: str | None) -> Sequence[AmplifierDevice]:
+        """The device of an amplifier, or all devices; InputError for an unknown name."""
+        if amplifier is None:
+            return tuple(self.devices.values())
+        if amplifier not in self.devices:
+            known = ", ".join(self.devices) or "(none on a wire)"
+            raise InputError(f"amplifier must be one of {known}, got {str(amplifier)[:40]!r}")
+        return (self.devices[amplifier],)
+
+    async def finish_recording(self) -> str | None:
+        """Write the running recording; returns a message about it, None where there is none."""
+        if self.recorder is None:
+            return None
+        recorder = self.stop_recording()
+        await asyncio.to_thread(recorder.finish)
+        full = " (truncated at its maximum size)" if recorder.is_full else ""
+        return f"wrote {recorder.path}: {recorder.seconds:.1f} s{full}"
+
+
+Response: TypeAlias = dict[str, Any]
+Operation: TypeAlias = Callable[[SimulationContext, Request, float], Awaitable[Response]]
+"""Executes a request at a time [s], or raises InputError and changes nothing."""
+
+
+async def _fingers(context: SimulationContext, request: Request, now: float) -> Response:
+    given = read(Fingers, request)
+    return _placed(context, given.fingers, now, observers=given.observers, loads=given.loads)
+
+
+async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
+    name, bench = read(Finger, request).finger, context.bench
+    if (name in bench.positions) != (request["op"] == "move"):
+        state = "already" if name in bench.positions else "not"
+        raise InputError(f"finger {name!r} is {state} on the plate")
+    given = read(Touch, request)
+    loads = dict(bench.loads)
+    if given.load is not None:
+        loads[name] = given.load
+    positions = {**bench.positions, name: given.at_m}
+    return _placed(context, positions, now, observers=bench.observers, loads=loads)
+
+
+async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
+    name, present = read(Finger, request).finger, context.bench.positions
+    if name not in present:
+        raise InputError(f"finger {name!r} is not on the plate")
+    rest = {id: at for id, at in present.items() if id != name}
+    return _placed(context, rest, now, observers=context.bench.observers, loads=context.bench.loads)
+
+
+def _placed(
+    context: SimulationContext,
+    positions: Mapping[str, Position],
+    now: float,
+    *,
+    observers: Collection[str],
+    loads: Mapping[str, float],
+) -> Response:
+    context.bench.begin_placing(positions, now=now, observers=observers, loads=loads)
+    context.start_solving()
+    return {"ok": True, "time_s": context.bench.time}
+
+
+async def _felt(context: SimulationContext, request: Request, now: float) -> Response:
+    window = read(Window, request)
+    await context.solved(
+        window.until_s
+    )  # in a thread, as the fits below: amplifiers must go on replying
+    context.bench.advance(now)
+    records, frequencies = context.bench.records(window.since_s, window.until_s)
+    felt = {
+        id: await asyncio.to_thread(measure_vibration, record, frequencies)
+        for id, record in records.items()
+    }
+    return {
+        "fingers": {
+            id: {
+                "points_m": one.points.tolist(),
+                "weights": one.weights.tolist(),
+                "frequencies_hz": list(one.frequencies),
+                "amplitude_m_s2": one.amplitude.tolist(),
+                "peak_m_s2": one.peak.tolist(),
+            }
+            for id, one in felt.items()
+        }
+    }
+
+
+async def _sensors(context: SimulationContext, request: Request, now: float) -> Response:
+    sensors = [
+        Accelerometer(name, *each.at_m, **each.model_dump(exclude={"at_m"}, exclude_unset=True))
+        for name, each in read(Sensors, request).sensors.items()
+    ]
+    context.bench.advance(now)
+    context.accelerometers.place(sensors)
+    return {"ok": True, "time_s": context.bench.time}
+
+
+async def _signals(context: SimulationContext, request: Request, now: float) -> Response:
+    recording = _recorded(context, request, now)
+    columns = zip(
+        recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
+    )
+    return {
+        "sample_rate_hz": recording.sample_rate,
+        "start_s": recording.start,
+        "sensors": {name: {"at_m": at, "m_s2": samples} for name, at, samples in columns},
+    }
+
+
+async def _tones(context: SimulationContext, request: Request, now: float) -> Response:
+    frequencies, nyquist = read(Tones, request).frequencies_hz, context.bench.sample_rate / 2
+    if len(set(frequencies)) < len(frequencies) or max(frequencies) >= nyquist:
+        raise InputError(f"frequencies_hz must be different ones below {nyquist:g} Hz")
+    recording = _recorded(context, request, now)
+    # In a thread: a long fit must not delay the amplifiers' replies.
+    phasors = await asyncio.to_thread(recording.tones, frequencies)
+    columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
+    return {
+        "sensors": {
+            name: {"at_m": at, "real_m_s2": a.real.tolist(), "imag_m_s2": a.imag.tolist()}
+            for name, at, a in columns
+        }
+    }
+
+
+def _recorded(context: SimulationContext, request: Request, now: float) -> Recording:
+    window = read(Window, request)
+    context.bench.advance(now)
+    return context.accelerometers.read(window.since_s, window.until_s)
+
+
+async def _record(context: SimulationContext, request: Request, now: float) -> Response:
+    file = read(File, request).file
+    context.bench.advance(now)
+    context.record(Path(file))
+    return {"ok": True, "time_s": context.bench.time}
+
+
+async def _finish(context: SimulationContext, request: Request, now: float) -> Response:
+    context.bench.advance(now)
+    recorder = context.stop_recording()
+    await asyncio.to_thread(recorder.finish)
+    return {
+        "file": str(recorder.path),
+        "seconds": recorder.seconds,
+        "is_full": recorder.is_full,
+    }
+
+
+async def _plate(context: SimulationContext, request: Request, now: float) -> Response:
+    context.bench.change_plate(_changed(context, read(PlateChange, request)), now=now)
+    return {"ok": True, "time_s": context.bench.time}
+
+
+def _changed(context: SimulationContext, change: PlateChange) -> PlateErrors:
+    first, rig = context.first_plate, context.bench.rig
+    names = [era.name for era in rig.eras]
+    if not change.stiffness.keys() <= set(names):
+        raise InputError(f"stiffness must be an object of factors by ERA ({', '.join(names)})")
+    stiffness = {
+        name: first.stiffness.get(name, 1.0) * change.stiffness.get(name, 1.0) for name in names
+    }
+    check_on_plate("a mass", [(x, y) for x, y, _ in change.masses], rig.plate)
+    return replace(
+        first,
+        modulus=first.modulus * change.modulus,
+        stiffness=stiffness,
+        masses=(*first.masses, *(PointLoad(x, y, mass=mass) for x, y, mass in change.masses)),
+    )
+
+
+OPERATIONS: Mapping[str, Operation] = {
+    "fingers": _fingers,
+    "touch": _touch_or_move,
+    "move": _touch_or_move,
+    "lift": _lift,
+    "felt": _felt,
+    "sensors": _sensors,
+    "signals": _signals,
+    "tones": _tones,
+    "record": _record,
+    "finish": _finish,
+    "plate": _plate,
+}
+
+
+VERSION = 3
+
+
+async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
+    """Execute one request line at a time [s]."""
+    try:
+        request = json.loads(line)
+        if not isinstance(request, dict):
+            raise InputError("a line must be a JSON object")
+        op = request.get("op")
+        if not isinstance(op, str) or op not in _OPERATIONS:
+            raise InputError(f"op must be one of {', '.join(_OPERATIONS)}, got {str(op)[:40]!r}")
+        return await _OPERATIONS[op](context, request, now)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return {"error": f"invalid JSON: {error}"}
+    except InputError as error:
+        return {"error": str(error)}
+    except OSError as error:
+        problem = f"{error.filename or 'file'}: cannot be written: {error.strerror}"
+        return {"error": problem if error.strerror else str(error)}
+
+
+async def _hello(context: SimulationContext, request: Request, now: float) -> Response:
+    return {
+        "protocol": "era-sim-control",
+        "version": VERSION,
+        "clock": "wall" if context.step is None else "virtual",
+        "ops": list(_OPERATIONS),
+        "urls": dict(context.urls),
+    }
+
+
+async def _state(context: SimulationContext, request: Request, now: float) -> Response:
+    bench = context.bench
+    bench.advance(now)
+    amplifiers = {}
+    for name, amplifier in bench.amplifiers.items():
+        summary = amplifier.summary(bench.time)
+        amplifiers[name] = {
+            "state": summary.state,
+            "fault": summary.fault,
+            "token": summary.token,
+            "high_voltage": summary.is_high_voltage,
+            "levels": list(summary.levels),
+        }
+    resting = {name: list(position) for name, position in bench.positions.items()}
+    return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
+
+
+async def _inject_fault(context: SimulationContext, request: Request, now: float) -> Response:
+    window = parse_fault({key: value for key, value in request.items() if key != "op"})
+    for device in context.devices_of(window.amplifier):
+        device.inject_fault(window)
+    return {"ok": True, "time_s": now}
+
+
+async def _faults(context: SimulationContext, request: Request, now: float) -> Response:
+    listed = {}
+    for name, device in context.devices.items():
+        begin = device.faults.begin
+        listed[name] = [
+            {
+                "fault": window.fault,
+                "begin_s": begin + window.at,
+                "end_s": begin + window.end if math.isfinite(window.end) else None,
+                "is_on": window.at <= now - begin < window.end,
+            }
+            for window in device.faults.windows
+        ]
+    return {"faults": listed}
+
+
+async def _recover(context: SimulationContext, request: Request, now: float) -> Response:
+    for device in context.devices_of(request.get("amplifier")):
+        device.recover()
+    return {"ok": True, "time_s": now}
+
+
+async def _step(context: SimulationContext, request: Request, now: float) -> Response:
+    seconds = read(Step, request).seconds
+    if context.step is None:
+        raise InputError("step needs virtual time: start era sim with --virtual-time")
+    await context.step(seconds)
+    context.bench.advance(now + seconds)
+    return {"ok": True, "time_s": context.bench.time}
+
+
+_OPERATIONS: Mapping[str, Operation] = {
+    "hello": _hello,
+    "state": _state,
+    **OPERATIONS,
+    "inject_fault": _inject_fault,
+    "faults": _faults,
+    "recover": _recover,
+    "step": _step,
+}
+
+
+LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it
+
+
+@asynccontextmanager
+async def control_socket(context: SimulationContext, path: Path) -> AsyncIterator[None]:
+    """Serve control at a path; raises LinkError where no socket can be created."""
+    sock = _bind(path)
+    loop = asyncio.get_running_loop()
+    clients: dict[asyncio.Task[None], socket.socket] = {}
+
+    def forget(client: asyncio.Task[None]) -> None:
+        clients.pop(client).close()
+
+    def accept() -> None:
+        try:
+            connection, _ = sock.accept()
+        except OSError:  # the client has disconnected already
+            return
+        connection.setblocking(False)
+        client = loop.create_task(_serve_client(context, connection), name=f"control at {path}")
+        clients[client] = connection
+        client.add_done_callback(forget)
+
+    loop.add_reader(sock, accept)
+    try:
+        yield
+    finally:
+        loop.remove_reader(sock)
+        sock.close()
+        await asyncio.to_thread(path.unlink, missing_ok=True)
+        for client in clients:
+            client.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+        await context.stop_solving()
+
+
+async def _serve_client(context: SimulationContext, connection: socket.socket) -> None:
+    """Serve a client line by line until it disconnects."""
+    loop = asyncio.get_running_loop()
+    rest = b""
+    with contextlib.suppress(ConnectionError):
+        while data := await loop.sock_recv(connection, LINE_MAX):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                response = await carry_out(context, line, now=threads.now())
+                await loop.sock_sendall(connection, await asyncio.to_thread(_encode, response))
+            if len(rest) > LINE_MAX:  # the next line cannot be found
+                error = {"error": f"line must be at most {LINE_MAX} bytes"}
+                await loop.sock_sendall(connection, _encode(error))
+                return
+
+
+def _encode(reply: dict[str, Any]) -> bytes:
+    return json.dumps(reply, separators=(",", ":")).encode() + b"\n"
+
+
+def _bind(path: Path) -> socket.socket:
+    """Create a listening socket for the owner only; a stale one is replaced."""
+    sock = socket.socket(socket.AF_UNIX)
+    mask = os.umask(0o177)
+    try:
+        if path.is_socket() and _is_dead(path):
+            path.unlink()
+        sock.bind(str(path))
+        sock.listen()
+        sock.setblocking(False)
+    except OSError as error:
+        sock.close()
+        raise LinkError(
+            f"{path}: cannot create control socket: {error.strerror or error}; give an unused path "
+            "of under 100 characters in a writable folder"
+        ) from error
+    finally:
+        os.umask(mask)
+    return sock
+
+
+def _is_dead(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return True
+    return False

@@ -1,1 +1,0 @@
-"""The project's firmware in the place of simulated amplifiers: its samples move the plate."""

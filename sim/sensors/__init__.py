@@ -1,1 +1,0 @@
-"""Virtual accelerometers, recordings, and measures of their signals."""

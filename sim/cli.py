@@ -14,7 +14,7 @@ from sim.desk.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
     from sim.control import SimulationContext
-    from sim.far_ends.opening import Wire
+    from sim.far_ends.wire_assignment import Wire
     from sim.plant.accelerometer import Accelerometer
     from sim.process.simulation import Simulation
     from sim.process.view import PlateView
@@ -122,7 +122,7 @@ def sim(
     with exit_on_signal():
         from model.config.fields import parse_point
         from model.rig.rig_file import load_rig
-        from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
+        from sim.far_ends.wire_assignment import Wire, assign_wires, choose_lines, links_of
         from sim.faults import FaultFile, load_faults
         from sim.firmware import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections

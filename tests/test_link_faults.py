@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from registry import threads as clock
 from registry.threads import no_long_collections
 from rig_on_wire import WIRES, HostedRig, rig_on_wire
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow
 from virtual_loop import in_virtual_time
 

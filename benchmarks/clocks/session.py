@@ -19,7 +19,7 @@ from drivers.protocol.definition import CLOCK_TURN, FEATURES
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import draw_imperfections
 
 _rig_on_wire: Any = support("rig_on_wire")

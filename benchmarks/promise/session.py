@@ -36,7 +36,7 @@ from controller.play.observer import PlayReport
 from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.line_kinds import PROMPT
 

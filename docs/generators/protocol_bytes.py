@@ -18,7 +18,7 @@ from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import More, Wire
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 

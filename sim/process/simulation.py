@@ -18,7 +18,7 @@ from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket
-from sim.far_ends.opening import Wire, open_wires
+from sim.far_ends.wire_assignment import Wire, open_wires
 from sim.faults import FaultFile
 from sim.firmware import FirmwareBench, running
 from sim.plant.accelerometer import Accelerometer

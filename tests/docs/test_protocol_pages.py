@@ -16,7 +16,7 @@ from drivers.playing.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from protocol_bytes import BYTES
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.word_objects import ObjectServer
+from sim.far_ends.can_amplifiers import ObjectServer
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
 

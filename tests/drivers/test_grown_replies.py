@@ -16,7 +16,7 @@ from hand_written_talk import HALF, Talk
 from judged_line import judged
 from protocol_tables import records
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.word_objects import ObjectServer, SdoAbort
+from sim.far_ends.can_amplifiers import ObjectServer, SdoAbort
 from virtual_loop import in_virtual_time
 from words_line import KINDS, MemoryLine, group_of
 

@@ -33,7 +33,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from set_table import SetTable, make_rig
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
 from virtual_loop import in_virtual_time
 

@@ -28,7 +28,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.witness_relay import parse_endpoint, relays
 from virtual_loop import in_virtual_time
 from witness_config import witness_config

@@ -27,7 +27,7 @@ from registry import threads
 from rig_on_wire import FarSide, far_side
 from set_table import SetTiming
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections
 from sim.witness_relay import parse_endpoint

@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads
 from sim.amplifier.readings import AmplifierSummary
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.plant.accelerometer import Accelerometer
 from sim.plant.fingers import Felt
 from sim.plant.imperfections import draw_imperfections

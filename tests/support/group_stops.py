@@ -29,7 +29,7 @@ from drivers.host.dialogue import SILENCING, Stopped
 from drivers.protocol.definition import BOOT_TIME
 from random_group import RandomGroup
 from rig_on_wire import after_each
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow, Toward
 from virtual_loop import Stuck, VirtualLoop, run_virtual
 

@@ -11,7 +11,7 @@ from drivers.judge.asking import CHECKS, LEVEL, CheckResult, of_kind
 from drivers.judge.asking import CLIENTS as BY_PROTOCOL
 from drivers.judge.asking.check import run_checks
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.can_amplifiers import CanAmplifiers
 from virtual_loop import run_virtual
 from words_line import KINDS as WIRES
 from words_line import FarEnd

@@ -39,7 +39,7 @@ from daemon_process import (
 from model.rig.rig_file import load_rig
 from rig_files import TWO_AMPLIFIERS, write_rig
 from rig_on_wire import WIRES, far_side
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 
 READY = "READY_TO_SWITCH_ON"
 LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life

@@ -27,7 +27,7 @@ from model.rig.rig import Channel
 from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
 from virtual_loop import run_virtual
 

@@ -18,7 +18,7 @@ from drivers.protocol.sets import Envelope
 from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
 from virtual_loop import VirtualLoop
 

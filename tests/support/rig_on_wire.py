@@ -21,7 +21,7 @@ from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
-from sim.far_ends.opening import Wire, open_wires
+from sim.far_ends.wire_assignment import Wire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
 from virtual_loop import VirtualLoop
@@ -124,7 +124,7 @@ WIRES: Mapping[str, Wire] = {
     "can+socketcand": Wire("socketcand", unpluggable=True),
     "can+slcan": Wire("slcan", unpluggable=True),
 }
-"""Each is far end and host by one scheme; see `sim.far_ends.opening`."""
+"""Each is far end and host by one scheme; see `sim.far_ends.wire_assignment`."""
 
 SHARED_WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", shared=True),

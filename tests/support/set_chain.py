@@ -10,7 +10,7 @@ from chain import Chain
 from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 
 Made = TypeVar("Made", bound=Chain)
 

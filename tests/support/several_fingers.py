@@ -35,7 +35,7 @@ from model.table.table_file import build_table
 from paper_table import smooth_rig
 from registry import threads
 from rig_on_wire import after_each
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from virtual_loop import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)

@@ -21,7 +21,7 @@ from drivers.judge.watching.config import TimeLimits
 from plate_witness import PlateTimes
 from registry import threads
 from rig_on_wire import after_each
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.line_kinds import LINE_KINDS, PROMPT
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence

@@ -65,7 +65,7 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 @dataclass(frozen=True)
 class Line:
-    """A wire: kind and kind of line as `sim.far_ends.opening` has them, and speed [bit/s]."""
+    """A wire: kind and kind of line as `sim.far_ends.wire_assignment` has them, and speed [bit/s]."""
 
     kind: str
     speed: int | None

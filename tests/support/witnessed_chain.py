@@ -23,7 +23,7 @@ from plate_witness import OperatorCommand
 from registry import threads
 from registry.limits import GuardLimits
 from set_table import STROKE, SetTable, make_rig
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from virtual_loop import run_virtual
 
 SENSED_EVERY = 0.001  # s

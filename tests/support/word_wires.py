@@ -18,9 +18,13 @@ from rig_on_wire import make_bench
 from set_table import make_rig
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
-from sim.far_ends.can_bus.amplifiers import CanAmplifiers
-from sim.far_ends.can_bus.bus import BusNodes, CanBus
+from sim.far_ends.can_amplifiers import (
+    BusNodes,
+    CanAmplifiers,
+    CanBus,
+    SlcanAdapter,
+    SocketcandClient,
+)
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import TcpEnd, TerminalEnd

@@ -22,7 +22,7 @@ from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_loop import run_virtual

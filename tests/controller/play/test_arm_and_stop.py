@@ -19,7 +19,7 @@ from model.rig.rig import Channel
 from newest_contact import BuzzNewestContact
 from set_chain import FINGER, OTHER, set_chain, set_running
 from set_table import SetTiming
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from small_table import small_problem, small_table
 from virtual_loop import in_virtual_time
 

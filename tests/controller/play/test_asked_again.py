@@ -26,7 +26,7 @@ from paper_table import contact_sets, smooth_rig
 from rig_on_wire import on_two_amplifiers
 from several_fingers import LEFT, RIGHT
 from several_fingers import table as paper_table
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from virtual_loop import in_virtual_time, run_virtual
 
 BUS = Wire("serial", speed=921_600, shared=True, line_kind="prompt")

@@ -33,7 +33,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from virtual_loop import run_virtual
 
 _logger = logging.getLogger(__name__)

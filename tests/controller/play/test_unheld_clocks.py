@@ -24,7 +24,7 @@ from model.table.table_file import build_table
 from paper_table import smooth_rig
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.readings import Crystal
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import draw_imperfections
 from virtual_loop import in_virtual_time
 

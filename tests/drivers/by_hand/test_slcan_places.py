@@ -13,8 +13,7 @@ from drivers.by_hand import reaching
 from drivers.by_hand.cli import app
 from drivers.by_hand.reaching import Candidate, detect_slcan
 from drivers.wires.can_frames import CanFrame
-from sim.far_ends.can_bus.adapters import SlcanAdapter
-from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter
 from sim.transport.pseudo_terminal import make_terminal
 
 SPOKEN = b"V\rC\rS6\rL\rC\r"

@@ -23,7 +23,7 @@ from rig_on_wire import (
     on_two_amplifiers,
     rig_on_wire,
 )
-from sim.far_ends.opening import Wire, assign_wires, choose_lines, links_of
+from sim.far_ends.wire_assignment import Wire, assign_wires, choose_lines, links_of
 from sim.faults import FaultKind, FaultWindow
 from virtual_loop import VirtualLoop, in_virtual_time
 

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from long_form import in_turn, shortly
 from plate_witness import RULES
 from random_group import RandomGroup
-from sim.far_ends.opening import Wire
+from sim.far_ends.wire_assignment import Wire
 from virtual_loop import run_virtual
 from witnessed_chain import SCENARIOS, WITNESSED, play
 

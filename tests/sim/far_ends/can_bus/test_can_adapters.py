@@ -10,8 +10,7 @@ import pytest
 from drivers.wires.can_frames import CanFrame
 from model.rig.rig import Rig
 from rig_on_wire import make_bench
-from sim.far_ends.can_bus.adapters import SlcanAdapter, SocketcandClient
-from sim.far_ends.can_bus.bus import CanBus
+from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter, SocketcandClient
 from sim.faults import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd
 

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.wires.can_frames import CanFrame, pack_frames, unpack_frames
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.can_bus.amplifiers import CanAmplifiers
+from sim.far_ends.can_amplifiers import CanAmplifiers
 
 START = (0x000, "0100")
 ARM = ((0x201, "010003033412fa00"), (0x201, "0101000000000000"))  # session 1234, 250 ms

@@ -22,8 +22,7 @@ from drivers.wires.can_frames import BITRATE
 from drivers.wires.known import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.far_ends.can_bus.adapters import BUS_NAME, SlcanAdapter, SocketcandClient
-from sim.far_ends.can_bus.bus import BusNodes, CanBus
+from sim.far_ends.can_amplifiers import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults import Faults

@@ -1,0 +1,596 @@
+"""The amplifiers' side of CAN: a bus, CANopen nodes and adapters.
+
+Objects of an amplifier, read and written by SDO (CiA 301).
+
+2000 has the identity: four texts, then the versions. 2001 and 2002 have the words of the replies to
+GetCaps and GetStatus, a subindex each. Uploads are expedited and segmented, downloads expedited;
+others are refused, since nothing longer than four bytes can be written.
+
+The amplifiers' side of a CAN bus, without I/O.
+
+Frames come and go packed (`drivers.wires.can_frames`), those of a message together.
+
+A CAN bus within this process: a frame of one member is received by all others, at one time.
+
+Not modelled: arbitration, retransmission, bus-off.
+
+Simulated CAN adapters: LAWICEL's serial ASCII commands (slcan), and socketcand over TCP.
+
+Commands of slcan end with CR; replies are CR, or BELL for errors; elements of socketcand are
+`< ... >`. Not modelled: acceptance masks, time stamps and polling, which are accepted without
+effect; modes other than raw mode, extended identifiers, discovery by broadcast.
+"""
+
+import asyncio
+import re
+import struct
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+
+from drivers.errors import WireCounters
+from drivers.protocol.definition import (
+    BY_NUMBER,
+    EVENT,
+    EVENT_RECORD,
+    FAULTS,
+    HELLO,
+    IDENTITY,
+    MESSAGES,
+    NAK,
+    QUANTITIES,
+    TEXTS,
+    nak_of,
+    name_of,
+    read_request,
+)
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import is_earlier_part
+from drivers.wires.can_frames import (
+    BLOCK,
+    CANOPEN,
+    NODE_MAX,
+    REPLY,
+    REQUEST,
+    SLCAN,
+    SOCKETCAND,
+    Assembler,
+    CanFrame,
+    Message,
+    cob_id,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
+from registry import threads
+from sim.amplifier.simulated_amplifier import SILENCING_RAMP
+from sim.bench.amplifier_device import AmplifierDevice
+from sim.transport.far_end import AmplifierPort, FarEnd, Send, Served
+from sim.transport.line import TwoWayLine
+
+TOGGLE = 0x0503_0000
+UNKNOWN_COMMAND = 0x0504_0001
+READ_ONLY = 0x0601_0002
+NO_OBJECT = 0x0602_0000
+BAD_LENGTH = 0x0607_0010
+NO_SUBINDEX = 0x0609_0011
+_DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 1, 2, 3, 4  # in the highest three bits
+_EXPEDITED = 2
+
+
+class SdoAbort(Exception):
+    """Aborts a transfer with a code, its only argument."""
+
+
+_NAMES = {index: name for name, index in CANOPEN["objects"].items()}
+"""Of objects by their index."""
+
+
+class ObjectServer:
+    """The objects of an amplifier at a node, served to one client.
+
+    heartbeat: its interval [ms], 0 for none; the one object that can be written.
+    """
+
+    def __init__(self, amplifier: AmplifierPort, node: int) -> None:
+        self._amplifier = amplifier
+        self._node = node
+        self.heartbeat: int = CANOPEN["heartbeat_ms"]
+        self._object = (0, 0)
+        self._rest: bytes | None = None  # of an upload
+        self._toggle = 0
+
+    def reply(self, data: bytes, now: float) -> bytes:
+        """Return the reply to a request at a time [s]; none to frames of other than eight bytes."""
+        if len(data) != BLOCK:
+            return b""
+        command = data[0] >> 5
+        try:
+            if command in (_DOWNLOAD, _UPLOAD):
+                self._rest = None
+                self._object = struct.unpack_from("<HB", data, 1)
+            if command == _DOWNLOAD and data[0] & _EXPEDITED:
+                length = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
+                self._write(*self._object, data[4 : 4 + length], now)
+                return struct.pack("<BHB4x", 0x60, *self._object)
+            if command == _UPLOAD:
+                return self._begin_upload(now)
+            if command == _UPLOAD_SEGMENT and self._rest is not None:
+                return self._upload_segment(self._rest, data[0] >> 4 & 1)
+            if command != _ABORT:
+                raise SdoAbort(UNKNOWN_COMMAND)
+        except SdoAbort as abort:
+            self._rest = None
+            return struct.pack("<BHBL", 0x80, *self._object, *abort.args)
+        self._rest = None
+        return b""
+
+    def _begin_upload(self, now: float) -> bytes:
+        value = self.read(*self._object, now)
+        if 1 <= len(value) <= 4:
+            command = 0x43 | (4 - len(value)) << 2
+            return struct.pack("<BHB4s", command, *self._object, value)
+        self._rest, self._toggle = value, 0
+        return struct.pack("<BHBL", 0x41, *self._object, len(value))
+
+    def _upload_segment(self, rest: bytes, toggle: int) -> bytes:
+        if toggle != self._toggle:
+            raise SdoAbort(TOGGLE)
+        piece, is_last = rest[:7], len(rest) <= 7
+        self._toggle ^= 1
+        self._rest = None if is_last else rest[7:]
+        return struct.pack("<B7s", toggle << 4 | (7 - len(piece)) << 1 | is_last, piece)
+
+    def read(self, index: int, subindex: int, now: float) -> bytes:
+        """Read an object at a time [s]; raises SdoAbort."""
+        entries = self._entries(index, now)
+        if not isinstance(entries, list):
+            entries = [entries]
+        else:
+            entries.insert(0, bytes([len(entries)]))
+        if subindex >= len(entries):
+            raise SdoAbort(NO_SUBINDEX)
+        return entries[subindex]
+
+    def _write(self, index: int, subindex: int, data: bytes, now: float) -> None:
+        self.read(index, subindex, now)
+        if _NAMES[index] != "heartbeat_producer":
+            raise SdoAbort(READ_ONLY)
+        if len(data) != 2:
+            raise SdoAbort(BAD_LENGTH)
+        self.heartbeat = int.from_bytes(data, "little")
+
+    def _entries(self, index: int, now: float) -> bytes | list[bytes]:
+        """Return an object, or its subindices from 1 on."""
+        identity = self._amplifier.identity
+        match _NAMES.get(index):
+            case "device_type":
+                return _u32(CANOPEN["device_type"])
+            case "error_register":
+                return bytes([CANOPEN["emergencies"][self._amplifier.fault]["error_register"]])
+            case "emergency_cob_id":
+                return _u32(cob_id("emergency", self._node))
+            case "heartbeat_producer":
+                return self.heartbeat.to_bytes(2, "little")
+            case "identity":
+                numbers = [CANOPEN[name] for name in ("vendor_id", "product_code", "revision")]
+                return [*map(_u32, numbers), _u32(zlib.crc32(identity["serial_number"].encode()))]
+            case "texts":
+                texts = [identity[field.name].encode() for field in TEXTS]
+                return [*texts, identity["versions"].to_bytes(2, "little")]
+            case "capabilities":
+                return self._words("GetCaps", now)
+            case "status":
+                return self._words("GetStatus", now)
+        raise SdoAbort(NO_OBJECT)
+
+    def _words(self, name: str, now: float) -> list[bytes]:
+        reply = self._amplifier.handle(name, {}, now)
+        return [word.to_bytes(2, "little") for word in MESSAGES[name].reply.pack(reply)]
+
+
+def _u32(value: int) -> bytes:
+    return struct.pack("<L", value)
+
+
+_NMT: Mapping[str, int] = CANOPEN["nmt"]
+_NMT_STATES: Mapping[str, int] = CANOPEN["nmt_states"]
+_OPERATIONAL, _STOPPED = _NMT_STATES["OPERATIONAL"], _NMT_STATES["STOPPED"]
+_BOOT_UP, _PRE_OPERATIONAL = _NMT_STATES["BOOT_UP"], _NMT_STATES["PRE_OPERATIONAL"]
+_LEADS_TO = {
+    _NMT["stop"]: _STOPPED,
+    **dict.fromkeys((_NMT["pre_operational"], _NMT["reset_communication"]), _PRE_OPERATIONAL),
+}
+"""The state in which a node no longer takes requests, by the command that leads there."""
+_NMT_LENGTH = 2
+_POLL = 0.05  # s; between looks whether a heartbeat is wanted again
+
+
+class CanAmplifiers(FarEnd):
+    """Amplifiers by their nodes on one bus; send: called with their frames."""
+
+    def __init__(self, amplifiers: Mapping[int, AmplifierPort], send: Send) -> None:
+        self._nodes = {node: _Node(amplifier, node, send) for node, amplifier in amplifiers.items()}
+        self._broadcasts = Assembler(WireCounters(), is_numbered=False)
+
+    def start(self, now: float) -> None:
+        """Boot all nodes at a time [s]."""
+        for node in self._nodes.values():
+            node.boot(now)
+
+    @property
+    def next_event(self) -> float:
+        """Time of the next heartbeat or event [s]."""
+        return min(node.next_event for node in self._nodes.values())
+
+    def tick(self, now: float) -> None:
+        """Send the heartbeats and events due by now [s]."""
+        for node in self._nodes.values():
+            node.tick(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take frames of other devices at a time [s]."""
+        for frame in unpack_frames(data):
+            self._receive(frame, now)
+
+    def _receive(self, frame: CanFrame, now: float) -> None:
+        number = frame.id & NODE_MAX
+        node, kind = self._nodes.get(number), frame.id - number
+        if frame.id == cob_id("nmt"):
+            if len(frame.data) == _NMT_LENGTH:
+                for each in self._nodes.values():
+                    if frame.data[1] in (0, each.number):
+                        each.command(frame.data[0], now)
+        elif frame.id == REQUEST:
+            if (message := self._broadcasts.add(frame.data, now)) is not None:
+                self._broadcast(message, now)
+        elif node is not None and kind == REQUEST:
+            node.request(frame.data, now)
+            self._note_numbers()
+        elif node is not None and kind == cob_id("sdo_request"):
+            node.read(frame.data, now)
+
+    def _broadcast(self, message: Message, now: float) -> None:
+        known = BY_NUMBER.get(message.type)
+        if known is not None and known.is_broadcast:
+            for node in self._nodes.values():
+                if node.is_listening:
+                    node.carry_out(message, now)
+            self._note_numbers()
+
+    def _note_numbers(self) -> None:
+        """Note the numbers of nodes, which may have taken others."""
+        self._nodes = {node.number: node for node in self._nodes.values()}
+
+
+class _Node:
+    """An amplifier at a node number."""
+
+    def __init__(self, amplifier: AmplifierPort, number: int, send: Send) -> None:
+        self._amplifier = amplifier
+        self._send = send
+        self.number = number
+        self._was_faulty = False
+        self._heartbeat_due = 0.0
+        self._reset()
+        amplifier.listeners.append(self._tell)
+
+    def _reset(self) -> None:
+        self._state = _PRE_OPERATIONAL
+        self._requests = Assembler(WireCounters())
+        self._objects = ObjectServer(self._amplifier, self.number)
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether it takes requests."""
+        return self._state == _OPERATIONAL and self._amplifier.is_answering
+
+    @property
+    def next_event(self) -> float:
+        """Time of the next heartbeat or event [s]."""
+        return min(self._heartbeat_due, self._amplifier.next_event)
+
+    def tick(self, now: float) -> None:
+        """Send what is due by now."""
+        self._amplifier.tick(now)
+        while self._heartbeat_due <= now:
+            interval = self._objects.heartbeat
+            if interval and self._amplifier.is_answering:
+                self._put(cob_id("heartbeat", self.number), bytes([self._state]))
+            self._heartbeat_due += interval / 1000 if interval else _POLL
+
+    def boot(self, now: float) -> None:
+        """Begin anew, not operational; what the amplifier plays is its own."""
+        self._reset()
+        self._put(cob_id("heartbeat", self.number), bytes([_BOOT_UP]))
+        self._heartbeat_due = now + self._objects.heartbeat / 1000
+
+    def command(self, command: int, now: float) -> None:
+        """Take a command of network management."""
+        if not self._amplifier.is_answering:
+            return
+        if command == _NMT["start"]:
+            self._state = _OPERATIONAL
+        elif command == _NMT["reset_node"]:
+            self._amplifier.restart(now)
+        elif command in _LEADS_TO:
+            self._leave(_LEADS_TO[command], now)
+        if command in (_NMT["reset_node"], _NMT["reset_communication"]):
+            self.boot(now)
+
+    def read(self, data: bytes, now: float) -> None:
+        """Take a frame to the objects."""
+        is_served = self._state != _STOPPED and self._amplifier.is_answering
+        if is_served and (reply := self._objects.reply(data, now)):
+            self._put(cob_id("sdo_answer", self.number), reply)
+
+    def request(self, data: bytes, now: float) -> None:
+        """Take a frame of a request, and carry out the message that it completes."""
+        if self.is_listening and (message := self._requests.add(data, now)) is not None:
+            self.carry_out(message, now)
+
+    def carry_out(self, message: Message, now: float) -> None:
+        """Carry out a message; one without a number has no reply, nor a part of a set."""
+        sender = self.number
+        try:
+            kind, words = message.type, self._words(message, now)
+        except Refusal as refusal:
+            has_reply = message.number and not is_earlier_part(message.type, message.words)
+            kind, words = NAK, nak_of(refusal, message.type) if has_reply else []
+        if words:
+            self._put(REPLY + sender, *segments(message.number, kind, words))
+        if self.number != sender:
+            self.boot(now)
+
+    def _words(self, message: Message, now: float) -> list[int]:
+        """Carry out a request; returns the words of its reply, if any. Raises Refusal."""
+        if message.type == HELLO:
+            return IDENTITY.pack(self._amplifier.identity)
+        name, values = read_request(message.type, message.words)
+        if name == "SetAddress" and values["address"] > NODE_MAX:
+            raise Refusal(f"address must be 1 to {NODE_MAX}, got {values['address']}")
+        reply = self._amplifier.handle(name, values, now)
+        if not message.number:
+            self._amplifier.withdraw_status()
+            reply = {}
+        if name == "SetAddress":
+            self.number = values["address"]
+        return BY_NUMBER[message.type].reply.pack(reply) if reply else []
+
+    def _leave(self, state: int, now: float) -> None:
+        """Stop what plays, then leave the state in which there are requests."""
+        if self._amplifier.state == "OPERATION_ENABLED":
+            ramp = QUANTITIES["ramp"].to_wire(SILENCING_RAMP)
+            self._amplifier.handle("Stop", {"ramp": ramp}, now)
+        self._state = state
+
+    def _tell(self, event: Values, now: float) -> None:
+        """Send an event, with an emergency where a fault comes or goes."""
+        if self.is_listening:
+            self._put(REPLY + self.number, *segments(0, EVENT, EVENT_RECORD.pack(event)))
+        fault = name_of(FAULTS, event["fault"])
+        is_faulty = fault != "NONE"
+        is_mute = self._state == _STOPPED or not self._amplifier.is_answering
+        if (is_faulty or self._was_faulty) and not is_mute:
+            known = CANOPEN["emergencies"][fault]
+            state = event["state"] | event["fault"] << 4
+            head = (known["code"], known["error_register"], state, event["channel"])
+            self._put(cob_id("emergency", self.number), struct.pack("<HBBB3x", *head))
+        self._was_faulty = is_faulty
+
+    def _put(self, can_id: int, *data: bytes) -> None:
+        """Send frames of one identifier."""
+        self._send(pack_frames(CanFrame(can_id, each) for each in data))
+
+
+Listener = Callable[[CanFrame], None]
+
+_OVERHEAD = 8  # bytes of a frame beside its data, about, with stuffing and gap
+
+
+class CanBus:
+    """A bus whose members are identified by their listeners.
+
+    bitrate [bit/s]: None for no transmission time.
+    """
+
+    def __init__(self, bitrate: int | None = None) -> None:
+        self._members: list[Listener] = []
+        self._bitrate = bitrate
+        self._free_from = 0.0
+        self._in_flight: set[asyncio.TimerHandle] = set()
+
+    def join(self, listener: Listener) -> None:
+        """Add a member."""
+        self._members.append(listener)
+
+    def leave(self, listener: Listener) -> None:
+        """Remove a member, if it is one."""
+        if listener in self._members:
+            self._members.remove(listener)
+
+    def send(self, frame: CanFrame, *, sender: Listener) -> None:
+        """Deliver a frame to all but its sender, after the frames that were sent before."""
+        if self._bitrate is None:
+            self._deliver(frame, sender)
+            return
+
+        def arrive() -> None:
+            self._in_flight.discard(timer)
+            self._deliver(frame, sender)
+
+        bits = 8 * (_OVERHEAD + len(frame.data))
+        self._free_from = max(threads.now(), self._free_from) + bits / self._bitrate
+        timer = asyncio.get_running_loop().call_at(self._free_from, arrive)
+        self._in_flight.add(timer)
+
+    def close(self) -> None:
+        """Discard the frames in flight."""
+        for timer in self._in_flight:
+            timer.cancel()
+        self._in_flight.clear()
+
+    def _deliver(self, frame: CanFrame, sender: Listener) -> None:
+        for member in tuple(self._members):
+            if member != sender:
+                member(frame)
+
+
+class BusNodes:
+    """Amplifiers on a bus, each at the node of its number, with faults of its own each way.
+
+    A damaged frame fails its CRC and is dropped. All take a frame at one time, however long a
+    simulation needs.
+    """
+
+    def __init__(self, bus: CanBus, devices: Sequence[AmplifierDevice]) -> None:
+        self._bus = bus
+        self._nodes = [self._connect(device) for device in devices]
+        bus.join(self._hear)
+
+    def close(self) -> None:
+        """Leave the bus and discard frames in flight."""
+        self._bus.leave(self._hear)
+        for line, served in self._nodes:
+            line.close()
+            served.close()
+
+    def _hear(self, frame: CanFrame) -> None:
+        now = threads.now()
+        for line, _ in self._nodes:
+            line.inward.send(pack_frames([frame]), now)
+
+    def _leave(self, data: bytes) -> None:
+        for frame in unpack_frames(data):
+            self._bus.send(frame, sender=self._hear)
+
+    def _connect(self, device: AmplifierDevice) -> tuple[TwoWayLine, Served]:
+        def send(frames: bytes) -> None:
+            for frame in unpack_frames(frames):
+                line.outward.send(pack_frames([frame]))
+
+        def boot() -> None:
+            end.start(threads.now())
+            served.schedule()
+
+        line = TwoWayLine(
+            to_amplifier=lambda data, now: served.receive(data, now),
+            to_host=self._leave,
+            faults=device.faults,
+            finds_damage=True,
+        )
+        end = CanAmplifiers({device.address: device}, send)
+        served = Served(end)
+        device.boot_listeners.append(boot)
+        boot()
+        return line, served
+
+
+_CR, _BELL = b"\r", b"\x07"
+_MAX_LENGTH = 64  # characters; a frame has 21
+_REMOTE = re.compile(rb"r[0-7][0-9A-Fa-f]{2}[0-8]|R[01][0-9A-Fa-f]{7}[0-8]")
+_EXTENDED = re.compile(rb"T[01][0-9A-Fa-f]{7}[0-8](?:[0-9A-Fa-f]{2})*")
+_SETTING = re.compile(rb"S[0-9]|s[0-9A-Fa-f]{4,6}|Y[0-9]|[Mm][0-9A-Fa-f]{8}|[ZX][01]|W[0-9]|")
+
+
+class SlcanAdapter(FarEnd):
+    """The adapter: text in, `send` called with text, frames to and from a bus."""
+
+    def __init__(self, bus: CanBus, send: Send) -> None:
+        self._bus = bus
+        self._send = send
+        self._rest = b""
+        self._is_open = self._may_send = False
+        bus.join(self._hear)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.leave(self._hear)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Process text from the host."""
+        *lines, self._rest = (self._rest + data).split(_CR)
+        for line in lines:
+            self._send(self._answer(line.strip(b"\n")))
+        if len(self._rest) > _MAX_LENGTH:
+            self._rest = b""
+            self._send(_BELL)
+
+    def _answer(self, line: bytes) -> bytes:
+        match line:
+            case b"O" | b"L" if not self._is_open:
+                self._is_open, self._may_send = True, line == b"O"
+                return _CR
+            case b"C":  # also when closed: hosts begin with it
+                self._is_open = False
+                return _CR
+            case b"V" | b"v":
+                return line + b"1013" + _CR
+            case b"N":
+                return b"NE0A1" + _CR
+            case b"F" if self._is_open:
+                return b"F00" + _CR
+        if self._is_open and self._may_send:
+            if _REMOTE.fullmatch(line) or _EXTENDED.fullmatch(line):
+                return (b"z" if line[:1] == b"r" else b"Z") + _CR  # no receiver for these
+            if frame := SLCAN.decode(line):
+                self._bus.send(frame, sender=self._hear)
+                return b"z" + _CR
+        if not self._is_open and _SETTING.fullmatch(line):
+            return _CR
+        return _BELL
+
+    def _hear(self, frame: CanFrame) -> None:
+        if self._is_open:
+            self._send(SLCAN.encode(frame))
+
+
+BUS_NAME = "can0"
+_MAX_ELEMENT = 512  # characters of an element
+
+
+class SocketcandClient(FarEnd):
+    """One connection, through the states new, open and raw."""
+
+    def __init__(self, bus: CanBus, send: Send) -> None:
+        self._bus = bus
+        self._send = send
+        self._rest = b""
+        self._is_open = self._is_raw = False
+        send(b"< hi >")
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.leave(self._hear)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Process complete elements; text between them is skipped."""
+        *elements, rest = (self._rest + data).split(b">")
+        self._rest = rest if len(rest) <= _MAX_ELEMENT else b""
+        for element in elements:
+            _, bracket, content = element.partition(b"<")
+            if bracket:
+                self._element(content.strip())
+
+    def _element(self, element: bytes) -> None:
+        match element:
+            case _ if not self._is_open:
+                self._is_open = element == f"open {BUS_NAME}".encode()
+                self._send(b"< ok >" if self._is_open else b"< error could not open bus >")
+                if not self._is_open:
+                    self._send(b"")
+            case b"rawmode":
+                self._send(b"< ok >")
+                if not self._is_raw:
+                    self._is_raw = True
+                    self._bus.join(self._hear)
+            case b"echo":
+                self._send(b"< echo >")
+            case _ if element.startswith(b"send "):
+                if frame := SOCKETCAND.decode_sent(b"<" + element):  # nor does socketcand say more
+                    self._bus.send(frame, sender=self._hear)
+            case _:
+                self._send(b"< error unknown command >")
+
+    def _hear(self, frame: CanFrame) -> None:
+        stamp = f"{threads.now():.6f}"  # only differences are meaningful
+        self._send(f"< frame {frame.id:03X} {stamp} {frame.data.hex().upper()} >".encode())

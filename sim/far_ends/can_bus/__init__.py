@@ -1,1 +1,0 @@
-"""The amplifiers' side of CAN: a bus, CANopen nodes and adapters."""

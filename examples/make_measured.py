@@ -23,8 +23,7 @@ from model.rig.rig_file import load_rig
 from model.structure.attachments import footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Term
-from sim.plant.accelerometer import Accelerometer, positions, readings
-from sim.plant.fingers import fit_tones
+from sim.plant.fingers import Accelerometer, fit_tones, positions, readings
 from sim.plant.plant import Plant
 
 FREQUENCIES = np.arange(40.0, 501.0, 10.0)

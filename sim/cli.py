@@ -15,7 +15,7 @@ from sim.desk.soft_amp_cli import port_option, soft_amp
 if TYPE_CHECKING:
     from sim.control import SimulationContext
     from sim.far_ends.wire_assignment import Wire
-    from sim.plant.accelerometer import Accelerometer
+    from sim.plant.fingers import Accelerometer
     from sim.process.simulation import Simulation
     from sim.process.view import PlateView
 
@@ -209,7 +209,7 @@ def _check_rate(rate: float, *, frequency_max: float) -> None:
 
 def _sensor(text: str) -> "Accelerometer":
     from model.config.fields import parse_point
-    from sim.plant.accelerometer import Accelerometer
+    from sim.plant.fingers import Accelerometer
 
     name, equals, position = text.partition("=")
     if not (name and equals):

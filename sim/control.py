@@ -90,8 +90,7 @@ from registry.wording import first_problem
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.faults import parse_fault
-from sim.plant.accelerometer import Accelerometer
-from sim.plant.fingers import Position, measure_vibration
+from sim.plant.fingers import Accelerometer, Position, measure_vibration
 from sim.plant.imperfections import PlateErrors
 from sim.sensors import Accelerometers, Recorder, Recording
 

@@ -26,7 +26,7 @@ from model.rig.rig import Rig
 from sim.bench.bench import Bench
 from sim.plant.fingers import KEPT, Position
 from sim.plant.imperfections import Imperfections
-from sim.plant.sampled import SampledPlant
+from sim.plant.plant import SampledPlant
 
 RATE = 16_000.0
 """Samples per second and channel [Hz]."""

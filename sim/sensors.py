@@ -29,8 +29,7 @@ from model.files.array_file import begins_with
 from model.files.uff import ACCELERATION, TIME, TIME_RESPONSE, Function, Universal, write_universal
 from registry.files import regular_file
 from sim.bench.bench import Bench
-from sim.plant.accelerometer import Accelerometer, positions, readings
-from sim.plant.fingers import KEPT, fit_tones
+from sim.plant.fingers import KEPT, Accelerometer, fit_tones, positions, readings
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,9 @@ from model.finger import detection_threshold
 from model.rig.rig import Rig
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
-from sim.plant import second_harmonic
-from sim.plant.imperfections import Imperfections, realised
-from sim.plant.loaded_plates import Placement
-from sim.plant.voiced_base import motion_of
+from sim.plant import imperfections
+from sim.plant.imperfections import Imperfections, motion_of, realised
+from sim.plant.plant import Placement
 
 STRONGEST = 0.040  # s
 
@@ -48,7 +47,7 @@ class _Part(Bench):
 
     def _motion(self, index: int, playing: Sequence[Voice], clock: StraightClock) -> Any:
         errors, terms = self._errors[index], []
-        for voice in (*playing, *second_harmonic.of_voices(playing, errors.harmonic)):
+        for voice in (*playing, *imperfections.of_voices(playing, errors.harmonic)):
             if self.is_heard(self.owners.get(voice.layer)):
                 at = np.array([voice.frequency])
                 threshold = float(detection_threshold(at, self.threshold)[0])

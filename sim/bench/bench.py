@@ -50,13 +50,20 @@ from model.transients.base_motion import Motion
 from registry import threads
 from sim.amplifier.readings import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.plant import second_harmonic
-from sim.plant.accelerometer import Accelerometer, positions, readings
-from sim.plant.fingers import KEPT, Felt, Fingers, Position, Record, measure_vibration
-from sim.plant.imperfections import Imperfections, PlateErrors, realised
-from sim.plant.loaded_plates import LoadedPlate, Placement
-from sim.plant.plant import SAMPLE_RATE, Plant
-from sim.plant.voiced_base import motion_of
+from sim.plant import imperfections as second_harmonic
+from sim.plant.fingers import (
+    KEPT,
+    Accelerometer,
+    Felt,
+    Fingers,
+    Position,
+    Record,
+    measure_vibration,
+    positions,
+    readings,
+)
+from sim.plant.imperfections import Imperfections, PlateErrors, motion_of, realised
+from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Placement, Plant
 
 WRONG = 0.5e-6
 """Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""

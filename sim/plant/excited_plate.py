@@ -35,11 +35,10 @@ from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.shaping import ONSET_WINDOW
 from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
-from sim.plant import second_harmonic
+from sim.plant import imperfections as second_harmonic
 from sim.plant.fingers import Record, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
-from sim.plant.loaded_plates import LoadedPlate
-from sim.plant.plant import SAMPLE_RATE, Plant
+from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Plant
 
 STEADY = 0.25
 """Length [s] of the last part, in which steady amplitudes are fitted; resolves 10 Hz."""

@@ -3,6 +3,13 @@
 Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
 from the rig's and stand elsewhere, fingers that do not weigh alike, and crystals of the amplifiers.
 ERAs move with a second harmonic. Not modelled: other distortion, drifting errors of channels.
+
+Second harmonics of ERAs: the tones that these play beside those that they are to play.
+
+A share of each tone's own amplitude, at twice its frequency and twice its phase, and an angle of
+each ERA. Of signals there are none, and of several tones together no sums and differences.
+
+Motion of an ERA's base by the voices of its channel, in terms for the plate in time.
 """
 
 import cmath
@@ -13,24 +20,21 @@ from zlib import crc32
 
 import numpy as np
 
+from drivers.playing.playback import Voice
 from drivers.protocol.definition import CLOCK_TURN
+from model.answer.answer import Layer
 from model.answer.stimulus import Finger
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import PlateMesh
-from model.structure.attachments import (
-    Fingertip,
-    FingertipLoad,
-    PointLoad,
-    fingertip_loads,
-)
+from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, fingertip_loads
 from model.structure.exciter import Actuator
 from model.study.verification import draw_plates
-from model.transients.base_motion import Motion, Term
-from model.vibration import finer_mesh
-from sim.amplifier.readings import Crystal
+from model.transients.base_motion import BaseEnvelope, Motion, Term, along_lines, raised_cosine
+from model.vibration import Tone, finer_mesh
+from sim.amplifier.readings import Crystal, StraightClock
 
 _MAX_LOSS_FACTOR = 0.99
 _MIN_FACTOR = 0.05  # of a normal draw about 1, which may be negative
@@ -41,7 +45,7 @@ _CRYSTAL, _WARM_UP = 50e-6, 1e-6  # 50 ppm, and 1 ppm/s either way
 class ChannelErrors:
     """Errors of one channel: gain factor, phase [rad].
 
-    harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.second_harmonic`).
+    harmonic: second harmonic of its ERA's motion, relative to it (`sim.plant.imperfections`).
     """
 
     gain: float = 1.0
@@ -297,3 +301,64 @@ def realised(motion: Motion, errors: ChannelErrors) -> list[Term]:
     """Base motion with the gain and phase errors of its channel."""
     factor = errors.factor
     return [term._replace(c0=factor * term.c0, c1=factor * term.c1) for term in motion]
+
+
+def of_voices(voices: Sequence[Voice], share: complex) -> list[Voice]:
+    """Second harmonics of the voices of a channel; none of share 0."""
+    if not share:
+        return []
+    found = []
+    for voice in voices:
+        way = voice.transition
+        first, last, *knots = (_doubled(each, share) for each in (way.first, way.last, *way.knots))
+        doubled = replace(way, first=first, last=last, knots=tuple(knots))
+        found.append(replace(voice, frequency=2 * voice.frequency, transition=doubled))
+    return found
+
+
+def of_layer(layer: Layer, shares: Mapping[str, complex]) -> list[Layer]:
+    """Second harmonics of a layer's voices as it starts; shares: by ERA, none where all are 0."""
+    if not any(shares.values()):
+        return []
+    return [
+        replace(
+            voice,
+            excitation={
+                name: Tone.from_phasor(2 * tone.frequency, _doubled(tone.phasor, shares[name]))
+                for name, tone in voice.excitation.items()
+            },
+            onset=voice.onset
+            and {name: _of_envelope(each, shares[name]) for name, each in voice.onset.items()},
+        )
+        for voice in layer.voices
+    ]
+
+
+def _of_envelope(envelope: BaseEnvelope, share: complex) -> BaseEnvelope:
+    start, *knots = (_doubled(value, share) for value in (envelope.start, *envelope.knots))
+    return BaseEnvelope(2 * envelope.frequency, start, tuple(knots), envelope.step)
+
+
+def _doubled(amplitude: complex, share: complex) -> complex:
+    """Amplitude of the second harmonic of one."""
+    return share * amplitude * amplitude / abs(amplitude) if amplitude else 0j
+
+
+def motion_of(
+    voices: Sequence[Voice], clock: StraightClock, *, stroke: float, delay: float = 0.0
+) -> list[Term]:
+    """Return the motion of a base by the voices of its channel, level 1 being the stroke [m].
+
+    clock: of the amplifier, on which angles count; delay [s]: of the base behind its voices.
+    """
+    return [term for voice in voices for term in _terms(voice, clock, stroke, delay)]
+
+
+def _terms(voice: Voice, clock: StraightClock, stroke: float, delay: float) -> tuple[Term, ...]:
+    way, omega = voice.transition, 2 * math.pi * voice.frequency
+    factor = stroke * cmath.exp(1j * omega * clock.at(way.start))
+    start, omega = way.start + delay, omega * clock.pace
+    if not way.knots:
+        return raised_cosine(start, way.step, omega, factor * way.first, factor * way.last)
+    values = [factor * value for value in (way.first, *way.knots, way.last)]
+    return along_lines(start, way.step, omega, values)

@@ -2,12 +2,34 @@
 
 The exact solutions are those of `model.transients.time_response`; the plant adds the clock, the
 present base motion, and the free vibration that remains after each change.
+
+The plate's equations of motion under fingers, solved once for each set of contacts.
+
+A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
+reduced basis is extended by the static vectors of the point, and the small system diagonalised
+again. Solutions are cached. Structural damping remains that of the plate on its ERAs.
+
+Fingers that come to rest are solved apart: a large plate takes a tenth of a second, in which its
+amplifiers must go on replying.
+
+Accelerations of a vibrating plate on a grid of times, at points that stay for a while.
+
+A free vibration is a sum of exponentials that decay, a forced one of a few that do not. All are
+tabulated for a block of samples, so that a block is one product of matrices.
+
+The plate in the time domain under bases that move along samples, joined by straight lines.
+
+For amplifiers that make waveforms of their own. As in `sim.plant.plant` no step size enters: a base
+that moves along a straight line has a closed-form solution, and every corner adds a free vibration.
 """
 
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from itertools import chain, pairwise
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,9 +37,282 @@ from model.arrays import ComplexArray, FloatArray
 from model.reduction.reduced_plate import ReducedPlate
 from model.structure.attachments import FingertipLoad, PointLoad, Source
 from model.transients.base_motion import BaseMotions, Motion
-from model.transients.time_response import ForcedVibration
-from sim.plant.loaded_plates import LoadedPlate, LoadedPlateCache, carried_state
-from sim.plant.sampler import Sampler
+from model.transients.time_response import ForcedVibration, PlateInTime, plate_in_time
+from sim.plant.fingers import Position
+
+Footprint: TypeAlias = tuple[float, float, float]
+"""x, y, radius [m]."""
+
+BLOCK = 512  # samples per table of exponentials; a power of 2
+
+# s; a point keeps its static vectors for so long after a lift, ten times as long as their motion
+# takes to decay.
+_KEEP_LIFTED = 0.2
+_MAX_LIFTED = 8  # points; a sliding finger leaves many
+_MAX_SOLVED = 32  # sets of contacts, of about a megabyte each
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedPlate:
+    """The plate under a set of contacts, reduced for forces at them."""
+
+    reduced: ReducedPlate
+    plate: PlateInTime
+    _tables: dict[float, ComplexArray] = field(default_factory=dict)
+
+    def exponentials(self, sample_rate: float) -> ComplexArray:
+        """exp(eigenvalue k / sample_rate [Hz]), k up to a block, (BLOCK, m)."""
+        if sample_rate not in self._tables:
+            self._tables.clear()
+            self._tables[sample_rate] = exponentials(self.plate.decay, sample_rate)
+        return self._tables[sample_rate]
+
+
+def exponentials(s: ComplexArray, sample_rate: float) -> ComplexArray:
+    """exp(s k / sample_rate) for s (n,) [1/s] and k up to a block, (BLOCK, n)."""
+    table = np.ones((BLOCK, len(s)), dtype=complex)
+    done = 1
+    while done < BLOCK:  # doubled, since an exponential costs ten products
+        np.multiply(table[:done], np.exp(s * (done / sample_rate)), out=table[done : 2 * done])
+        done *= 2
+    return table
+
+
+Under: TypeAlias = tuple[LoadedPlate, Mapping[str, FingertipLoad]]
+"""A loaded plate with its contacts by id of the finger, in the order of its coordinates."""
+
+
+def carried_state(state: FloatArray, before: Under, after: Under) -> FloatArray:
+    """Displacement and velocity of all coordinates, (2 r,), carried to another set of contacts.
+
+    Those of the plate and of magnets, and of the phalanges of fingers that stay, are continuous; a
+    new finger's phalanx is at rest.
+    """
+    (plate, contacts), (other, wanted) = before, after
+    halves, count = np.split(state, 2), len(plate.reduced.omega)
+    fixed = len(halves[0]) - len(contacts)
+    moving = dict(zip(contacts, np.transpose([half[fixed:] for half in halves]), strict=True))
+    phalanges = np.reshape([moving.get(id, (0.0, 0.0)) for id in wanted], (-1, 2)).T
+    motion = [half[:count] for half in halves]
+    if other.reduced is not plate.reduced:
+        carried = other.reduced.projection_from(plate.reduced)
+        motion = [carried @ half for half in motion]
+    magnets = [half[count:fixed] for half in halves]
+    return np.concatenate([*chain.from_iterable(zip(motion, magnets, phalanges, strict=True))])
+
+
+class LoadedPlateCache:
+    """Solutions of one plate on its ERAs with its loads, under any contacts.
+
+    reduced: for forces at the ERAs and loads. Raises InputError for ERAs that do not support it.
+    """
+
+    def __init__(
+        self, reduced: ReducedPlate, eras: Sequence[Source], loads: Sequence[PointLoad]
+    ) -> None:
+        self._unloaded = reduced
+        self._eras = tuple(eras)
+        self._loads = tuple(loads)
+        self._lifted: dict[Footprint, float] = {}  # by point: when [s]
+        self._resting: tuple[Footprint, ...] = ()
+        self._solved = lru_cache(_MAX_SOLVED)(self._solve)
+        self._reduced_at = lru_cache(_MAX_SOLVED)(self._reduce)
+
+    def solution(
+        self, contacts: Sequence[FingertipLoad], *, time: float
+    ) -> Callable[[], LoadedPlate]:
+        """What solves the plate under these contacts from a time [s] on, in any thread.
+
+        Calls must be in order of time.
+        """
+        resting = tuple(sorted({(each.x, each.y, each.foot) for each in contacts}))
+        for point in self._resting:
+            self._lifted.pop(point, None)
+            self._lifted[point] = time
+        self._resting = resting
+        recent = [
+            point
+            for point, when in self._lifted.items()
+            if time - when < _KEEP_LIFTED and point not in resting
+        ][-_MAX_LIFTED:]
+        self._lifted = {point: self._lifted[point] for point in recent}
+        return partial(self._solved, (*resting, *sorted(recent)), tuple(contacts))
+
+    def _solve(
+        self, points: tuple[Footprint, ...], contacts: tuple[FingertipLoad, ...]
+    ) -> LoadedPlate:
+        if not points:
+            unloaded = _solve_unloaded(self._unloaded, self._eras, self._loads)
+            return LoadedPlate(self._unloaded, unloaded)
+        reduced = self._reduced_at(points)
+        plate = plate_in_time(reduced, self._eras, loads=self._loads, contacts=contacts)
+        return LoadedPlate(reduced, plate)
+
+    def _reduce(self, points: tuple[Footprint, ...]) -> ReducedPlate:
+        return self._unloaded.with_attachments_at(np.array(points))
+
+
+@lru_cache(maxsize=2)  # successive benches of one rig share it
+def _solve_unloaded(
+    reduced: ReducedPlate, eras: tuple[Source, ...], loads: tuple[PointLoad, ...]
+) -> PlateInTime:
+    return plate_in_time(reduced, eras, loads=loads)
+
+
+class Placement:
+    """Positions [m] and loads of all fingers by id from a time [s] on.
+
+    solve: returns the plate under them, may be called in any thread, and is called once; None where
+    what loads the plate stays.
+    """
+
+    def __init__(
+        self,
+        time: float,
+        positions: Mapping[str, Position],
+        contacts: Mapping[str, FingertipLoad],
+        solve: Callable[[], LoadedPlate] | None,
+    ) -> None:
+        self.time = time
+        self.positions = dict(positions)
+        self.contacts = contacts
+        self.is_solved = solve is None
+        self._is_started = False
+        self._solve = solve
+        self._lock = threading.Lock()
+        self._loaded: LoadedPlate | None = None
+
+    def supersedes(self, before: "Placement", last: "Placement") -> bool:
+        """Whether the last one can be left out, as of fingers that slide faster than is solved.
+
+        Its solution has not begun, and it only moved the same fingers.
+        """
+        is_slide = self.positions.keys() == last.positions.keys() == before.positions.keys()
+        return is_slide and not (last.is_solved or last._is_started)
+
+    def solved(self) -> LoadedPlate | None:
+        """The plate under these fingers, solved if it is not yet; raises what solving raises."""
+        self._is_started = True
+        with self._lock:
+            try:
+                if self._loaded is None and self._solve is not None:
+                    self._loaded = self._solve()
+                return self._loaded
+            finally:
+                self.is_solved = True
+
+
+_NEGLIGIBLE = 1e-17  # of the strongest free vibration: a tenth of what rounding leaves of it
+_SMALLEST = 1e-60  # m/s²; what is subnormal is slow
+_TABLES_KEPT = 8  # sets of omegas
+
+
+class Sampler:
+    """Samples a loaded plate at points of these shapes (q, r), phalanges included.
+
+    precision: of the sums, double or single; everything before them is double.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedPlate,
+        points: FloatArray,
+        *,
+        sample_rate: float,
+        precision: type[np.floating] = np.float64,
+    ) -> None:
+        self.points = points
+        self.sample_rate = sample_rate
+        self.precision = precision
+        plate = loaded.plate
+        self._by_forced = np.ascontiguousarray((points @ plate.displacement).T)
+        # Conjugate exponents and amplitudes at the points (m, q), those that decay fastest last.
+        self._decay = plate.decay.conj()
+        self._free = (points @ plate.free_acceleration).conj().T
+        self._strengths = np.abs(self._free).max(axis=1, initial=0.0)
+        self._free_table = self._columns(loaded.exponentials(sample_rate))
+        self._forced: ForcedVibration | None = None
+        self._solution = -1  # which these are, with their conjugate amplitudes (n, q):
+        self._constant = self._growth = self._free[:0]  # of all its solutions, and per second
+        self._exponents = self._decay[:0]
+        self._forced_table = self._free_table[:, :0]
+
+    def sample(
+        self,
+        times: FloatArray,
+        out: FloatArray,
+        *,
+        free: ComplexArray,
+        forced: ForcedVibration,
+        solution: int,
+    ) -> None:
+        """Write accelerations at times (n,) [s], evenly spaced, to out (n, q).
+
+        free (m,): amplitude of each free vibration at the time of the forced one, which is a
+        solution by its number.
+        """
+        if forced is not self._forced or solution != self._solution:
+            self._use(forced, solution)
+        rows = forced.rows(solution)
+        for start in range(0, len(times), BLOCK):
+            into = out[start : start + BLOCK]
+            tau = float(times[start] - forced.times[solution])
+            now = np.exp(self._decay * tau) * free.conj()
+            kept = self._kept(now)
+            amplitudes = self._rows(self._free[:kept] * now[:kept, None])
+            np.matmul(self._free_table[: len(into), : 2 * kept], amplitudes, out=into)
+            driven: ComplexArray = self._constant[rows]
+            if forced.a1 is not None:
+                driven = np.vstack([driven + tau * self._growth[rows], self._growth[rows]])
+            turned = driven * np.exp(self._exponents * tau)[:, None]
+            into += self._forced_table[: len(into)] @ self._rows(turned)
+
+    def _rows(self, amplitudes: ComplexArray) -> FloatArray:
+        """Real and imaginary parts (2 n, q) of amplitudes (n, q), one after the other."""
+        parts = np.stack([amplitudes.real, amplitudes.imag], axis=1, dtype=self.precision)
+        return parts.reshape(-1, len(self.points))
+
+    def _columns(self, table: ComplexArray) -> FloatArray:
+        """Real and imaginary parts (n, 2 k) of a table (n, k)."""
+        return np.ascontiguousarray(table).view(float).astype(self.precision, copy=False)
+
+    def _kept(self, free: ComplexArray) -> int:
+        """How many free vibrations count."""
+        strengths = np.abs(free) * self._strengths
+        counts = strengths > max(_NEGLIGIBLE * strengths.max(), _SMALLEST)
+        last = counts.nonzero()[0][-1:]
+        return int(last[0]) + 1 if len(last) else 0
+
+    def _use(self, forced: ForcedVibration, solution: int) -> None:
+        """Tabulate the exponentials of a solution."""
+        if forced is not self._forced:
+            self._find_amplitudes(forced)
+        self._solution = solution
+        omegas = forced.omegas[forced.rows(solution)]
+        table = _sinusoids(omegas.tobytes(), self.sample_rate)
+        self._exponents = np.asarray(-1j * omegas, dtype=complex)
+        if forced.a1 is not None:
+            table = np.hstack([table, np.arange(BLOCK)[:, None] / self.sample_rate * table])
+            self._exponents = np.tile(self._exponents, 2)
+        self._forced_table = self._columns(table)
+
+    def _find_amplitudes(self, forced: ForcedVibration) -> None:
+        """Find the amplitudes of all solutions at the points, all at once."""
+        self._forced = forced
+        s = 1j * forced.omegas[:, None]
+        constant = s**2 * forced.a0
+        if forced.a1 is not None:
+            constant += 2 * s * forced.a1
+            # Im[a exp(s t)] is Re[-i a exp(s t)].
+            self._growth = np.asarray(1j * ((s**2 * forced.a1) @ self._by_forced).conj())
+        self._constant = np.asarray(1j * (constant @ self._by_forced).conj())
+
+
+@lru_cache(_TABLES_KEPT)
+def _sinusoids(omegas: bytes, sample_rate: float) -> ComplexArray:
+    """exp(i omega k / sample_rate) for k up to a block, (BLOCK, n)."""
+    return exponentials(np.asarray(1j * np.frombuffer(omegas), dtype=complex), sample_rate)
+
 
 SAMPLE_RATE = 10_000.0
 """Default sampling rate [Hz]: peaks at 500 Hz are sampled to within 1.3 %."""
@@ -254,3 +549,68 @@ class Plant:
         """Advance to the end of a stretch."""
         self.time = end
         return _Stretch(end, includes_end, self._free, self._forced, self._solution)
+
+
+class SampledPlant:
+    """The plate of a plant that nothing else drives, at rest before sample 0; rate [Hz].
+
+    It has the coordinates of the plant, and follows its contacts. An ERA's measured gain over
+    frequency is that at 0 Hz, since samples have no frequency.
+    """
+
+    def __init__(self, plant: Plant, *, rate: float) -> None:
+        from scipy.signal import lfilter  # takes half a second to load
+
+        self._filter = lfilter
+        self.rate = rate
+        self._plant = plant
+        self._contacts = plant.contacts
+        self._bases = np.zeros(len(plant.loaded.plate.eras))  # at the last sample [m]
+        self._slopes = np.zeros(len(plant.loaded.plate.eras))  # before it [m/s]
+        self._use(plant.loaded)
+        self._free = np.zeros(len(plant.loaded.plate.decay), dtype=complex)
+
+    def follow(self) -> None:
+        """Go on under the plant's present contacts."""
+        if self._plant.loaded is self._current and self._plant.contacts == self._contacts:
+            return
+        before = self._current, self._contacts
+        state = (self._current.plate.free_state @ (self._free + self._forced)).real
+        self._contacts = self._plant.contacts
+        self._use(self._plant.loaded)
+        state = carried_state(state, before, (self._current, self._contacts))
+        self._free = self._current.plate.to_free @ state - self._forced
+
+    def advance(self, bases: FloatArray, *, shapes: FloatArray) -> FloatArray:
+        """Advance by the next samples, the bases' motion (n, eras) [m].
+
+        shapes (p, r): of the plant's `reduced` at points. Return their accelerations (n, p)
+        [m/s²] half a sample before each: at the samples themselves the velocity of a base, and
+        with it the force of its damper, jumps.
+        """
+        plate = self._current.plate
+        slopes = np.diff(bases, axis=0, prepend=self._bases[None]) * self.rate
+        corners = -np.diff(slopes, axis=0, prepend=self._slopes[None]) @ self._by_slope
+        free = np.empty_like(corners)
+        factor = np.exp(plate.decay / self.rate)
+        for mode, one in enumerate(factor):
+            state = np.array([one * self._free[mode]])
+            free[:, mode], _ = self._filter([one], [1.0, -one], corners[:, mode], zi=state)
+        if len(bases):
+            self._free, self._bases, self._slopes = free[-1], bases[-1], slopes[-1]
+        points = plate.with_far_ends(shapes) @ plate.free_acceleration
+        halfway = free * np.exp(-plate.decay / (2 * self.rate))
+        return np.asarray((halfway @ points.T).real)
+
+    def _use(self, plate: LoadedPlate) -> None:
+        """Go on with a plate; find its forced vibration for bases of 1 m and of 1 m/s."""
+        self._current = plate
+        strokes = np.array([[era.full_level] for era in plate.plate.eras])
+        self._by_base, self._by_slope = (
+            found[0] / strokes @ plate.plate.vectors.T @ plate.plate.to_free.T
+            for found in plate.plate.following(np.zeros(1, dtype=complex))
+        )
+
+    @property
+    def _forced(self) -> ComplexArray:
+        return np.asarray(self._bases @ self._by_base + self._slopes @ self._by_slope)

@@ -21,8 +21,7 @@ from sim.control import SimulationContext, control_socket
 from sim.far_ends.wire_assignment import Wire, open_wires
 from sim.faults import FaultFile
 from sim.firmware import FirmwareBench, running
-from sim.plant.accelerometer import Accelerometer
-from sim.plant.fingers import Position
+from sim.plant.fingers import Accelerometer, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
 from sim.process.virtual_time import SteppedLoop

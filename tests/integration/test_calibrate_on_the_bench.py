@@ -14,7 +14,7 @@ from model.cli import app
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from perturbed_plate import FREQUENCIES, perturbed
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Accelerometer
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

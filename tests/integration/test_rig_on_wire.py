@@ -24,7 +24,7 @@ from model.structure.plate import SCALED
 from rig_files import write_rig
 from rig_on_wire import WIRES, far_side
 from sim.amplifier.simulated_amplifier import Amplifier
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Accelerometer
 from virtual_loop import run_virtual
 
 Typed = Callable[..., Result]

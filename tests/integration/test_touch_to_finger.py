@@ -38,7 +38,7 @@ from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope, shaped
 from only import only
 from rig_files import TWO_AMPLIFIERS, write_rig
-from sim.plant import second_harmonic
+from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
@@ -209,7 +209,7 @@ def _onset_contrast(truth: Truth, situation: Situation, pattern: Layer) -> float
     assert pattern.onset is not None
     errors = {name: truth.drawn.channels[channel] for name, channel in truth.rig.wiring.items()}
     shares = {name: each.harmonic for name, each in errors.items()}
-    onsets = [each.onset or {} for each in (pattern, *second_harmonic.of_layer(pattern, shares))]
+    onsets = [each.onset or {} for each in (pattern, *imperfections.of_layer(pattern, shares))]
     every = zip(*[shaped(onset, real.eras) for onset in onsets], strict=True)
     for number, (era, parts) in enumerate(zip(real.eras, every, strict=True)):
         terms = [term for part in parts for term in part]

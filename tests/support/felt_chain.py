@@ -25,8 +25,7 @@ from model.table.table import LocalizationTable
 from registry import threads
 from sim.amplifier.readings import AmplifierSummary
 from sim.far_ends.wire_assignment import Wire
-from sim.plant.accelerometer import Accelerometer
-from sim.plant.fingers import Felt
+from sim.plant.fingers import Accelerometer, Felt
 from sim.plant.imperfections import draw_imperfections
 from sim.sensors import Accelerometers, Recording
 from virtual_loop import run_virtual

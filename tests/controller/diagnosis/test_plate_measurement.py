@@ -33,7 +33,7 @@ from model.table.table_file import build_table
 from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.far_ends.wire_assignment import Wire
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Accelerometer
 from sim.sensors import Accelerometers
 from virtual_loop import run_virtual
 

@@ -20,8 +20,8 @@ from model.structure.attachments import Fingertip, FingertipLoad
 from plate_in_time import apart, lock_in
 from sim.bench.bench import Bench
 from sim.control import SimulationContext, carry_out
-from sim.plant.accelerometer import Accelerometer
-from sim.plant.loaded_plates import LoadedPlate, Placement
+from sim.plant.fingers import Accelerometer
+from sim.plant.plant import LoadedPlate, Placement
 from sim.sensors import Accelerometers
 
 START = 98765.4321  # as large as a clock may be

@@ -14,8 +14,7 @@ from model.rig.rig import Channel, Rig
 from plate_in_time import lock_in
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import WRONG, Bench, StraightClocks
-from sim.plant.imperfections import Imperfections
-from sim.plant.voiced_base import motion_of
+from sim.plant.imperfections import Imperfections, motion_of
 
 AT = (0.08, 0.06)
 

@@ -17,7 +17,7 @@ from plate_in_time import apart
 from registry import threads
 from rig_on_wire import WIRES, layer, on_two_amplifiers, rig_on_wire
 from sim.bench.bench import Bench
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Accelerometer
 from virtual_loop import in_virtual_time
 
 SESSION = 9

@@ -14,7 +14,7 @@ from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
 from sim.desk.measuring import simulated_plate
 from sim.desk.measuring.desk import Desk
-from sim.plant.accelerometer import Accelerometer
+from sim.plant.fingers import Accelerometer
 
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 1e-3) for n, (x, y) in enumerate(PLACES, start=1))

@@ -16,8 +16,7 @@ from model.table.table_file import build_table
 from model.transients.base_motion import raised_cosine
 from plate_in_time import lock_in
 from sim.plant.excited_plate import play
-from sim.plant.plant import Plant
-from sim.plant.sampled import SampledPlant
+from sim.plant.plant import Plant, SampledPlant
 
 RATE = 10_000.0
 AT = np.array([[0.11, 0.09]])

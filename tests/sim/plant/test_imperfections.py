@@ -30,8 +30,8 @@ from sim.plant.imperfections import (
     PlateErrors,
     draw_imperfections,
     draw_of_ensemble,
+    motion_of,
 )
-from sim.plant.voiced_base import motion_of
 
 AT = (0.08, 0.06)
 PERFECT = Imperfections()

@@ -25,8 +25,7 @@ from model.transients.base_motion import Term
 from model.transients.shaping import ONSET_WINDOW
 from only import only
 from paper_plate import make_paper_rig
-from sim.plant.plant import Plant
-from sim.plant.sampled import SampledPlant
+from sim.plant.plant import Plant, SampledPlant
 
 PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)
 CORNERS = [(0.0, 0.0), (0.3048, 0.0), (0.3048, 0.2286), (0.0, 0.2286)]
@@ -258,7 +257,7 @@ def test_contacts_are_solved_once(
     plant = Plant(reduced, coarse_rig.eras)
     plant.set_contacts(ONE)
     plant.set_contacts({})
-    monkeypatch.setattr("sim.plant.loaded_plates.plate_in_time", None)
+    monkeypatch.setattr("sim.plant.plant.plate_in_time", None)
     for _ in range(5):
         plant.skip(plant.time + 0.05)
         plant.set_contacts(ONE)

@@ -13,7 +13,7 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from recordings import read_recording
 from sim.bench.bench import Bench
-from sim.plant.accelerometer import Accelerometer, readings
+from sim.plant.fingers import Accelerometer, readings
 from sim.sensors import Recorder, Recording, write_recording
 
 RATE = 5000.0

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from sim.control import SimulationContext
     from sim.far_ends.wire_assignment import Wire
     from sim.plant.fingers import Accelerometer
-    from sim.process.simulation import Simulation
-    from sim.process.view import PlateView
+    from sim.process.simulation import PlateView, Simulation
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command("soft-amp")(soft_amp)
@@ -220,8 +219,7 @@ def _sensor(text: str) -> "Accelerometer":
 def _run(simulation: "Simulation", *, virtual_time: bool) -> None:
     import asyncio
 
-    from sim.process.simulation import make_fine_loop, run_simulation
-    from sim.process.virtual_time import SteppedLoop
+    from sim.process.simulation import SteppedLoop, make_fine_loop, run_simulation
 
     view = _LiveView() if sys.stdout.isatty() and simulation.firmware is None else None
     factory = SteppedLoop if virtual_time else make_fine_loop
@@ -251,7 +249,7 @@ class _LiveView:
         self._plate: PlateView | None = None
 
     def __call__(self, context: "SimulationContext") -> None:
-        from sim.process.view import PlateView, draw
+        from sim.process.simulation import PlateView, draw
 
         if self._plate is None:
             self._plate = PlateView(context.bench)

@@ -1,4 +1,9 @@
-"""The simulation as a process: a bench behind its wires, until a signal ends it."""
+"""The simulation as a process: a bench behind its wires, until a signal ends it.
+
+An event loop with a virtual clock that is stepped explicitly; I/O is served as usual.
+
+The live view of a simulation on the terminal: amplifiers, peak accelerations, fingers.
+"""
 
 import asyncio
 import contextlib
@@ -12,7 +17,14 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from model.arrays import FloatArray, lattice
 from model.rig.rig import Rig
+from model.vibration import G
 from registry import threads
 from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
@@ -24,8 +36,31 @@ from sim.firmware import FirmwareBench, running
 from sim.plant.fingers import Accelerometer, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
-from sim.process.virtual_time import SteppedLoop
 from sim.transport.pseudo_terminal import linked_urls
+
+STEP = 0.005  # s; the largest delay of a timer
+
+
+class SteppedLoop(asyncio.SelectorEventLoop):
+    """An event loop whose time begins at 0 s."""
+
+    def __init__(self) -> None:
+        self._now = 0.0
+        super().__init__()
+
+    def time(self) -> float:
+        """The present virtual time [s]."""
+        return self._now
+
+    async def step(self, seconds: float) -> None:
+        """Advance the time by so many seconds, and run the timers due in it."""
+        end = self._now + seconds
+        while self._now < end:
+            self._now = min(self._now + STEP, end)
+            # Twice: a due timer may schedule another call.
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+
 
 _VIEW_INTERVAL = 0.2  # s
 _NICE = 5  # beside firmware: its replies are due in milliseconds, while its samples can wait
@@ -191,3 +226,77 @@ async def _in_background(
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+
+
+WINDOW = 0.2  # s; of the peaks shown for fingers
+_SHADES = " ·-+*#@"
+_FULL = 5.0  # g; the last shade
+_THRESHOLD = 0.002  # of _FULL; smaller values are not drawn
+_COLUMNS, _ROWS = 28, 10
+_DECAY = 0.5  # of the peaks per picture
+
+
+class PlateView:
+    """Peak accelerations over a lattice of the plate (rows, columns) [m/s²], fading with time."""
+
+    def __init__(self, bench: Bench) -> None:
+        plate = bench.rig.plate
+        x = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * plate.length
+        y = (np.arange(_ROWS) + 0.5) / _ROWS * plate.width
+        self.begun = bench.time  # s
+        self._bench = bench
+        self._points = lattice(x, y)
+        self._peaks = np.zeros(len(self._points))
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Shapes at its points, in the present coordinates of the plate."""
+        return self._bench.shapes_at(self._points)
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Keep the peaks of accelerations (n, p) [m/s²]."""
+        np.maximum(self._peaks, np.abs(accelerations).max(axis=0), out=self._peaks)
+
+    def take(self) -> FloatArray:
+        """Return the peaks and fade them."""
+        peaks = self._peaks.copy()
+        self._peaks *= _DECAY
+        return peaks.reshape(_ROWS, _COLUMNS)
+
+
+def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
+    """Render the present state; without fingers it fits on 24 lines of 80 columns."""
+    bench = context.bench
+    amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")
+    for name, amplifier in bench.amplifiers.items():
+        summary = amplifier.summary(bench.time)
+        levels = "  ".join(f"{level:4.0%}" for level in summary.levels)
+        amplifiers.add_row(name, summary.state, summary.fault, str(summary.token), levels)
+    fingers = Table("finger", "at", "peak acceleration")
+    felt = bench.felt(bench.time - WINDOW, bench.time)
+    for name, (x, y) in bench.positions.items():
+        peak = f"{felt[name].peak.max() / G:.2f} g" if name in felt else ""
+        fingers.add_row(name, f"{x * 1000:.0f}, {y * 1000:.0f} mm", peak)
+    footer = [f"{bench.time - plate.begun:.1f} s"]
+    if context.recorder is not None:
+        full = ", full" if context.recorder.is_full else ""
+        footer.append(f"recording {context.recorder.path}: {context.recorder.seconds:.1f} s{full}")
+    touched = [fingers] if fingers.row_count else []
+    return Group(amplifiers, _picture(bench, plate.take()), *touched, Text("   ".join(footer)))
+
+
+def _picture(bench: Bench, peaks: FloatArray) -> Text:
+    """The plate with y upwards; O are fingers, E are ERAs."""
+    share = np.maximum(peaks / (_FULL * G) - _THRESHOLD, 0)
+    shade = np.ceil(share * (len(_SHADES) - 1)).astype(int)
+    rows = [[_SHADES[min(cell, len(_SHADES) - 1)] for cell in row] for row in shade]
+    size = bench.rig.plate.length, bench.rig.plate.width
+    places = [((era.x, era.y), "E") for era in bench.rig.eras]
+    places += [(at, "O") for at in bench.positions.values()]
+    for (x, y), mark in places:
+        column = min(int(x / size[0] * _COLUMNS), _COLUMNS - 1)
+        rows[min(int(y / size[1] * _ROWS), _ROWS - 1)][column] = mark
+    bar = "+" + "-" * _COLUMNS + "+"
+    lines = [bar, *(f"|{''.join(row)}|" for row in reversed(rows)), bar]
+    legend = f"peak acceleration: {_SHADES[1]} to {_SHADES[-1]} up to {_FULL:g} g; E ERA, O finger"
+    return Text("\n".join([*lines, legend]))

@@ -22,7 +22,7 @@ from recordings import read_recording
 from rig_files import write_rig
 from sim.bench.bench import Bench
 from sim.control import SimulationContext
-from sim.process.view import PlateView, draw
+from sim.process.simulation import PlateView, draw
 
 ROOT = example_rig_path().parent.parent
 TIMEOUT = 120  # s; for a loaded machine, not an expectation

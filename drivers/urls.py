@@ -2,7 +2,7 @@
 
 Kinds of lines between a host and amplifiers, and how closely clocks are held over each.
 
-They have the names of the lines that are simulated (`sim.transport.line_kinds`).
+They have the names of the lines that are simulated (`sim.transport.simulated_line`).
 """
 
 import re

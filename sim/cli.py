@@ -126,8 +126,8 @@ def sim(
         from sim.firmware import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
         from sim.process.simulation import Simulation
-        from sim.transport.line_kinds import PROMPT
-        from sim.transport.pseudo_terminal import links_by_amplifier
+        from sim.transport.far_end import links_by_amplifier
+        from sim.transport.simulated_line import PROMPT
 
         drawn = seed_of_plate(exact=exact, seed=seed)
         defaults = Wire(

@@ -28,8 +28,7 @@ from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.plant.imperfections import Imperfections, draw_imperfections
-from sim.transport.line import TwoWayLine
-from sim.transport.line_kinds import LineDelays, delays_of
+from sim.transport.simulated_line import LineDelays, TwoWayLine, delays_of
 
 _FORM = (
     "sim://RIG.yaml, optionally with ?control=PATH, &amplifier=NAME, &line=KIND, and &seed=N or "

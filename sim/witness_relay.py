@@ -20,7 +20,7 @@ from drivers.urls import Place
 from drivers.wires.known import address_of
 from model.errors import InputError
 from registry import threads
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import make_terminal
 
 _KINDS: dict[str, WireKind] = {
     **dict.fromkeys(("serial", "serial+tcp"), "serial"),

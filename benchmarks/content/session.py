@@ -26,7 +26,7 @@ from model.finger import FINGERTIP_RADIUS
 from registry import threads
 from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import draw_imperfections
-from sim.transport.line_kinds import PROMPT
+from sim.transport.simulated_line import PROMPT
 
 _chain: Any = support("chain").Chain
 _run_virtual: Any = support("virtual_loop").run_virtual

@@ -23,7 +23,7 @@ from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STA
 from drivers.protocol.records import Refusal, Values
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import make_terminal
 
 STEP = 0.005  # s; between changes of a tone that fades
 BEAT = 0.05  # s; between signs of life for the process that watches

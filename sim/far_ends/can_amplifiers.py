@@ -65,7 +65,7 @@ from registry import threads
 from sim.amplifier.simulated_amplifier import SILENCING_RAMP
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.transport.far_end import AmplifierPort, FarEnd, Send, Served
-from sim.transport.line import TwoWayLine
+from sim.transport.simulated_line import TwoWayLine
 
 TOGGLE = 0x0503_0000
 UNKNOWN_COMMAND = 0x0504_0001

@@ -27,7 +27,7 @@ from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.faults import Faults
 from sim.transport.far_end import HOST, TcpEnd, TerminalEnd
-from sim.transport.line_kinds import LINE_NAMES, PROMPT, delays_of
+from sim.transport.simulated_line import LINE_NAMES, PROMPT, delays_of
 
 _SERIAL_BITS, _MODBUS_BITS = 10, 11  # of a byte: start, eight data, parity on Modbus, stop
 

@@ -36,7 +36,7 @@ from sim.firmware import FirmwareBench, running
 from sim.plant.fingers import Accelerometer, Position
 from sim.plant.imperfections import Imperfections
 from sim.plant.plant import SAMPLE_RATE
-from sim.transport.pseudo_terminal import linked_urls
+from sim.transport.far_end import linked_urls
 
 STEP = 0.005  # s; the largest delay of a timer
 

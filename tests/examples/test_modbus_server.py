@@ -11,7 +11,7 @@ import pytest
 
 import era_haptics
 from drivers.judge.asking import judge, of_kind
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import make_terminal
 
 EXAMPLE = Path(era_haptics.__file__).parents[1] / "examples" / "modbus_server" / "modbus_server.py"
 FAILED = {"pieces", "exceptions"}

@@ -12,7 +12,7 @@ from typing import Any
 from drivers.errors import LinkError
 from drivers.ports import PORT_OPENER
 from registry import threads
-from sim.transport.pseudo_terminal import TERMINAL_MAKER, PseudoTerminal
+from sim.transport.far_end import TERMINAL_MAKER, PseudoTerminal
 from virtual_loop import VirtualLoop
 
 _PASSING = (50e-6, 900e-6)  # s; through driver and adapter

@@ -23,7 +23,7 @@ from registry import threads
 from rig_on_wire import after_each
 from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import Imperfections, draw_imperfections
-from sim.transport.line_kinds import LINE_KINDS, PROMPT
+from sim.transport.simulated_line import LINE_KINDS, PROMPT
 from soak_plan import FaultInjection, OperatorAction, Plan, TouchSequence
 from soak_plates import soak_rig, soak_source, soak_table, soak_timing
 from virtual_loop import START, Stuck, VirtualLoop, run_virtual

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 from sim.faults import FaultKind, FaultWindow
-from sim.transport.line_kinds import PROMPT
+from sim.transport.simulated_line import PROMPT
 
 KINDS: Mapping[str, Sequence[int | None]] = {
     "serial": (115_200, 921_600),

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.by_hand.reaching import Arrangement, arrangement_of
 from drivers.urls import CLOCK_ERRORS, SIMULATED
-from sim.transport.line_kinds import LINE_KINDS, PROMPT
+from sim.transport.simulated_line import LINE_KINDS, PROMPT
 
 STATED = 5e-6 / math.sqrt(3)
 """5 us at most either way, all errors alike, are so much rms."""

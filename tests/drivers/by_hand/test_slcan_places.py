@@ -14,7 +14,7 @@ from drivers.by_hand.cli import app
 from drivers.by_hand.reaching import Candidate, detect_slcan
 from drivers.wires.can_frames import CanFrame
 from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import make_terminal
 
 SPOKEN = b"V\rC\rS6\rL\rC\r"
 BEATS = ((0x701, b"\x05"), (0x77F, b"\x7f"), (0x700, b"\x05"), (0x181, b"\0"))

@@ -16,7 +16,7 @@ from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO
 from drivers.wires.serial_line import SerialWire
 from sim.amplifier.readings import AmplifierClock, Crystal
-from sim.transport.line_kinds import LINE_KINDS, LineDelays
+from sim.transport.simulated_line import LINE_KINDS, LineDelays
 from virtual_loop import run_virtual
 from words_line import MemoryLine, group_of, unaltered
 

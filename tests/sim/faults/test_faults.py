@@ -8,7 +8,7 @@ import pytest
 from model.errors import InputError
 from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.process.simulation import STEP, SteppedLoop
-from sim.transport.line import Line
+from sim.transport.simulated_line import Line
 
 FRAME = bytes(range(40))
 

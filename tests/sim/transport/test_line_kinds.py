@@ -4,7 +4,7 @@ import statistics
 
 import pytest
 
-from sim.transport.line_kinds import LINE_KINDS, Latency, LineKind
+from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
 
 PROMPT = Latency()
 FRAME_ERROR = 50e-6  # of a frame's length, relative

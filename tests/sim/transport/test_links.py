@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from model.errors import InputError
-from sim.transport.pseudo_terminal import linked_urls, links_by_amplifier
+from sim.transport.far_end import linked_urls, links_by_amplifier
 
 
 @pytest.fixture

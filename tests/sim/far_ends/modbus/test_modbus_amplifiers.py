@@ -10,7 +10,7 @@ from foreign_masters import MASTERS, drive
 from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from sim.transport.pseudo_terminal import make_terminal
+from sim.transport.far_end import make_terminal
 
 
 @asynccontextmanager

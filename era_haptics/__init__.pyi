@@ -1,11 +1,11 @@
 # The names of the package and where each is defined: for type checkers, and for `__init__.py`.
-from controller.api.async_client import AsyncClient as AsyncClient
+from controller.api.client import AsyncClient as AsyncClient
 from controller.api.client import Client as Client
-from controller.api.client_protocol import LeaseLost as LeaseLost
-from controller.api.client_protocol import Notification as Notification
-from controller.api.client_protocol import Unreachable as Unreachable
 from controller.api.jsonrpc import NotSilent as NotSilent
 from controller.api.jsonrpc import RpcError as RpcError
+from controller.api.link import LeaseLost as LeaseLost
+from controller.api.link import Notification as Notification
+from controller.api.link import Unreachable as Unreachable
 from drivers.by_hand.actions import BlockingAmplifier as BlockingAmplifier
 from drivers.errors import CommandRefused as CommandRefused
 from drivers.errors import DriverError as DriverError

@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.desk.session import ERA, Desk, Place, running
 from controller.api.client import Client
-from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
 from model.finger import detection_threshold

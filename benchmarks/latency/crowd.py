@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks.latency.machine import TIMEOUT, running
 from benchmarks.latency.session import RESTING, UNANSWERED, Session
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Unreachable
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 
 _FLOODS = Path(__file__).parents[2] / "tests" / "support" / "floods.py"
 RECONNECTING = ("again", 200)

@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.latency.far_side import FarSide
 from benchmarks.latency.machine import DAEMON_NICE, TIMEOUT, EndedEarly, running
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Unreachable
+from controller.api.client import AsyncClient
+from controller.api.link import Unreachable
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from model.rig.rig import Rig

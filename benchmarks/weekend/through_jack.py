@@ -45,7 +45,7 @@ from benchmarks.weekend.chain import (
     table,
 )
 from controller.api.client import Client
-from controller.api.client_protocol import LeaseLost
+from controller.api.link import LeaseLost
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
 from model.calibration.responses import WiredSensor

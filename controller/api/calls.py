@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from controller.api.client_protocol import make_params
+from controller.api.link import make_params
 from controller.api.methods import Method
 from controller.api.registered import METHODS
 from controller.api.schema import BY_PLACE, Empty, Message

@@ -4,23 +4,385 @@ with Client.connect() as era:
     print(era.status().state)
     with era.armed("my study"):
         era.touch([(0.10, 0.05)])
+
+asyncio client of the daemon's API; `controller.api.client` is the blocking one.
+
+async with await AsyncClient.connect() as era:
+    await era.subscribe("pattern")
+    async for event in era.events():
+        print(event.data)
 """
 
+import asyncio
 import functools
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager, suppress
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
-from controller.api.async_client import AsyncClient
-from controller.api.calls import Calls
-from controller.api.client_protocol import RESPONSE_TIMEOUT, Notification, Unreachable
-from controller.api.jsonrpc import RpcError
-from controller.api.methods import DEFAULT_LEASE, ArmResult
-from controller.api.registered import METHODS
-from registry.threads import LoopThread
+from controller.api.calls import AsyncCalls, Calls
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import (
+    RESPONSE_TIMEOUT,
+    ConnectionLost,
+    DaemonLink,
+    LeaseLost,
+    Notification,
+    Unreachable,
+    as_position,
+    find_socket,
+    make_params,
+    read_result,
+    touches_at,
+)
+from controller.api.methods import DEFAULT_LEASE, ArmResult, ClearParams, HelloParams
+from controller.api.registered import METHODS, SILENCING
+from controller.api.schema import Empty, Message, Topic, headline
+from registry.threads import LoopThread, pauses
+
+MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
+_MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
+_REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
+_RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
 
 _T = TypeVar("_T")
+_ResultT = TypeVar("_ResultT", bound=Message)
+
+
+class AsyncClient(AsyncCalls):
+    """A client of the daemon, made by `connect`; any number of calls may be pending.
+
+    Without that its first call connects. A lost connection, and one without a response in time, is
+    made again by the next call, with all subscriptions. Every method ends
+    within the timeout and raises RpcError for an error of the daemon, Unreachable (a LinkError)
+    without a response, and LeaseLost, except for `stop` and `disarm`, once the lease of `armed` is
+    lost.
+    """
+
+    def __init__(self, path: Path, *, name: str, timeout: float) -> None:
+        self.path = path
+        self._name = name
+        self._timeout = timeout
+        self._link: DaemonLink | None = None
+        self._following: asyncio.Task[None] | None = None
+        self._connecting = asyncio.Lock()
+        self._is_closed = False
+        self._rates: dict[Topic, float | None] = {}  # of the subscriptions
+        self._events: deque[tuple[int, Notification]] = deque()
+        self._lost = 0  # events that were dropped here before the next one
+        self._connections = 0
+        self._changed = asyncio.Event()  # an event arrived, or the connection was lost
+        self._lease: ArmResult | None = None  # of `armed`
+        self._lease_lost: LeaseLost | None = None
+        self._renewing: asyncio.Task[None] | None = None
+        self._seen: tuple[int, int] | None = None  # connection and epoch of what was seen last
+
+    @classmethod
+    async def connect(
+        cls,
+        path: Path | str | None = None,
+        *,
+        name: str = "python",
+        timeout: float = RESPONSE_TIMEOUT,
+    ) -> Self:
+        """Connect to the daemon at a socket (default: the usual one) and introduce this client.
+
+        Raises Unreachable if no daemon answers, one of another major version, or a process that is
+        not to be believed.
+        """
+        client = cls(find_socket(path), name=name, timeout=timeout)
+        await client._within_timeout(client._repeated(client._connected))
+        return client
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection; the daemon lifts this client's fingers."""
+        self._is_closed = True
+        self._changed.set()
+        if self._renewing is not None:
+            self._renewing.cancel()
+        if self._link is not None:
+            self._link.abort()
+        await asyncio.sleep(0)
+
+    async def touch(
+        self, positions: Sequence[tuple[float, float]], *, source: str = "python"
+    ) -> None:
+        """Report all fingers of a source, at x, y [m]; valid for 150 ms, so repeat it."""
+        await self._call(Empty, "touch", source=source, touches=touches_at(positions))
+
+    async def play(
+        self,
+        effect: str | Sequence[tuple[float, float, float]],
+        position: tuple[float, float],
+        *,
+        level_db_sl: float | None = None,
+        taps: Sequence[tuple[float, float, float]] = (),
+        loop: bool = False,
+    ) -> None:
+        """Play an effect at the finger nearest to x, y [m]; its status says what it feels.
+
+        effect: its name, or points of what lasts: time [s], intensity and sharpness, 0 to 1; taps:
+        the same of short ones beside them.
+        """
+        x, y = as_position(position)
+        played = {"effect": effect} if isinstance(effect, str) else {"points": [*map(list, effect)]}
+        more = {"level_db_sl": level_db_sl, "taps": [*map(list, taps)], "loop": loop}
+        await self._call(Empty, "play", **played, x_m=x, y_m=y, **more)
+
+    async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
+        """Receive notifications of topics; see `events`."""
+        await self._call(Empty, "subscribe", topics=list(topics), rate_hz=rate_hz)
+        for topic in topics:
+            self._rates.pop(topic, None)
+            self._rates[topic] = rate_hz
+
+    async def unsubscribe(self, *topics: Topic) -> None:
+        """Receive no more notifications of topics."""
+        await self._call(Empty, "unsubscribe", topics=list(topics))
+        for topic in topics:
+            self._rates.pop(topic, None)
+
+    @asynccontextmanager
+    async def armed(
+        self, owner: str, *, lease_s: float = DEFAULT_LEASE
+    ) -> AsyncIterator[ArmResult]:
+        """Armed within the block, disarmed after it; the lease is renewed meanwhile.
+
+        Raises LeaseLost at the next call and at the end of the block once the lease is lost.
+        """
+        lease = await self.begin_armed(owner, lease_s=lease_s)
+        try:
+            yield lease
+        except BaseException:
+            with suppress(RpcError, Unreachable):
+                await self.end_armed()
+            raise
+        await self.end_armed()
+
+    async def begin_armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
+        """Arm, and renew the lease until `end_armed`: the beginning of `armed`."""
+        arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
+        try:
+            lease = await asyncio.shield(arming)
+        except asyncio.CancelledError:
+            with suppress(RpcError, Unreachable):  # if refused, another client's lease
+                await self.disarm(lease=(await arming).lease)
+            raise
+        self._lease, self._lease_lost = lease, None
+        self._renewing = asyncio.create_task(self._keep_renewing(lease), name="lease")
+        return lease
+
+    async def end_armed(self) -> None:
+        """Disarm: the end of `armed`; raises LeaseLost if the lease was lost before."""
+        lease, lost = self._lease, self._lease_lost
+        self._release()
+        self._lease_lost = None
+        if lost is not None:
+            raise lost
+        if lease is None:  # ended by a call of this client
+            return
+        try:
+            await self.disarm(lease=lease.lease)
+        except RpcError as error:
+            if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
+                raise
+            raise await self._why_lost(error) from error
+
+    async def events(self) -> AsyncIterator[Notification]:
+        """Yield notifications as they arrive, until `close`; raises Unreachable."""
+        while (event := await self.next_event()) is not None:
+            yield event
+
+    async def next_event(self, *, timeout: float | None = None) -> Notification | None:
+        """Wait for a notification; None after a timeout [s] or `close`; raises Unreachable.
+
+        A lost connection is made again, for which the client's timeout holds. Of those that are not
+        taken the oldest are dropped, and counted in `lost` of the next one. Raises LeaseLost,
+        after the notifications that have arrived, once the lease of `armed` is lost.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                while not self._events and not self._is_closed:
+                    self._check_lease()
+                    self._changed.clear()
+                    if self._link is None or not self._link.is_open:
+                        await self._within_timeout(
+                            self._repeated(
+                                self._connected,
+                                after=(RpcError, Unreachable),
+                                duration=0.9 * self._timeout,
+                            )
+                        )
+                    else:
+                        await self._changed.wait()
+        if not self._events:
+            return None
+        connection, event = self._events.popleft()
+        self._see(connection, event.data.get("epoch"))
+        lost, self._lost = self._lost, 0
+        return replace(event, lost=event.lost + lost)
+
+    async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
+        """Call any method and return its result.
+
+        What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
+        state event.
+        """
+        if method not in SILENCING:
+            self._check_lease()
+        if isinstance(params, ClearParams) and params.epoch is None and self._seen is not None:
+            params = params.model_copy(update={"epoch": self._seen[1]})
+        if method == "stop":
+            self._release()
+        found = await self._within_timeout(self._send(method, params))
+        if method in SILENCING:
+            self._release()
+        elif isinstance(params, HelloParams):
+            self._name = params.client
+        read = read_result(found, result)
+        self._see(self._connections, getattr(read, "epoch", None))
+        return read
+
+    async def _call(self, result: type[_ResultT], method: str, **values: object) -> _ResultT:
+        """Call a method with these parameters."""
+        return await self.call(method, make_params(method, **values), result)
+
+    async def _send(self, method: str, params: Message) -> Any:
+        """Send a request, again over new connections if that is harmless."""
+
+        async def attempt() -> Any:
+            return await (await self._connected()).call(method, params)
+
+        if method in METHODS and not METHODS[method].is_repeated:
+            return await (await self._repeated(self._connected)).call(method, params)
+        after = Unreachable if method == "stop" else ConnectionLost
+        return await self._repeated(attempt, after=after)
+
+    async def _repeated(
+        self,
+        attempt: Callable[[], Awaitable[_T]],
+        *,
+        after: type[Exception] | tuple[type[Exception], ...] = ConnectionLost,
+        duration: float = _REPEATED_FOR,
+    ) -> _T:
+        """The result of an attempt, which is repeated after some errors for a while [s]."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + duration
+        following = pauses(first=duration / 100, maximum=duration / 10)
+        while True:
+            try:
+                return await attempt()
+            except after:
+                pause = next(following)
+                if self._is_closed or loop.time() + pause >= end:
+                    raise
+                await asyncio.sleep(pause)
+
+    async def _within_timeout(self, work: Any) -> Any:
+        try:
+            async with asyncio.timeout(self._timeout):
+                return await work
+        except TimeoutError as error:
+            if self._link is not None:  # else what waits in it would grow without bounds
+                self._link.abort()
+            raise Unreachable.at(self.path, error) from error
+
+    async def _connected(self) -> DaemonLink:
+        """The connection, made again if it was lost; raises RpcError and Unreachable."""
+        async with self._connecting:
+            if self._is_closed:
+                raise Unreachable(f"this client of the daemon at {self.path} is closed")
+            if self._link is None or not self._link.is_open:
+                link = await DaemonLink.open(self.path, self._name)
+                connection = self._connections + 1
+                following = link.follow(partial(self._received, connection))
+                self._following = asyncio.create_task(following, name="API")
+                self._following.add_done_callback(lambda _: self._changed.set())
+                try:
+                    for rate in dict.fromkeys(self._rates.values()):
+                        topics = [topic for topic, each in self._rates.items() if each == rate]
+                        params = make_params("subscribe", topics=topics, rate_hz=rate)
+                        await link.call("subscribe", params)
+                except BaseException:
+                    link.abort()
+                    raise
+                self._link, self._connections = link, connection
+            return self._link
+
+    def _received(self, connection: int, event: Notification) -> None:
+        if len(self._events) == MAX_QUEUED_EVENTS:
+            self._lost += 1 + self._events.popleft()[1].lost
+        self._events.append((connection, event))
+        self._changed.set()
+
+    def _see(self, connection: int, epoch: int | None) -> None:
+        """Note an epoch seen, unless a later one was: another connection may begin lower."""
+        if epoch is not None:
+            self._seen = max(self._seen or (0, 0), (connection, epoch))
+
+    def _check_lease(self) -> None:
+        """Raise LeaseLost once the lease of `armed` is lost."""
+        if self._lease_lost is not None:
+            raise self._lease_lost.with_traceback(None)
+
+    def _release(self) -> None:
+        """Stop renewing the lease."""
+        self._lease = None
+        if self._renewing is not None:
+            self._renewing.cancel()
+            self._renewing = None
+
+    async def _keep_renewing(self, lease: ArmResult) -> None:
+        """Renew a lease until it is lost, over a new connection if need be.
+
+        While no daemon responds it is tried again for as long as the lease lasts. Nothing arms
+        again: a lease that the daemon has ended is lost.
+        """
+        loop = asyncio.get_running_loop()
+        params = make_params("renew", lease=lease.lease)
+        expires_at = loop.time() + lease.lease_s
+        pause = _RENEWAL_INTERVAL
+        reason: RpcError | Unreachable | None = None
+        while loop.time() < expires_at:
+            await asyncio.sleep(min(pause, expires_at - loop.time()))
+            sent_at = loop.time()
+            try:
+                async with asyncio.timeout_at(expires_at):
+                    await self._send("renew", params)
+            except Unreachable as error:
+                reason, pause = error, _MIN_RETRY_INTERVAL
+            except TimeoutError as error:
+                reason = reason or Unreachable.at(self.path, error)
+            except RpcError as error:
+                reason = error
+                if error.code is not ErrorCode.BUSY:
+                    break
+                pause = _MAX_RETRY_INTERVAL
+            else:
+                expires_at, pause = sent_at + lease.lease_s, _RENEWAL_INTERVAL
+                reason = None
+        if self._lease is lease:
+            self._lease_lost = await self._why_lost(reason)
+            self._changed.set()
+
+    async def _why_lost(self, reason: RpcError | Unreachable | None) -> LeaseLost:
+        """The loss of the lease with the daemon's cause, where the daemon has refused it."""
+        if isinstance(reason, RpcError):
+            with suppress(RpcError, Unreachable):
+                status = await self.status()
+                return LeaseLost(headline(status.state, status.cause))
+        return LeaseLost(str(reason))
+
+
 _P = ParamSpec("_P")
 
 

@@ -2,18 +2,44 @@
 
 Nothing here waits. The server takes lines one at a time from all connections in turn, so that a
 flood on one costs the others nothing; output that a client does not read is bounded, then dropped.
+
+Which clients are connected: acceptance of connections, and places for clients.
+
+Connections to the daemon's socket are accepted one per turn, and refused above a rate per process.
+A refusal costs some microseconds, so that processes that connect again and again delay neither the
+control loop nor the clients that wait behind them in the queue.
+
+However many clients there are, another one can connect and `stop`, as there are places in reserve
+for methods that silence. A client that has sent nothing yet is evicted first, then an idle
+subscriber, then any idle client; never one that holds the arming lease or waits for a response. The
+reserve is shared among processes: a client of the one with the most there is evicted, silent ones
+first, but none whose first bytes have arrived unread.
+
+When clients of the API are served: in short turns, with what the control loop leaves.
+
+A share of the event loop's processor time, saved up for bursts, is for clients that touch or hold
+the lease, another one for all other clients. A turn is short, and waits while a touch is on its way
+to the wire. A client whose input may hold a stop is served at once, within neither limit.
 """
 
 import asyncio
+import contextlib
 import math
+import os
+import resource
 import select
+import socket
 import time
+from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, InvalidRequest, RpcError, error_line
+from controller.api.link import credentials_of
 from controller.api.schema import Topic
-from controller.process.rate_limit import RateLimiter
+from controller.process.rate_limit import RateLimiter, Rates
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses
@@ -221,3 +247,289 @@ class Connection(asyncio.BufferedProtocol):
         """Close at once."""
         if self._transport is not None:
             self._transport.abort()
+
+
+MAX_CONNECTIONS = 32  # for all methods
+RESERVE = 8  # further ones, for the methods in reserve alone
+IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
+SILENT_TIMEOUT = 0.1  # s; the same for one that has sent nothing yet
+MAX_CONNECTION_RATE = 20.0  # 1/s; connections of one process
+CONNECTION_BURST = 64  # connections
+_QUEUE = 512  # connections
+_REFUSALS_PER_TURN = 8
+_PAUSE = 0.1  # s; while there is no descriptor at all
+
+
+class Admission:
+    """The connected clients; holds_lease: whether a client does."""
+
+    def __init__(
+        self, *, holds_lease: Callable[[Connection], bool], clock: Callable[[], float]
+    ) -> None:
+        self.admitted: set[Connection] = set()
+        self._holds_lease = holds_lease
+        self._clock = clock
+
+    def admit(self, new: Connection) -> None:
+        """Admit a new client, if necessary in place of another, or close it."""
+        new.is_reserve = not self._has_room()
+        if new.is_reserve:
+            reserve = [each for each in self.admitted if each.is_reserve]
+            if len(reserve) >= RESERVE:
+                evicted = _evictable(reserve, new)
+                if evicted is None:
+                    new.abort()
+                    return
+                self._drop(evicted)
+        self.admitted.add(new)
+
+    def promote(self, one: Connection) -> bool:
+        """Whether a client is now served all methods."""
+        if one.is_reserve and self._has_room():
+            one.is_reserve = False
+        return not one.is_reserve
+
+    def _has_room(self) -> bool:
+        full = [each for each in self.admitted if not each.is_reserve]
+        if len(full) < MAX_CONNECTIONS:
+            return True
+        candidates = [each for each in full if not each.pending and not self._holds_lease(each)]
+        now, timeout = self._clock(), SILENT_TIMEOUT
+        idle = [each for each in candidates if not each.has_spoken]
+        if not idle:
+            timeout = IDLE_TIMEOUT
+            expired = [each for each in candidates if now - each.received_at >= timeout]
+            idle = [each for each in expired if each.topics] or expired
+        evictable = min(idle, key=lambda each: each.received_at, default=None)
+        if evictable is None or now - evictable.received_at < timeout:
+            return False
+        self._drop(evictable)
+        return True
+
+    def _drop(self, one: Connection) -> None:
+        self.admitted.discard(one)
+        one.abort()
+
+
+def _evictable(reserve: list[Connection], new: Connection) -> Connection | None:
+    """The client in reserve that a new one replaces, or None.
+
+    Of its own process, or of one with more clients there.
+    """
+    counts = Counter(each.process for each in reserve)
+    candidates = [
+        each
+        for each in reserve
+        if not each.pending
+        and (each.process == new.process or counts[each.process] > counts[new.process])
+        and not each.is_unread
+    ]
+    return min(
+        candidates,
+        key=lambda each: (-counts[each.process], each.has_spoken, each.received_at),
+        default=None,
+    )
+
+
+class Acceptor:
+    """Accepts connections of a bound Unix socket.
+
+    make_connection: called with the id of the connecting process; clock [s].
+    """
+
+    def __init__(
+        self,
+        bound: socket.socket,
+        make_connection: Callable[[int], Connection],
+        *,
+        clock: Callable[[], float],
+    ) -> None:
+        self._bound = bound
+        self._make_connection = make_connection
+        self._loop = asyncio.get_running_loop()
+        self._beginning: set[asyncio.Task[object]] = set()
+        self._rates = Rates(MAX_CONNECTION_RATE, burst=CONNECTION_BURST, clock=clock)
+        self._spare = _spare_descriptor()
+        bound.setblocking(False)
+        bound.listen(_QUEUE)
+        self._start_serving()
+
+    async def close(self) -> None:
+        """Stop listening; return once what was accepted is open."""
+        self._loop.remove_reader(self._bound)
+        self._bound.close()
+        if self._spare is not None:
+            os.close(self._spare)
+        await asyncio.gather(*self._beginning, return_exceptions=True)
+
+    def _start_serving(self) -> None:
+        if self._bound.fileno() >= 0:
+            self._loop.add_reader(self._bound, self._accept)
+
+    def _accept(self) -> None:
+        """Accept one connection, after at most some that are refused."""
+        for _ in range(_REFUSALS_PER_TURN):
+            try:
+                accepted, _ = self._bound.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return
+            except OSError:
+                self._refuse_without_descriptors()
+                return
+            process, _ = credentials_of(accepted) or (0, 0)
+            if self._rates.of(process).take():
+                make = partial(self._make_connection, process)
+                task = self._loop.create_task(self._loop.connect_accepted_socket(make, accepted))
+                self._beginning.add(task)
+                task.add_done_callback(self._beginning.discard)
+                return
+            accepted.close()
+
+    def _refuse_without_descriptors(self) -> None:
+        """Refuse a connection by means of the spare descriptor; pause if it was taken meanwhile."""
+        if self._spare is not None:
+            os.close(self._spare)
+            with contextlib.suppress(OSError):
+                self._bound.accept()[0].close()
+        self._spare = _spare_descriptor()
+        if self._spare is None:
+            self._loop.remove_reader(self._bound)
+            self._loop.call_later(_PAUSE, self._start_serving)
+
+
+def _spare_descriptor() -> int | None:
+    """A descriptor to be given up for another, or None if there is no more."""
+    try:
+        return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
+
+
+MIN_DESCRIPTORS = 64
+_MAX_DESCRIPTORS = 65_536
+
+
+def allow_many_descriptors() -> int:
+    """Raise the limit, so that idle connections do not use it up; return it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limit = _MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else hard
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+        return limit
+    return soft
+
+
+MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients of either share
+SHARE = 0.25  # of the event loop's time, for those that touch, and for the others together
+BURST = 0.02  # s of processor time, saved up
+MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
+_RECHECK = 0.0005  # s; of a turn that is deferred
+
+
+@dataclass(eq=False, slots=True)
+class _Lane:
+    """Clients that wait, and what is known of their next turn.
+
+    budget: of processor time; is_urgent: they wait for nothing, but count in it.
+    """
+
+    budget: RateLimiter
+    is_urgent: bool = False
+    waiting: deque[Connection] = field(default_factory=deque)
+    is_scheduled: bool = False
+    deferred_since: float | None = None
+
+
+class Turns:
+    """Serves waiting clients in turn, a line of each.
+
+    serve: serves one line of a client; is_first: whether a client touches or holds the lease;
+    is_busy: whether a touch is on its way to the wire; clock [s]; processor_time: of this thread
+    [s].
+    """
+
+    def __init__(
+        self,
+        serve: Callable[[Connection], None],
+        *,
+        is_first: Callable[[Connection], bool],
+        is_busy: Callable[[], bool],
+        clock: Callable[[], float],
+        processor_time: Callable[[], float],
+    ) -> None:
+        self._serve = serve
+        self._is_busy = is_busy
+        self._clock = clock
+        self._processor_time = processor_time
+        self._is_first = is_first
+        first, others = (RateLimiter(SHARE, burst=BURST, clock=clock) for _ in range(2))
+        self._first, self._others = _Lane(first), _Lane(others)
+        self._urgent = _Lane(others, is_urgent=True)
+
+    def add(self, connection: Connection) -> None:
+        """Serve a client that has lines."""
+        lanes = (self._urgent, self._first, self._others)
+        waits_in = next((each for each in lanes if connection in each.waiting), None)
+        if connection.is_urgent:
+            lane = self._urgent
+        elif waits_in is not None:
+            return
+        else:
+            lane = self._first if self._is_first(connection) else self._others
+        if lane is not waits_in:
+            if waits_in is not None:
+                waits_in.waiting.remove(connection)
+            lane.waiting.append(connection)
+            if lane.is_urgent:  # before what has arrived meanwhile
+                asyncio.get_running_loop().call_soon(self._take_turn, lane)
+            else:
+                self._schedule(lane)
+
+    def _schedule(self, lane: _Lane, delay: float = 0.0) -> None:
+        """Schedule a turn unless one is: after a delay [s], or in the next iteration but one.
+
+        Data that arrived meanwhile and what it wakes, such as the control loop for a touch, run
+        first.
+        """
+        if not lane.waiting or lane.is_scheduled:
+            return
+        lane.is_scheduled = True
+        loop = asyncio.get_running_loop()
+        if delay > 0:
+            loop.call_later(delay, self._take_turn, lane)
+        else:
+            loop.call_soon(loop.call_soon, self._take_turn, lane)
+
+    def _take_turn(self, lane: _Lane) -> None:
+        """Serve a line of each client, round and round, until the turn's time is up."""
+        lane.is_scheduled = False
+        if not lane.is_urgent and (delay := self._delay(lane)) > 0:
+            self._schedule(lane, delay)
+            return
+        began_at, end = self._processor_time(), time.perf_counter() + MAX_TURN
+        reading_time = 0.0
+        lane.deferred_since = None
+        try:
+            while lane.waiting:
+                connection = lane.waiting.popleft()
+                self._serve(connection)
+                reading_time += connection.reading_time
+                connection.reading_time = 0.0
+                if connection.has_lines:
+                    self.add(connection)
+                connection.close_if_finished()
+                if time.perf_counter() >= end:
+                    break
+        finally:  # whatever fails: others wait, perhaps with a stop
+            lane.budget.spend(self._processor_time() - began_at + reading_time)
+            self._schedule(lane)
+
+    def _delay(self, lane: _Lane) -> float:
+        """Return the time [s] by which the turn that is due has to wait, 0 for none."""
+        if self._is_busy():
+            now = self._clock()
+            if lane.deferred_since is None:
+                lane.deferred_since = now
+            if now - lane.deferred_since < MAX_DEFERRAL:
+                return _RECHECK
+        return lane.budget.pause()

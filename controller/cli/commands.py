@@ -57,7 +57,7 @@ def gateway(
     from controller.gateway.settings import Settings, read_token, require_gateway
 
     require_gateway()
-    from controller.api.place import find_socket
+    from controller.api.link import find_socket
     from controller.gateway.serving import serve
 
     host, port = _host_and_port(listen)

@@ -231,7 +231,7 @@ def watch(
     from typing import cast
 
     from controller.api.schema import Topic
-    from controller.api.topics import TOPICS
+    from controller.api.server import TOPICS
     from controller.cli.shown import show_event
 
     selected = topics or _DEFAULT_TOPICS
@@ -270,8 +270,8 @@ def connected(socket: Path | None, *, timeout: float | None = None) -> "Iterator
     timeout [s]: for each call, the client's own if None.
     """
     from controller.api.client import Client
-    from controller.api.client_protocol import RESPONSE_TIMEOUT
     from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
+    from controller.api.link import RESPONSE_TIMEOUT
 
     with Client.connect(socket, name="era", timeout=timeout or RESPONSE_TIMEOUT) as era:
         try:

@@ -3,7 +3,7 @@
 from datetime import datetime
 
 from controller.api.amplifier_status import AmplifierStatus
-from controller.api.client_protocol import Notification
+from controller.api.link import Notification
 from controller.api.methods import StatusResult
 from controller.api.schema import ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import in_words

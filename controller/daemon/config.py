@@ -90,7 +90,7 @@ def load_daemon_config(path: Path) -> DaemonConfig:
 
 def daemon_config_of(document: Document) -> DaemonConfig:
     """Load what a daemon's file names; raises as `load_daemon_config`."""
-    from controller.api.place import default_socket  # not on Windows, where rigs are checked
+    from controller.api.link import default_socket  # not on Windows, where rigs are checked
 
     _check_kind(document)
     validation = Validation(document, DaemonSection)

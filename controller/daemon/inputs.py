@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Literal
 
 from controller.api.schema import TouchInputStatus
-from controller.api.topics import InputsEvent
+from controller.api.server import InputsEvent
 from controller.daemon.config import TouchInput
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import ALIGNED, TouchFrame, TouchSource

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.topics import LayoutEvent
+from controller.api.server import LayoutEvent
 from controller.daemon.config import DaemonConfig
 from controller.daemon.reload import ConfigChange, warn_of_bands
 from controller.effects.player import EffectPlayer

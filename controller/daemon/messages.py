@@ -23,7 +23,7 @@ from controller.api.schema import (
     RigSummary,
     TableSummary,
 )
-from controller.api.topics import ContactsEvent, PatternEvent, SilenceEvent
+from controller.api.server import ContactsEvent, PatternEvent, SilenceEvent
 from controller.daemon.config import DaemonConfig
 from controller.effects.layout import SurfaceLayout
 from controller.operation.states import Loss

@@ -19,7 +19,7 @@ from controller.api.schema import (
     LearningSummary,
     PlateEvent,
 )
-from controller.api.topics import (
+from controller.api.server import (
     AmplifiersEvent,
     Hub,
     InputsEvent,

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from controller.api.admission import MIN_DESCRIPTORS, allow_many_descriptors
+from controller.api.connection import MIN_DESCRIPTORS, allow_many_descriptors
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.config_sections import loopback_address
 from controller.daemon.daemon import Daemon

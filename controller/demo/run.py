@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, load_daemon_config

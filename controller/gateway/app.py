@@ -13,8 +13,7 @@ from aiohttp.typedefs import Handler
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic.json_schema import models_json_schema
 
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import (
     ERROR_MEANINGS,
     ErrorCode,
@@ -27,6 +26,7 @@ from controller.api.jsonrpc import (
     request_line,
     unknown_method,
 )
+from controller.api.link import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
 from controller.api.methods import Method
 from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import API_VERSION, Message

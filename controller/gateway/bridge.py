@@ -13,9 +13,8 @@ from pathlib import Path
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError, read_request
-from controller.api.link import DaemonLink
+from controller.api.link import DaemonLink, Unreachable
 from controller.api.registered import SILENCING
 from controller.gateway.field import DrawnField
 

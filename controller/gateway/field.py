@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from controller.api.client_protocol import Notification, read_line, result_of
 from controller.api.jsonrpc import request_line
-from controller.api.link import DaemonLink
+from controller.api.link import DaemonLink, Notification, read_line, result_of
 from controller.api.schema import PlayedTone
 from model.arrays import ComplexArray, lattice
 from model.finger import detection_threshold

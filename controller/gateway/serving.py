@@ -12,7 +12,7 @@ from collections.abc import Callable
 from aiohttp import web
 from aiohttp.http import HttpProcessingError
 
-from controller.api.admission import allow_many_descriptors
+from controller.api.connection import allow_many_descriptors
 from controller.gateway.app import Gateway
 from controller.gateway.connections import CLIENT_TIMEOUT, ConnectionAcceptor
 from controller.gateway.settings import Settings

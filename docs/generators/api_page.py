@@ -7,8 +7,8 @@ from controller.api.jsonrpc import ERROR_MEANINGS
 from controller.api.methods import Method
 from controller.api.registered import METHODS
 from controller.api.schema import Message
+from controller.api.server import TOPICS, EventParams
 from controller.api.summaries import SUMMARIES
-from controller.api.topics import TOPICS, EventParams
 from message_types import Models, Notation, each_model
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.schema import headline
-from controller.api.topics import StateEvent
+from controller.api.server import StateEvent
 from controller.daemon.config_sections import (
     DaemonSection,
     DumpSection,

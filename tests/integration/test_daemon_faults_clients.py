@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 from daemon_bench import PATIENCE, far_end, until
 from daemon_process import (
     DaemonProcess,

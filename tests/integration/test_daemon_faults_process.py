@@ -19,7 +19,7 @@ import httpx
 import pytest
 
 import patient_daemon
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.play.selection import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
 from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon

@@ -12,7 +12,7 @@ import dashboard_pictures
 from chromium import Page
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import ContactStatus, DaemonStateName
-from controller.api.topics import Hub, LayoutEvent, PatternEvent, StateEvent
+from controller.api.server import Hub, LayoutEvent, PatternEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
 from daemon_bench import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard

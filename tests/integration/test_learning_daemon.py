@@ -14,7 +14,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.schema import LearningSummary
 from controller.daemon.daemon import Daemon
 from controller.demo.touch_row import FingerVibration, steady_contrast_db

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from daemon_bench import PATIENCE, PLACE, READY, daemon_at, holding, ready, until, until_state
 from patient_daemon import wait_long
 from sound_card import SoftAmp, capture_on, jack_server

@@ -15,7 +15,7 @@ import pytest
 
 from chromium import Page, open_browser
 from controller.api.client import Client
-from controller.api.topics import StateEvent
+from controller.api.server import StateEvent
 from daemon_bench import PATIENCE
 from gateway_bench import (
     TOKEN,

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import model
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.methods import StatusResult
 from daemon_bench import PATIENCE, holding, next_event, ready, until
 from daemon_process import STARTING

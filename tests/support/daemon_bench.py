@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from chain import Chain
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Notification
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import Notification
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.process.log import LogThread

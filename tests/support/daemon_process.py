@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from daemon_bench import (
     ENABLED,

@@ -53,8 +53,7 @@ from controller.api.schema import (
     TableSummary,
     Topic,
 )
-from controller.api.server import ApiServer
-from controller.api.topics import Hub, StateEvent
+from controller.api.server import ApiServer, Hub, StateEvent
 from daemon_bench import PATIENCE, daemon_table, write_daemon
 from installed_program import ERA
 from model.rig.rig_file import parse_rig

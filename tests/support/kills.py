@@ -20,9 +20,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Unreachable
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 from daemon_bench import until, until_state
 from daemon_process import (
     REACTION,

@@ -13,11 +13,17 @@ from typing import cast
 
 import pytest
 
-from controller.api import turns
-from controller.api.admission import MAX_CONNECTIONS, Acceptor, Admission
-from controller.api.connection import MAX_REQUEST_RATE, MAX_UNREAD_BYTES, Connection
+from controller.api import connection as turns
+from controller.api.connection import (
+    MAX_CONNECTIONS,
+    MAX_REQUEST_RATE,
+    MAX_UNREAD_BYTES,
+    Acceptor,
+    Admission,
+    Connection,
+)
 from controller.api.schema import MAX_RATE, Message
-from controller.api.topics import ContactsEvent, Hub, LogEvent
+from controller.api.server import ContactsEvent, Hub, LogEvent
 from registry.threads import no_long_collections
 from served_api import ServedApi, Wire, feed, request, serving
 

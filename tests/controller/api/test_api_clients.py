@@ -19,14 +19,19 @@ from typing import cast
 import pytest
 
 import controller
-from controller.api.async_client import MAX_QUEUED_EVENTS, AsyncClient
-from controller.api.client import Client
-from controller.api.client_protocol import ConnectionLost, LeaseLost, Unreachable
+from controller.api.client import MAX_QUEUED_EVENTS, AsyncClient, Client
 from controller.api.jsonrpc import ErrorCode, RpcError, event_line
-from controller.api.link import DaemonLink
-from controller.api.place import SYSTEM_SOCKET, check_peer, find_socket
+from controller.api.link import (
+    SYSTEM_SOCKET,
+    ConnectionLost,
+    DaemonLink,
+    LeaseLost,
+    Unreachable,
+    check_peer,
+    find_socket,
+)
 from controller.api.registered import METHODS
-from controller.api.topics import LogEvent
+from controller.api.server import LogEvent
 from daemon_bench import (
     PLACE,
     daemon_at,
@@ -201,7 +206,7 @@ async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert found is not None
     code = re.sub(r"^    ", "", found[1], flags=re.MULTILINE)
     async with running_daemon(tmp_path) as bench:
-        monkeypatch.setattr("controller.api.async_client.find_socket", lambda path: bench.socket)
+        monkeypatch.setattr("controller.api.client.find_socket", lambda path: bench.socket)
         async with await bench.client() as era:
             await until_state(era, READY)
             await asyncio.to_thread(exec, code, {})
@@ -413,7 +418,7 @@ def test_clients_use_the_socket_of_the_environment(
 ) -> None:
     """It is taken whether or not a daemon is there; a given path goes first."""
     monkeypatch.setenv("ERA_HAPTICS_SOCKET", str(tmp_path / "own.sock"))
-    monkeypatch.setattr("controller.api.place.SYSTEM_SOCKET", tmp_path)  # exists
+    monkeypatch.setattr("controller.api.link.SYSTEM_SOCKET", tmp_path)  # exists
     assert find_socket(None) == tmp_path / "own.sock"
     assert find_socket("given.sock") == Path("given.sock")
 

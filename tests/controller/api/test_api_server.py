@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from controller.api import turns
+from controller.api import connection
 from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import StatusResult, TouchParams
 from controller.api.server import ApiServer
@@ -118,7 +118,7 @@ async def test_arm_is_not_carried_out_after_what_silences(
     monkeypatch: pytest.MonkeyPatch, silencing: str
 ) -> None:
     """Both in the same bytes: it ends disarmed; the other way round it is armed."""
-    monkeypatch.setattr(turns, "MAX_TURN", 1.0)  # else the arming may have begun by then
+    monkeypatch.setattr(connection, "MAX_TURN", 1.0)  # else the arming may have begun by then
     served = ServedApi()
     served.may_arm.set()
     client, wire = served.client()

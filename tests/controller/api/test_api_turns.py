@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from controller.api import turns
+from controller.api import connection
 from served_api import ServedApi, feed, request
 from virtual_loop import in_virtual_time
 
@@ -25,7 +25,7 @@ def serve(**costs: float) -> ServedApi:
 @pytest.fixture(autouse=True)
 def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """End turns by the number of lines, as virtual time stands still meanwhile."""
-    monkeypatch.setattr(turns, "MAX_TURN", 0.0)
+    monkeypatch.setattr(connection, "MAX_TURN", 0.0)
 
 
 @in_virtual_time
@@ -40,7 +40,7 @@ async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
         lines += 1
 
     monkeypatch.undo()
-    monkeypatch.setattr(turns.time, "perf_counter", lambda: 30e-6 * lines)
+    monkeypatch.setattr(connection.time, "perf_counter", lambda: 30e-6 * lines)
     served = serve()
     served.called = count
     feed(served.client()[0], REQUEST * 10)

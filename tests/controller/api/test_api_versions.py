@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from controller.api.async_client import AsyncClient
-from controller.api.client import Client
+from controller.api.client import AsyncClient, Client
 from controller.api.connection import Connection
 from controller.api.registered import METHODS
-from controller.api.topics import TOPICS, EventParams
+from controller.api.server import TOPICS, EventParams
 from controller.gateway.field import DrawnField
 from daemon_bench import PLACE, holding, running_daemon, until_state
 from virtual_loop import in_virtual_time

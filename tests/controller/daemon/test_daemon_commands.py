@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from controller.api.client_protocol import Notification
-from controller.api.topics import TOPICS
+from controller.api.link import Notification
+from controller.api.server import TOPICS
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.cli.shown import show_event

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from controller.api.place import default_socket
+from controller.api.link import default_socket
 from controller.daemon.config import DAEMON, load_daemon_config
 from controller.daemon.config_sections import DaemonSection
 from controller.sources.touch import Touch

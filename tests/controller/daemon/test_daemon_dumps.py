@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode
 from controller.operation.dumps import (
     MAX_DECISIONS,

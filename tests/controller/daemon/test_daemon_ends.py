@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.play.content import BEING_CHOSEN
 from controller.play.intent import NO_CONTACTS
 from controller.play.selection import GIVEN_UP

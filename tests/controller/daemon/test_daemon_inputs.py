@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.topics import InputsEvent
+from controller.api.server import InputsEvent
 from controller.cli.shown import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.inputs import TouchInputs

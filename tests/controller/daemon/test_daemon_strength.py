@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.demo.run import layout_of_people
 from controller.effects.strengths import MAX_NAMES

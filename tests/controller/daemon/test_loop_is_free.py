@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.api.async_client import AsyncClient
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.registered import METHODS
-from controller.api.topics import TOPICS
+from controller.api.server import TOPICS
 from controller.effects.file import File
 from controller.play.chooser import Chooser
 from controller.sources import udp_source

@@ -15,7 +15,7 @@ import pytest
 from controller.api.methods import RequestedBy
 from controller.api.registered import METHODS
 from controller.api.schema import PlayedTone
-from controller.api.topics import LogEvent, PatternEvent
+from controller.api.server import LogEvent, PatternEvent
 from controller.gateway import app
 from controller.gateway.settings import Settings
 from gateway_bench import (

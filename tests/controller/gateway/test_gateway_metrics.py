@@ -16,11 +16,11 @@ from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 from prometheus_client.parser import text_string_to_metric_families
 
-from controller.api.client_protocol import Unreachable
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
 from controller.api.schema import Message, PlayedTone
-from controller.api.topics import Hub, PatternEvent
+from controller.api.server import Hub, PatternEvent
 from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.field import DrawnField, FieldSolver

@@ -10,9 +10,9 @@ import pytest
 from aiohttp import WSMessage, WSMsgType
 
 from controller.api import link
-from controller.api.async_client import AsyncClient
-from controller.api.client_protocol import Unreachable
+from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 from controller.api.schema import API_VERSION
 from controller.gateway import bridge
 from daemon_bench import PATIENCE

@@ -15,9 +15,8 @@ from typing import Any
 import pytest
 
 from controller.cli.main import run
-from controller.content.ahap import Ahap
-from controller.content.format import ContentFormat
-from controller.content.formats import content_format, content_formats, read_content
+from controller.content.formats import Ahap, content_format, content_formats, read_content
+from controller.content.reading import ContentFormat
 from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
 from controller.effects.kinds import effect_kind, effect_kinds

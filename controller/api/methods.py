@@ -34,7 +34,7 @@ from controller.api.schema import (
     TouchInputStatus,
     TouchPoint,
 )
-from controller.content.points import MAX_GIVEN
+from controller.content.pattern import MAX_GIVEN
 from controller.effects.gains import GainDb, SourceName
 
 DEFAULT_LEASE = 10.0  # s

@@ -4,8 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from controller.check.content_check import RANGE_DB, TOLERANCE_DB, CheckedContent
-from controller.content.pattern import Pattern, along
-from controller.content.sharpness import hertz_of
+from controller.content.pattern import Pattern, along, hertz_of
 
 _REQUESTED, _FELT = "#888888", "#0b5cad"
 

@@ -10,8 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from controller.content.pattern import Pattern, Transient, along
-from controller.content.sharpness import MAX_HZ, MIN_HZ, hertz_of
+from controller.content.pattern import MAX_HZ, MIN_HZ, Pattern, Transient, along, hertz_of
 from model.answer.stimulus import MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray, best_of
 from model.finger import decibels

@@ -3,11 +3,9 @@
 `read_content` is for trying one.
 """
 
-from controller.content.format import ContentFormat
 from controller.content.formats import read_content
-from controller.content.json_file import ContentSection, Entries, read_json
-from controller.content.pattern import Pattern, Transient
-from controller.content.points import pattern_of_points
+from controller.content.pattern import Pattern, Transient, pattern_of_points
+from controller.content.reading import ContentFormat, ContentSection, Entries, read_json
 from model.config.fields import Validation
 from model.errors import InputError
 

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from controller.content.ahap import Ahap
 from controller.content.formats import (
+    Ahap,
     content_formats,
     named_content,
     named_contents,
     read_content,
 )
-from controller.content.pattern import Pattern, Transient
-from controller.content.points import pattern_of_points, points_of
+from controller.content.pattern import Pattern, Transient, pattern_of_points, points_of
 from model.errors import InputError
 
 Read = Callable[..., Pattern]

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from chain import Chain
-from controller.content.pattern import Curve, Pattern, Transient
-from controller.content.sharpness import sharpness_of
+from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
 from controller.effects.buzz import Buzz
 from controller.effects.click import Click
 from controller.effects.effect import Effect

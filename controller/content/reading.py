@@ -1,0 +1,438 @@
+"""What every format of content is, and the bounds of a file of any.
+
+JSON files of content, read strictly; a line for every key, found when an error needs it.
+
+Vibrations that last at the same time, made one: a curve of intensity and one of sharpness.
+
+WAV files: level and centre frequency of a signal over time.
+
+A signal is felt by the strength of its vibration, not by its waveform: it is split into two bands,
+below and above 140 Hz; intensity is the amplitude of both together, 1 for a sine of full scale, and
+the sharpness is that of the stronger. What lies outside the frequencies that a sharpness can stand
+for is left out, and said in dB.
+"""
+
+import json
+import math
+import re
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
+
+import numpy as np
+from pydantic import ConfigDict, GetCoreSchemaHandler
+
+from controller.content.pattern import MAX_DURATION, MAX_HZ, MIN_HZ, Curve, Pattern, sharpness_of
+from model.arrays import FloatArray
+from model.config.document import ConfigError, ConfigProblem, Document, KeyPath, decoded, key_name
+from model.config.fields import Section
+from model.errors import InputError
+from model.files.wav_file import samples_of
+from model.quantities import counted
+
+MAX_SIZE = 4 << 20
+"""Largest file [bytes]."""
+
+MAX_POINTS = 20_000
+"""Most points of a file: breakpoints, keyframes, events, or what one of them is made of."""
+
+
+def refusal(source: str, message: str, *, line: int | None = None, key: str = "") -> ConfigError:
+    """Return the error of a file as a whole, or of a key on a line."""
+    return ConfigError(source, [ConfigProblem(line, key, message)])
+
+
+def too_much(end: float, count: int) -> str:
+    """Return what is wrong with content that ends at a time [s] and has so many points, or ""."""
+    if end > MAX_DURATION:
+        return f"must end within {MAX_DURATION:g} s, got {end:g} s; shorten it"
+    return f"has more than {MAX_POINTS} points; leave some out" if count > MAX_POINTS else ""
+
+
+class ContentFormat(ABC):
+    """A format of content; a class for each, named by the ending of its files."""
+
+    ending: ClassVar[str]
+    """What a file's name ends with after the dot, in lower case."""
+
+    has_channels: ClassVar[bool] = False
+    """Whether a file may hold several channels, of which one is read."""
+
+    @abstractmethod
+    def read(self, content: bytes, source: str, channel: int) -> Pattern:
+        """Return what a file asks for.
+
+        content: all bytes of the file; source: its name, for errors; channel: counted from 1.
+        Raises InputError for what the format does not allow, with the line and key where it has
+        any. Nothing may be executed, or read from elsewhere, that a file names.
+        """
+
+
+_MAX_SIZE = 2 << 20  # bytes
+_MAX_LEVELS = 20
+_MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thirteen
+_MAX_NAMED = 5  # unknown keys in remarks
+_EMPTY: tuple[object, ...] = (None, "", [], {})
+
+_SPACE = re.compile(r"[ \t\n\r]*")
+_STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
+_STRINGS = re.compile(_STRING, re.DOTALL)
+_TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
+_DECODER = json.JSONDecoder(parse_int=float)  # of any number of digits
+
+
+_T = TypeVar("_T")
+
+
+class _FirstOfMany:
+    """Annotation of a list: the first invalid entry is reported, and no more of them are looked at.
+
+    pydantic's own, FailFast, cannot be in a union.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        return {**handler(source), "fail_fast": True, "max_length": MAX_POINTS}
+
+
+Entries: TypeAlias = Annotated[list[_T], _FirstOfMany()]
+"""A list of which the first invalid entry is reported."""
+
+
+class ContentSection(Section):
+    """An object in a file of content: strict types, finite numbers; unknown keys are ignored."""
+
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class JsonDocument(Document):
+    """The content of a JSON file; lines are found when asked for."""
+
+    def line_of(self, path: KeyPath) -> int:
+        """The line of a key or list entry, or of the nearest one above it if it is missing."""
+        start = value = _skipped(self.text, 0)
+        for key in path:
+            found = (where for name, *where in _entries(self.text, value) if name == key)
+            start, value = next(found, (start, -1))
+            if value < 0:
+                break
+        return _line(self.text, start)
+
+
+def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> JsonDocument:
+    """Read an object; raises ConfigError for what is not JSON, nested too deep or repeated."""
+    if len(content) > _MAX_SIZE:
+        raise refusal(source, f"is larger than {_MAX_SIZE >> 20} MiB; shorten the content")
+    text = decoded(source, content).removeprefix("\ufeff")
+    if has_trailing_commas:
+        text = _TRAILING_COMMA.sub(lambda found: found[1] or " ", text)
+    _check_size(source, text)
+    try:
+        # Whole numbers become floats: those of many digits are refused by their size, as 1e999 is.
+        data = json.loads(text, object_pairs_hook=_unique, parse_int=float)
+    except _RepeatedKey:
+        line, path, first = next(_repeated(text, _skipped(text, 0), ()))
+        message = f"is given twice, first on line {first}; remove one"
+        raise refusal(source, message, line=line, key=key_name(path)) from None
+    except json.JSONDecodeError as error:
+        is_cut = not text.rstrip().endswith("}")
+        remedy = "its end is missing: export it again" if is_cut else "correct it there"
+        message = f"is not valid JSON: {error.msg} in column {error.colno}; {remedy}"
+        raise refusal(source, message, line=error.lineno) from error
+    if not isinstance(data, dict):
+        raise refusal(source, "must be an object in braces, got another value", line=1)
+    return JsonDocument(source, text, data, {})
+
+
+def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
+    """Return in words which keys of a file are ignored, the first ones by name.
+
+    but: those that say nothing of what is felt, besides all that are empty.
+    """
+    found = Counter(name for name in _extra(section) if name not in but)
+    if not found:
+        return ()
+    names = [key_name((name,)) for name in list(found)[:_MAX_NAMED]]
+    more = " and others" * (len(found) > _MAX_NAMED)
+    return (f"{counted(found.total(), 'unknown key')} ignored: {', '.join(names)}{more}",)
+
+
+def _extra(value: Any) -> Iterator[str]:
+    if isinstance(value, list):
+        for entry in value:
+            yield from _extra(entry)
+    elif isinstance(value, ContentSection):
+        yield from (k for k, each in (value.model_extra or {}).items() if each not in _EMPTY)
+        for name in type(value).model_fields:
+            yield from _extra(getattr(value, name))
+
+
+class _RepeatedKey(Exception):
+    """A key that is given twice."""
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        raise _RepeatedKey
+    return made
+
+
+def _repeated(text: str, at: int, path: KeyPath) -> Iterator[tuple[int, KeyPath, int]]:
+    """Yield the line, the path and the first line of every repeated key."""
+    seen: dict[str | int, int] = {}
+    for key, start, value in _entries(text, at):
+        inner = (*path, key)
+        if key in seen:
+            yield _line(text, start), inner, _line(text, seen[key])
+        seen[key] = start
+        yield from _repeated(text, value, inner)
+
+
+def _check_size(source: str, text: str) -> None:
+    """Refuse what is nested too deep, or has too many values, before it is parsed."""
+    bare = _STRINGS.sub("", text)
+    codes = np.frombuffer(bare.encode("utf-32-le", "surrogatepass"), np.uint32)
+    opened = (codes == ord("{")) | (codes == ord("["))
+    levels = np.cumsum(opened.astype(int) - ((codes == ord("}")) | (codes == ord("]"))))
+    if len(levels) and levels.max() > _MAX_LEVELS:
+        line = _line(bare, int(np.argmax(levels > _MAX_LEVELS)))
+        raise refusal(source, f"is nested more than {_MAX_LEVELS} levels deep", line=line)
+    if np.count_nonzero(opened | (codes == ord(","))) > _MAX_VALUES:
+        raise refusal(source, f"has more than {_MAX_VALUES} values; shorten it")
+
+
+def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:
+    """Yield the key, where it begins and where its value begins, of an object or a list."""
+    closing = {"{": "}", "[": "]"}.get(text[at])
+    if closing is None:
+        return
+    at = _skipped(text, at + 1)
+    index = 0
+    while text[at] != closing:
+        start, key = at, index
+        name: str | int = key
+        if closing == "}":
+            name, at = json.decoder.scanstring(text, at + 1)  # type: ignore[attr-defined]
+            at = _skipped(text, _skipped(text, at) + 1)
+        yield name, start, at
+        at = _skipped(text, _DECODER.raw_decode(text, at)[1])
+        at = _skipped(text, at + 1) if text[at] == "," else at
+        index += 1
+
+
+def _skipped(text: str, at: int) -> int:
+    """Return where something stands next that is no space."""
+    found = _SPACE.match(text, at)
+    return at if found is None else found.end()
+
+
+def _line(text: str, at: int) -> int:
+    return text.count("\n", 0, at) + 1
+
+
+Segment: TypeAlias = tuple[float, float, float, float, float, float]
+"""Start and end [s], intensity at both, sharpness at both; straight lines between."""
+
+_STEP = 0.005  # s; products and sums of straight lines are straight lines within it
+_DIGITS = 9  # times are of whole nanoseconds, so that none are all but the same
+_MAX_OVERLAP = 1_000_000  # parts of segments
+
+
+def mixed(
+    source: str,
+    segments: list[Segment],
+    *,
+    factor: Curve = ((0.0, 1.0),),
+    addend: Curve = ((0.0, 0.0),),
+) -> tuple[Curve, Curve]:
+    """Return intensity and sharpness of segments that may overlap.
+
+    Intensities add as powers, up to 1; the sharpness is that of the strongest. factor, addend: of
+    all intensities and sharpnesses over time. source: the file, for the error of too many.
+    """
+    rows = np.array(segments).reshape(-1, 6)
+    rows[:, :2] = rows[:, :2].round(_DIGITS)
+    rows = rows[rows[:, 1] > rows[:, 0]]
+    if not len(rows):
+        return (), ()
+    begins, ends = rows[:, 0], rows[:, 1]
+    given = [time for curve in (factor, addend) for time, _ in curve]
+    grid = np.arange(begins.min(), ends.max(), _STEP)
+    knots = np.unique(np.concatenate([begins, ends, np.round([*grid, *given], _DIGITS)]))
+    knots = knots[(knots >= begins.min()) & (knots <= ends.max())]
+    first = np.searchsorted(knots, begins)
+    counts = np.searchsorted(knots, ends) - first
+    if counts.sum() > _MAX_OVERLAP:
+        raise refusal(source, "has too many events that overlap; shorten them")
+    which = np.repeat(np.arange(len(rows)), counts)
+    at = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    limits = np.stack([knots[at], knots[at + 1]])
+    share = (limits - begins[which]) / (ends - begins)[which]
+    levels, sharps = (
+        rows[which, column] + share * (rows[which, column + 1] - rows[which, column])
+        for column in (2, 4)
+    )
+    count = len(knots) - 1
+    power = np.stack([np.bincount(at, level**2, minlength=count) for level in levels])
+    order = np.argsort(levels.sum(axis=0), kind="stable")
+    sharpness = np.full((2, count), np.nan)
+    sharpness[:, at[order]] = sharps[:, order]  # of equal places the last, the strongest, stays
+    intensity = np.sqrt(power) * between(factor, knots)
+    sharpness += between(addend, knots)
+    return _curve(knots, np.clip(intensity, 0, 1)), _curve(knots, np.clip(sharpness, 0, 1))
+
+
+def between(curve: Curve, knots: FloatArray) -> FloatArray:
+    """Return a curve (2, n) after and before the ends of each stretch between knots."""
+    times, values = np.array(curve).T
+    times = times.round(_DIGITS)
+    width = np.diff(knots)
+    early, late = (np.interp(knots[:-1] + part * width, times, values) for part in (0.25, 0.75))
+    return np.stack([1.5 * early - 0.5 * late, 1.5 * late - 0.5 * early])
+
+
+def _curve(knots: FloatArray, values: FloatArray) -> Curve:
+    """Return the points that a curve needs; values (2, n) at both ends of each stretch."""
+    times = np.stack([knots[:-1], knots[1:]], axis=1).ravel()
+    course = values.T.ravel()
+    is_given = ~np.isnan(course)
+    return thinned(times[is_given], course[is_given])
+
+
+def thinned(times: FloatArray, values: FloatArray) -> Curve:
+    """Return a curve without the points that repeat another or lie on the line between two."""
+    is_new = np.ones(len(times), bool)
+    is_new[1:] = (np.diff(times) > 0) | (abs(np.diff(values)) > 1e-12)
+    times, values = times[is_new], values[is_new]
+    is_kept = np.ones(len(times), bool)
+    if len(times) > 2:
+        width = times[2:] - times[:-2]
+        along = np.divide(
+            times[1:-1] - times[:-2], width, out=np.zeros_like(width), where=width > 0
+        )
+        straight = values[:-2] + along * (values[2:] - values[:-2])
+        is_step = (np.diff(times)[:-1] == 0) | (np.diff(times)[1:] == 0)
+        is_kept[1:-1] = is_step | (abs(values[1:-1] - straight) > 1e-12)
+    return tuple(zip(times[is_kept].tolist(), values[is_kept].tolist(), strict=True))
+
+
+_RATE = 200  # points a second, or a little more
+_PER_POINT = 10  # samples of the analytic signal
+_SPLIT = (110.0, 178.0)  # Hz; half an octave on both sides of the split fades over
+_OUTER_LOW, _OUTER_HIGH = (45.0, MIN_HZ), (MAX_HZ, 430.0)  # Hz; faded out beyond
+_FLOOR = 0.03  # of the highest intensity; what rings beside a burst in the bands lies below
+_MIN_RATE, _MAX_RATE = 1000, 192_000
+_MIN_LOST = 0.01  # of the energy
+
+
+class Wav(ContentFormat):
+    """Sampled signals, as PCM or float."""
+
+    ending = "wav"
+    has_channels = True
+
+    def read(self, content: bytes, source: str, channel: int) -> Pattern:
+        """Return the course of one channel's vibration."""
+        rate, samples = _samples(content, source)
+        count = samples.shape[1]
+        if count > 2:
+            raise refusal(source, f"must have 1 or 2 channels, got {count}")
+        if channel > count:
+            raise refusal(source, f"channel must be 1 to {count}, got {channel}")
+        signal = samples[:, channel - 1]
+        intensity, sharpness, remarks = course_of(signal, rate)
+        if count == 2:
+            remarks = (f"channel {channel} of 2 read", *remarks)
+        return Pattern(len(signal) / rate, intensity, sharpness, (), remarks)
+
+
+def _samples(content: bytes, source: str) -> tuple[int, FloatArray]:
+    """Return the rate [Hz], and samples (n, channels) of which 1 is full scale."""
+    try:
+        rate, samples = samples_of(content)
+    except InputError as error:
+        raise refusal(source, str(error)) from error
+    if not _MIN_RATE <= rate <= _MAX_RATE:
+        raise refusal(source, f"sample rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate}")
+    if problem := too_much(len(samples) / rate, 0):
+        raise refusal(source, problem)
+    return rate, samples
+
+
+def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:
+    """Return intensity and sharpness of a signal at a rate [Hz], and what is left out."""
+    import scipy.fft
+
+    duration = len(signal) / rate
+    # A second longer at least: its end does not come round to its beginning.
+    length = scipy.fft.next_fast_len(len(signal) + rate, real=True)
+    cycle = length / rate  # s
+    spectrum = scipy.fft.rfft(signal, length)[1:] / length
+    frequencies = np.arange(1, math.ceil(_OUTER_HIGH[1] * cycle)) / cycle
+    outer = _rise(frequencies, *_OUTER_LOW) * _rise(1 / frequencies, *_inverse(_OUTER_HIGH))
+    upper = _rise(frequencies, *_SPLIT)
+    lower = _rise(1 / frequencies, *_inverse(_SPLIT))
+    points = scipy.fft.next_fast_len(math.ceil(cycle * _RATE))
+    step = cycle / points
+    count = math.ceil(duration / step)
+    levels, centres = zip(
+        *(
+            _band(spectrum[: len(outer)] * outer * band, points, step, count)
+            for band in (lower, upper)
+        ),
+        strict=True,
+    )
+    intensity = np.hypot(*levels)
+    intensity[intensity < _FLOOR * intensity.max()] = 0
+    sharpness = sharpness_of(np.where(levels[1] > levels[0], *centres[::-1]))
+    times = (np.arange(count) + 0.5) * step
+    times[-1] = min(times[-1], duration)
+    is_felt = intensity > 0
+    given = np.concatenate([[0], times, [duration]])
+    course = np.concatenate([intensity[:1], np.minimum(intensity, 1), intensity[-1:]]).clip(0, 1)
+    return (
+        thinned(given, course),
+        thinned(times[is_felt], sharpness[is_felt]),
+        _remarks(spectrum, outer, intensity),
+    )
+
+
+def _remarks(spectrum: Any, outer: FloatArray, intensity: FloatArray) -> tuple[str, ...]:
+    power = abs(spectrum) ** 2
+    total = float(power.sum())
+    lost = 1 - float((power[: len(outer)] * outer**2).sum()) / total if total else 0.0
+    remarks = []
+    if lost > _MIN_LOST:
+        remarks.append(
+            f"{lost:.0%} of its energy ({10 * math.log10(lost):.1f} dB) lies outside "
+            f"{MIN_HZ:g} to {MAX_HZ:g} Hz and is left out"
+        )
+    if (intensity > 1).any():
+        remarks.append(f"{(intensity > 1).mean():.1%} of the time above full scale, clamped")
+    return tuple(remarks)
+
+
+def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the amplitude and the centre frequency [Hz] of a band at the first points.
+
+    points: of the whole cycle, a step [s] apart.
+    """
+    bins = np.zeros(points * _PER_POINT, complex)
+    bins[1 : len(spectrum) + 1] = 2 * spectrum
+    analytic = np.fft.ifft(bins, norm="forward")
+    power = (abs(analytic) ** 2).reshape(-1, _PER_POINT).mean(axis=1)
+    turned = (np.roll(analytic, -1) * analytic.conj()).reshape(-1, _PER_POINT).sum(axis=1)
+    return np.sqrt(power[:count]), np.angle(turned[:count]) * _PER_POINT / (2 * math.pi * step)
+
+
+def _rise(frequencies: FloatArray, low: float, high: float) -> FloatArray:
+    """Return 0 below and 1 above two frequencies; rises and falls between add as powers to 1."""
+    share = np.log(frequencies / low) / math.log(high / low)
+    return np.asarray(np.sin(share.clip(0, 1) * math.pi / 2))
+
+
+def _inverse(edges: tuple[float, float]) -> tuple[float, float]:
+    return 1 / edges[1], 1 / edges[0]

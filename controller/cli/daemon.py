@@ -79,7 +79,7 @@ def daemon(
     ] = None,
 ) -> None:
     """Run the daemon that drives a plate; starts disarmed."""
-    from controller.daemon.run import check_daemon, run_daemon
+    from controller.daemon.daemon import check_daemon, run_daemon
 
     if check:
         typer.echo(check_daemon(config))

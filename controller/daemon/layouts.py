@@ -1,18 +1,108 @@
-"""The surface layouts of a running daemon, of which one is in use."""
+"""The surface layouts of a running daemon, of which one is in use.
 
+A configuration that is read again while its daemon runs: what has changed, and may be applied.
+
+Nothing here runs in the event loop, as large layouts take a while to compare.
+
+Touch inputs of the daemon: the configured sources.
+"""
+
+import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.api.server import LayoutEvent
-from controller.daemon.config import DaemonConfig
-from controller.daemon.reload import ConfigChange, warn_of_bands
+from controller.api.schema import TouchInputStatus
+from controller.api.server import InputsEvent, LayoutEvent
+from controller.daemon.children import read_in_child
+from controller.daemon.config import DaemonConfig, TouchInput
+from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.effects.strengths import Strengths, read_strengths
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from model.arrays import FloatArray
-from registry.plugins import did_you_mean
+from model.errors import InputError
+from registry import threads
+from registry.plugins import did_you_mean, failure_text
+from registry.threads import Backoff, in_thread, without_collections
 
 _logger = logging.getLogger(__name__)
+
+_APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
+
+
+@dataclass(frozen=True)
+class ConfigChange:
+    """A configuration, and how it differs from the one in use.
+
+    restart: changed keys that need a restart; changes: all others, in words; layouts: names of
+    those that differ, None for what every touch feels without any; old_max_db_sl, max_db_sl: the
+    highest level of all layouts before and after [dB SL].
+    """
+
+    config: DaemonConfig
+    restart: list[str]
+    changes: list[str]
+    layouts: frozenset[str | None]
+    old_max_db_sl: float
+    max_db_sl: float
+
+    def refusals(self, *, is_armed: bool) -> list[str]:
+        """Why nothing of it may be applied; empty if all may."""
+        reasons = [f"{key}: changed, which needs a restart" for key in self.restart]
+        if is_armed and self.max_db_sl > self.old_max_db_sl:
+            reasons.append(
+                f"maximum level must not increase while armed, got {self.max_db_sl:g} dB SL (was "
+                f"{self.old_max_db_sl:g}); disarm, then reload"
+            )
+        return reasons
+
+
+def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
+    """Read a daemon's configuration again for a table's frequencies [Hz]; blocks.
+
+    Raises as `read_in_child`.
+    """
+    with without_collections():  # of large layouts
+        change = config_change(old, read_in_child(old.source, frequencies))
+        warn_of_bands(
+            {name: change.config.layouts.get(name) for name in change.layouts}, frequencies
+        )
+        return change
+
+
+def warn_of_bands(
+    layouts: Mapping[str | None, SurfaceLayout | None], frequencies: FloatArray
+) -> None:
+    """Log what layouts play in place of bands that a table of frequencies [Hz] lacks."""
+    for name, layout in layouts.items():
+        for problem in layout.band_problems(frequencies) if layout else ():
+            _logger.warning("layout %s: %s", name, problem)
+
+
+def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
+    """Compare all keys and layouts, and the content of the rig's file."""
+    before, after = old.section.model_dump(), new.section.model_dump()
+    restart = [key for key in before if before[key] != after[key] and key not in _APPLIED]
+    if old.rig_text != new.rig_text and "rig" not in restart:
+        restart.append("rig")
+    was, now = old.layouts, new.layouts
+    differ = [name for name in {**was, **now} if was.get(name) != now.get(name)]
+    changes = [
+        f"layouts.{name}: {'added' if name not in was else 'changed' if name in now else 'removed'}"
+        for name in differ
+        if name is not None
+    ]
+    if before["level_db_sl"] != after["level_db_sl"]:
+        changes.append(f"level_db_sl: from {before['level_db_sl']:g} to {after['level_db_sl']:g}")
+    kept = {name: now[name] if name in differ else was[name] for name in now}
+    highest = [max(each.max_db_sl for each in layouts.values()) for layouts in (was, now)]
+    new = replace(new, layouts=kept)
+    return ConfigChange(new, restart, changes, frozenset(differ), *highest)
 
 
 class LayoutChoice:
@@ -74,3 +164,123 @@ class LayoutChoice:
         self.player.replace(self._layouts[name])
         _logger.info("layout: %s in use", name or "none")
         self._changed()
+
+
+_MIN_PAUSE, _MAX_PAUSE = 1.0, 30.0  # s; before a failed source is restarted
+_CLOSE_TIMEOUT = 0.2  # s
+_WATCH_INTERVAL = 1.0  # s; in which the state of all inputs is looked at
+
+
+class TouchInputs:
+    """Runs touch sources concurrently.
+
+    deliver receives their frames in coordinates of the plate, each source name prefixed with the
+    configured name; lift, that prefix: of a source that ends, fails or is cancelled. One that fails
+    is restarted after a growing pause. rejects: counter of all sources. changed: called when
+    `event` has changed.
+    """
+
+    def __init__(
+        self,
+        deliver: Callable[[TouchFrame], None],
+        lift: Callable[[str], None],
+        *,
+        rejects: RejectCounter,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._deliver = deliver
+        self._lift = lift
+        self._rejects = rejects
+        self._changed = changed
+        self._sources: dict[TouchInput, TouchSource | str | None] = {}
+        """Source of each input; the reason in words while it has no source; None at its end."""
+        self._running: list[asyncio.Task[None]] = []
+        self.event = InputsEvent(inputs=[], rejected_touches={})
+        """State of all inputs and rejected touches, at most a second old."""
+
+    def start(self, inputs: Sequence[TouchInput]) -> None:
+        """Run these sources until `close`."""
+        self._sources = dict.fromkeys(inputs, "being opened")
+        self._running += [
+            asyncio.create_task(self._run(each), name=f"touch {each.name}") for each in inputs
+        ]
+        self._running.append(asyncio.create_task(self._watch(), name="touch inputs"))
+
+    async def close(self) -> None:
+        """Stop all sources; one of a plug-in that goes on is ended where it waits."""
+        for task in self._running:
+            task.cancel()
+        if not self._running:
+            return
+        _, late = await asyncio.wait(self._running, timeout=_CLOSE_TIMEOUT)
+        for task in late:  # else the end of the program would wait for it
+            _logger.warning("%s: does not end when cancelled", task.get_name())
+            with suppress(Exception):  # it ignores this as well, or fails
+                task.get_coro().close()
+            task.cancel()
+        ends = asyncio.gather(*late, return_exceptions=True)
+        await asyncio.wait([ends], timeout=_CLOSE_TIMEOUT)
+
+    async def _run(self, touch_input: TouchInput) -> None:
+        prefix, calibration = f"{touch_input.name}:", touch_input.calibration
+
+        def deliver(frame: TouchFrame) -> None:
+            # The sender chooses the name, which is printed on terminals.
+            source = frame.source if frame.source.isprintable() else ascii(frame.source)
+            touches = frame.touches
+            if calibration != ALIGNED:
+                touches = tuple(map(calibration.apply, touches))
+            self._deliver(replace(frame, source=prefix + source, touches=touches))
+
+        backoff = Backoff(_MIN_PAUSE, _MAX_PAUSE)
+        while True:
+            started_at = threads.now()
+            try:
+                # A plug-in may block.
+                source = await in_thread(touch_input.make, name="touch source")
+                source.rejects = self._rejects
+                self._sources[touch_input] = source
+                await source.run(deliver)
+            except Exception as error:
+                is_expected = isinstance(error, InputError | OSError)
+                text = str(error) if is_expected else failure_text(error)
+                _logger.error("touch source %s: failed, restarting: %s", touch_input.name, text)
+                self._look((touch_input, text))
+            else:
+                _logger.info("touch source %s: finished", touch_input.name)
+                self._look((touch_input, None))
+                return
+            finally:
+                self._lift(prefix)
+            # A panel may be plugged in later, a port be released.
+            await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
+
+    def _look(self, *changed: tuple[TouchInput, TouchSource | str | None]) -> None:
+        """Look at all inputs, of which some have changed."""
+        self._sources.update(changed)
+        statuses = [_status(*each) for each in self._sources.items()]
+        event = InputsEvent(inputs=statuses, rejected_touches=dict(self._rejects.counts))
+        if event != self.event:
+            self.event = event
+            self._changed()
+
+    async def _watch(self) -> None:
+        """Look at all inputs from time to time."""
+        while True:
+            await asyncio.sleep(_WATCH_INTERVAL)
+            self._look()
+
+
+def _status(touch_input: TouchInput, source: TouchSource | str | None) -> TouchInputStatus:
+    """Describe an input by its source, or by the reason for having no source."""
+    try:
+        problem = source.problem if isinstance(source, TouchSource) else source
+    except Exception as error:  # of a plug-in
+        problem = failure_text(error)
+    lacking: Literal["mute", "missing"] = "missing" if isinstance(source, str) else "mute"
+    return TouchInputStatus(
+        name=touch_input.name,
+        url=touch_input.url,
+        state="ended" if source is None else "open" if problem is None else lacking,
+        problem=problem,
+    )

@@ -42,8 +42,7 @@ from controller.api.server import Handler
 from controller.content.pattern import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
-from controller.daemon.messages import effects_result, hello_result, playing_of
-from controller.daemon.publisher import EventPublisher
+from controller.daemon.messages import EventPublisher, effects_result, hello_result, playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.file import File
 from controller.learning.learning import Learning

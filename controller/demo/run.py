@@ -15,8 +15,7 @@ from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.schema import MAX_LEASE
 from controller.daemon.config import DaemonConfig, load_daemon_config
-from controller.daemon.daemon import Daemon
-from controller.daemon.run import page_address
+from controller.daemon.daemon import Daemon, page_address
 from controller.demo.far_end import SIM_OPTIONS, WATCHDOG, SimulatedPlate, simulated_plate
 from controller.demo.recorder import TouchRecorder
 from controller.demo.touch_row import TouchRow

@@ -22,8 +22,7 @@ from pydantic.json_schema import models_json_schema
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
-from controller.daemon.config import file_of, is_daemon_document
-from controller.daemon.config_sections import DaemonSection
+from controller.daemon.config import DaemonSection, file_of, is_daemon_document
 from controller.effects.layout_file import LayoutSection
 from controller.operation.dumps import DUMP_PATTERN
 from drivers.errors import LinkError

@@ -7,7 +7,7 @@ import pytest
 
 from controller.api.schema import headline
 from controller.api.server import StateEvent
-from controller.daemon.config_sections import (
+from controller.daemon.config import (
     DaemonSection,
     DumpSection,
     LogSection,

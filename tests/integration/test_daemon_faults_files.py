@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.daemon.run import check_daemon
+from controller.daemon.daemon import check_daemon
 from daemon_bench import ENABLED, holding, ready_daemon, write_daemon
 from model.errors import InputError
 from virtual_loop import in_virtual_time

@@ -201,7 +201,7 @@ async def test_reload_ends_after_unexpected_error(
             raise RuntimeError("injected")
 
         with monkeypatch.context() as patched:
-            patched.setattr("controller.daemon.reload.read_in_child", fail)
+            patched.setattr("controller.daemon.layouts.read_in_child", fail)
             await bench.daemon.reload()
         await bench.daemon.reload()
         assert notices == ["RELOADING=1", "READY=1"] * 2

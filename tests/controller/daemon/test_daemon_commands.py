@@ -16,7 +16,7 @@ from controller.api.server import TOPICS
 from controller.cli.commands import app
 from controller.cli.main import run
 from controller.cli.shown import show_event
-from controller.daemon.run import run_daemon
+from controller.daemon.daemon import run_daemon
 from controller.process.log import LogThread
 from daemon_bench import write_daemon
 from drivers.errors import CommandError
@@ -53,7 +53,7 @@ def test_dashboard_option_has_optional_address(
     """Before and behind the configuration; the default is the gateway's."""
     calls: list[tuple[str, str | None]] = []
     monkeypatch.setattr(
-        "controller.daemon.run.run_daemon",
+        "controller.daemon.daemon.run_daemon",
         lambda config, *, dashboard, trace: calls.append((config.name, dashboard)),
     )
     for line in (["daemon", "d.yaml", *arguments], ["daemon", *arguments, "d.yaml"]):
@@ -69,10 +69,12 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
     pages: list[str | None] = []
     monkeypatch.setattr("controller.gateway.settings.find_spec", lambda name: None)
     monkeypatch.setattr(
-        "controller.daemon.run._run",
+        "controller.daemon.daemon._run",
         lambda config, lock, *, log, dashboard: pages.append(dashboard),
     )
-    monkeypatch.setattr("controller.daemon.run.start_log", lambda file, *, level: LogThread(file))
+    monkeypatch.setattr(
+        "controller.daemon.daemon.start_log", lambda file, *, level: LogThread(file)
+    )
     more = 'dashboard: "127.0.0.1:0"\n'
     run_daemon(write_daemon(tmp_path, {"main": "sim://"}, more), dashboard=None)
     assert pages == [None]
@@ -82,7 +84,7 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
 
 def test_daemon_refuses_to_start_with_few_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Below 64 its own files and 40 clients would use them up."""
-    monkeypatch.setattr("controller.daemon.run.allow_many_descriptors", lambda: 63)
+    monkeypatch.setattr("controller.daemon.daemon.allow_many_descriptors", lambda: 63)
     with pytest.raises(InputError, match="64, got 63"):
         run_daemon(Path("missing.yaml"), dashboard=None)
 
@@ -115,7 +117,7 @@ def test_daemon_refuses_pipe_as_log_or_trace(tmp_path: Path) -> None:
 
 def test_daemon_imports_no_package_of_other_commands() -> None:
     """Its start does not wait for optimisers, pictures or web servers."""
-    program = "import sys, controller.daemon.run; print(*sys.modules)"
+    program = "import sys, controller.daemon.daemon; print(*sys.modules)"
     modules = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout.split()

@@ -8,8 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.api.link import default_socket
-from controller.daemon.config import DAEMON, load_daemon_config
-from controller.daemon.config_sections import DaemonSection
+from controller.daemon.config import DAEMON, DaemonSection, load_daemon_config
 from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError

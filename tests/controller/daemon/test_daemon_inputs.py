@@ -16,7 +16,7 @@ import pytest
 from controller.api.server import InputsEvent
 from controller.cli.shown import show_status
 from controller.daemon.config import TouchInput
-from controller.daemon.inputs import TouchInputs
+from controller.daemon.layouts import TouchInputs
 from controller.gateway.metrics import exposition
 from controller.sources.contacts import Change
 from controller.sources.reject_counter import RejectCounter
@@ -120,7 +120,7 @@ async def test_inputs_run_beside_each_other(
         "c:": Panel("z"),
     }
     monkeypatch.setattr("controller.daemon.config.open_source", panels.__getitem__)
-    monkeypatch.setattr("controller.daemon.inputs._WATCH_INTERVAL", 0.01)
+    monkeypatch.setattr("controller.daemon.layouts._WATCH_INTERVAL", 0.01)
     frames: list[TouchFrame] = []
     lifted: list[str] = []
     inputs = touch_inputs(frames.append, lifted.append)
@@ -160,7 +160,7 @@ def test_closing_waits_for_no_source_that_goes_on(monkeypatch: pytest.MonkeyPatc
                     await asyncio.sleep(60)
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Stubborn())
-    monkeypatch.setattr("controller.daemon.inputs._CLOSE_TIMEOUT", 0.0)
+    monkeypatch.setattr("controller.daemon.layouts._CLOSE_TIMEOUT", 0.0)
 
     async def serve() -> None:
         LEFT.append(touch_inputs())
@@ -196,8 +196,8 @@ async def test_failed_input_is_restarted_after_growing_pauses(
         await sleep(0)
 
     monkeypatch.setattr("controller.daemon.config.open_source", lambda url: Late())
-    monkeypatch.setattr("controller.daemon.inputs.asyncio.sleep", pause)
-    monkeypatch.setattr("controller.daemon.inputs._WATCH_INTERVAL", 0.5)
+    monkeypatch.setattr("controller.daemon.layouts.asyncio.sleep", pause)
+    monkeypatch.setattr("controller.daemon.layouts._WATCH_INTERVAL", 0.5)
     inputs = touch_inputs()
     inputs.start([TouchInput("left", "a:", TouchCalibration())])
     while len(runs) < 3:

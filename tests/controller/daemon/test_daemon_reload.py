@@ -13,7 +13,7 @@ import pytest
 
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, load_daemon_config
-from controller.daemon.reload import config_change
+from controller.daemon.layouts import config_change
 from controller.process.child import child_command
 from daemon_bench import ENABLED, ready_daemon
 from model.errors import InputError

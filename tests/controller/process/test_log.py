@@ -15,7 +15,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from controller.daemon.publisher import LatencyStatistics
+from controller.daemon.messages import LatencyStatistics
 from controller.operation.dumps import (
     DUMP_PATTERN,
     MAX_DUMPS,

@@ -18,7 +18,7 @@ from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from controller.demo.touch_row import TouchRow
+    from controller.demo.recorder import TouchRow
 
 
 def demo(
@@ -63,8 +63,15 @@ def demo(
     import asyncio
     import time
 
-    from controller.demo.pictures import write_pictures
-    from controller.demo.run import WIRES, Scene, check_page, example_scenes, run_demo, run_live
+    from controller.demo.demonstration import (
+        WIRES,
+        Scene,
+        check_page,
+        example_scenes,
+        run_demo,
+        run_live,
+        write_pictures,
+    )
     from controller.sources.capture import read_capture
     from model.rig.rig_file import example_rig_path, load_rig
     from model.table.table_file import cached_table

@@ -1,28 +1,334 @@
-"""Observes the daemon and the simulated plate, and makes a row of every touch."""
+"""Observes the daemon and the simulated plate, and makes a row of every touch.
+
+One row of the demonstration: a touch, what was predicted for it and what was measured.
+
+Simulated amplifiers and their plate, in a process of their own behind a real wire.
+
+The controller reaches the amplifiers over the wire only; the control socket places the fingers and
+reads their vibration.
+"""
 
 import asyncio
+import contextlib
+import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import os
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
-from typing import TypeAlias, cast
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeAlias, cast
+from urllib.parse import quote
 
-from controller.demo.far_end import SimulatedPlate
-from controller.demo.touch_row import (
-    FingerRow,
-    FingerVibration,
-    Position,
-    TouchRow,
-    peak_contrast_db,
-    steady_contrast_db,
-)
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
 from controller.play.content import Prediction
 from controller.play.layer_content import LayerContent
 from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.process.child import ended
 from controller.sources.contacts import Change, Contact, ContactKey
-from model.answer.answer import HELD_BACK
+from drivers.errors import LinkError
+from model.answer.answer import HELD_BACK, Layer
+from model.arrays import FloatArray
+from model.finger import DEFAULT_THRESHOLD, contrast_db, mean_level_db_sl, sensation_level
 from model.transients.shaping import ONSET_WINDOW
 from registry import threads
+from registry.wording import first_problem
+
+Position: TypeAlias = tuple[float, float]
+
+SAME_FREQUENCY = 1.0
+"""Difference [Hz] within which a tone is that of a content, as its amplifier has rounded it."""
+
+
+@dataclass(frozen=True)
+class FingerVibration:
+    """Measured vibration of one fingertip over a window.
+
+    frequencies (f,) [Hz]; amplitudes (f, p) [m/s²] of the steady part at each point of the tip;
+    peaks (p,) [m/s²], the largest acceleration there, transients included; weights (p,) of the
+    points in the mean over the tip; threshold: name of the set that levels are above.
+    """
+
+    frequencies: FloatArray
+    amplitudes: FloatArray
+    peaks: FloatArray
+    weights: FloatArray
+    threshold: str = DEFAULT_THRESHOLD
+
+    @property
+    def level_db_sl(self) -> float:
+        """Sensation level, mean over the tip; -inf without vibration."""
+        return mean_level_db_sl(self.frequencies, self.amplitudes, self.weights, self.threshold)
+
+    @property
+    def loudest_db_sl(self) -> float:
+        """Sensation level at the loudest point of the tip; -inf without vibration."""
+        return float(sensation_level(self.frequencies, self.amplitudes, self.threshold).max())
+
+    def parted(self, frequency: float) -> tuple["FingerVibration", "FingerVibration"]:
+        """Return the part of a content's frequency [Hz], and that of all others."""
+        is_own = np.abs(self.frequencies - frequency) < SAME_FREQUENCY
+        own, others = (
+            replace(self, frequencies=self.frequencies[some], amplitudes=self.amplitudes[some])
+            for some in (is_own, ~is_own)
+        )
+        return own, others
+
+
+@dataclass(frozen=True, kw_only=True)
+class FingerRow:
+    """A finger among several contents: its frequency and verdict, what was promised and measured.
+
+    Contrasts are those of its own level above that of the power of all others' contents here.
+    Measured ones are None where nothing of its own, or nothing else, was measured.
+    """
+
+    at_m: Position
+    frequency_hz: float | None
+    verdict: str
+    promised_contrast_db: float | None
+    measured_contrast_db: float | None
+    measured_level_db_sl: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchRow:
+    """A touch from down to up, with its last steady pattern of most contents.
+
+    Its fields are the keys of `era demo --json`, but for those that `_OWN` names: quiet: other
+    fingertips by id [m]; pattern; levels_db_sl by id: of the target the mean over its tip, of any
+    other finger its loudest point, whose least difference is the contrast. Contrasts are None for
+    a finger alone, and measured ones if the pattern was too short: predicted ones are of the
+    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels;
+    transient ones are in accelerations, over the first 100 ms of the touch's first pattern.
+    drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
+    wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then
+    to the contents of others at this finger; contents: their patterns, in the order of layers.
+    """
+
+    target_id: str
+    time_s: float
+    until_s: float
+    targets_m: Sequence[Position]
+    quiet: Mapping[str, Position]
+    reason: str | None = None
+    drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    mode: str | None = None
+    shaped_onset: bool = False
+    latency_ms: float | None = None
+    played_s: float = 0.0
+    steady: bool = False
+    predicted_contrast_db: float | None = None
+    promised_contrast_db: float | None = None
+    measured_contrast_db: float | None = None
+    predicted_transient_contrast_db: float | None = None
+    measured_transient_contrast_db: float | None = None
+    predicted_level_db_sl: float | None = None
+    measured_level_db_sl: float | None = None
+    pattern: Layer | None = None
+    levels_db_sl: Mapping[str, float] = field(default_factory=dict)
+    fingers: Sequence[FingerRow] = ()
+    contents: Sequence[Layer] = ()
+
+    @property
+    def keeps_promise(self) -> bool | None:
+        """Whether the steady felt contrast is at least the promised one; None if not measured."""
+        promised, measured = self.promised_contrast_db, self.measured_contrast_db
+        if not self.steady or promised is None or measured is None:
+            return None
+        return measured >= promised
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the row in the format of `era demo --json`."""
+        row = {each.name: getattr(self, each.name) for each in fields(self)}
+        row = {key: row[key] for key in row if key not in _OWN}
+        row["quiet_m"] = list(self.quiet.values())
+        if self.fingers:
+            row["fingers"] = [asdict(each) for each in self.fingers]
+        return row
+
+
+_OWN = ("target_id", "quiet", "pattern", "levels_db_sl", "fingers", "contents")
+
+
+def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float | None:
+    """Level of the target above that of the loudest quiet point [dB], steady; None if alone."""
+    if not quiet:
+        return None
+    return target.level_db_sl - max(finger.loudest_db_sl for finger in quiet)
+
+
+def peak_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float:
+    """Contrast of the peaks [dB], as `model.transients.shaping` predicts for an onset."""
+    others = np.concatenate([finger.peaks for finger in quiet])
+    return float(contrast_db([target.peaks], others, [target.weights]))
+
+
+WATCHDOG = 2.0
+"""Watchdog [s] of simulated amplifiers, the longest of the protocol: their machine may be busy."""
+
+STARTUP_TIMEOUT = 120.0  # s; solving the plate takes long on a busy machine
+EXIT_TIMEOUT = 3.0  # s
+_REPLY_TIMEOUT = 30.0  # s; long enough for a busy machine
+_MAX_REPLY = 1 << 20  # bytes; what ten fingers feel takes a fiftieth of it
+_REMEDY = "see its output above and start the demonstration again"
+
+SIM_OPTIONS: Mapping[str, Sequence[str]] = {
+    "serial": ("--serial", "--shared"),
+    "modbus": ("--modbus-tcp", "0"),
+    "can": ("--socketcand", "0"),
+    "firmware": ("--firmware",),
+}
+"""Options of `era sim` by wire; amplifiers share a bus, so that they start together."""
+
+
+class SimulatedPlate:
+    """The plate behind the amplifiers, with their URLs by name; methods raise LinkError.
+
+    control: path of its control socket; each request has a connection of its own, so that no finger
+    waits for a vibration.
+    """
+
+    def __init__(
+        self, control: Path, urls: Mapping[str, str], *, threshold: str = DEFAULT_THRESHOLD
+    ) -> None:
+        self.urls = urls
+        self._control = control
+        self._threshold = threshold
+        self._placing = asyncio.Lock()  # fingers are placed in order
+
+    async def place_fingers(
+        self, positions: Mapping[str, Position], loads: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        """Place fingers at positions [m] by id, loads by id, too; all others are removed."""
+        async with self._placing:
+            await self._request("fingers", fingers=dict(positions), loads=dict(loads))
+
+    async def vibration(self, since: float, until: float) -> dict[str, FingerVibration]:
+        """Vibration of each finger by id between two times [s] of time.monotonic()."""
+        reply = await self._request("felt", since_s=since, until_s=until)
+        return {
+            id: FingerVibration(
+                frequencies=np.array(felt.frequencies_hz),
+                amplitudes=np.array(felt.amplitude_m_s2).reshape(
+                    len(felt.frequencies_hz), len(felt.peak_m_s2)
+                ),
+                peaks=np.array(felt.peak_m_s2),
+                weights=np.array(felt.weights),
+                threshold=self._threshold,
+            )
+            for id, felt in reply.fingers.items()
+        }
+
+    async def _request(self, op: str, **values: object) -> "_Reply":
+        """The reply to a request; raises LinkError if there is none or it is an error."""
+        try:
+            async with asyncio.timeout(_REPLY_TIMEOUT):
+                path = str(self._control)
+                reader, writer = await asyncio.open_unix_connection(path, limit=_MAX_REPLY)
+                with contextlib.closing(writer):
+                    writer.write(json.dumps({"op": op, **values}).encode() + b"\n")
+                    reply = _Reply.model_validate_json(await reader.readline())
+        except (OSError, ValueError) as error:  # no line, or half of one, is no JSON
+            why = str(error) or "it took too long"
+            if isinstance(error, ValidationError):
+                why = " ".join(first_problem(error))
+            raise LinkError(
+                f"simulated plate at {self._control}: no reply to {op} ({why}); {_REMEDY}"
+            ) from error
+        if reply.error is not None:
+            raise LinkError(f"simulated plate: {op} refused: {reply.error}")
+        return reply
+
+
+class _FingerRecord(BaseModel):
+    """Vibration of a finger, as the control socket has it."""
+
+    frequencies_hz: list[float]
+    amplitude_m_s2: list[list[float]]
+    peak_m_s2: list[float]
+    weights: list[float]
+
+
+class _Reply(BaseModel):
+    """What is read of a reply of the control socket."""
+
+    error: str | None = None
+    fingers: dict[str, _FingerRecord] = {}
+
+
+@contextlib.asynccontextmanager
+async def simulated_plate(
+    rig_file: Path,
+    amplifiers: Collection[str],
+    *,
+    wire: str,
+    seed: int | None = 0,
+    threshold: str = DEFAULT_THRESHOLD,
+) -> AsyncIterator[SimulatedPlate]:
+    """Simulate the amplifiers of a rig file for the duration of the context.
+
+    wire: a key of `SIM_OPTIONS` for a process of their own, "sim" for a plate in this process;
+    seed: of the plate within the rig's uncertainty, None for the rig's own; threshold: name of the
+    set for levels. Raises LinkError if the process does not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="era-") as folder:
+        path = Path(folder) / "control"
+        async with contextlib.AsyncExitStack() as stack:
+            if wire == "sim":
+                plate = "exact" if seed is None else f"seed={seed}"
+                base = f"sim://{quote(os.fsencode(rig_file))}?control={quote(os.fsencode(path))}&{plate}&amplifier="
+                urls = {name: base + quote(name) for name in amplifiers}
+            else:
+                process = await _start(rig_file, wire=wire, control=path, seed=seed)
+                stack.push_async_callback(_terminate, process)
+                urls = await _read_urls(process, count=len(amplifiers))
+            yield SimulatedPlate(path, urls, threshold=threshold)
+
+
+async def _start(
+    rig_file: Path, *, wire: str, control: Path, seed: int | None
+) -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        # -P: do not import a folder named sim in the working directory
+        *(sys.executable, "-P", "-m", "sim", str(rig_file), *SIM_OPTIONS[wire]),
+        *(("--exact",) if seed is None else ("--seed", str(seed))),
+        *("--control", str(control)),
+        "--until-eof",  # ends with the pipe below, however this process ends
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C must not end the amplifiers before they are silenced
+    )
+
+
+async def _read_urls(process: asyncio.subprocess.Process, *, count: int) -> dict[str, str]:
+    """Read a line `NAME: URL` per amplifier from the process."""
+    urls: dict[str, str] = {}
+    assert process.stdout is not None  # noqa: S101  a pipe was requested
+    try:
+        async with asyncio.timeout(STARTUP_TIMEOUT):
+            while len(urls) < count and (line := (await process.stdout.readline()).decode()):
+                name, _, url = line.strip().partition(": ")
+                urls[name] = url
+    except TimeoutError:
+        reason = f"not ready within {STARTUP_TIMEOUT:g} s"
+        raise LinkError(f"simulated amplifiers: {reason}; {_REMEDY}") from None
+    if len(urls) < count:
+        status = await process.wait()
+        raise LinkError(f"simulated amplifiers: exited with status {status}; {_REMEDY}")
+    return urls
+
+
+async def _terminate(process: asyncio.subprocess.Process) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.terminate()
+    await ended(process, EXIT_TIMEOUT)
+
 
 STEADY_WINDOW = 0.25
 """Time [s] over which a pattern is measured: settled, and it separates tones 10 Hz apart.

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-import controller.demo.far_end
-import controller.demo.run
+import controller.demo.demonstration
+import controller.demo.recorder
 import live_demonstration
 from controller.api.client import Client
 from controller.cli.main import run
+from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder
-from controller.demo.run import Scene, layout_of_people
 from controller.sources.capture import read_capture
 from gateway_bench import wait_for
 from installed_program import ERA
@@ -77,7 +77,7 @@ def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
     layout = layout_of_people(plate, {"left": None, "right": None})
     recorded = read_capture(capture)
     scenes = [Scene(recorded), Scene(recorded, layout)]
-    monkeypatch.setattr(controller.demo.run, "example_scenes", lambda rig: scenes)
+    monkeypatch.setattr(controller.demo.demonstration, "example_scenes", lambda rig: scenes)
     status, out, said = demo("--wire", "sim")
     assert (status, said) == (0, "")  # no hint either
     result = json.loads(out)
@@ -132,9 +132,9 @@ def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
     def killing(*arguments, on_row):
         return TouchRecorder(*arguments, on_row=lambda row: far_ends[0].kill())
 
-    start_far_end = controller.demo.far_end._start
-    monkeypatch.setattr(controller.demo.far_end, "_start", start)
-    monkeypatch.setattr(controller.demo.run, "TouchRecorder", killing)
+    start_far_end = controller.demo.recorder._start
+    monkeypatch.setattr(controller.demo.recorder, "_start", start)
+    monkeypatch.setattr(controller.demo.demonstration, "TouchRecorder", killing)
     status, out, said = demo("--touches", capture)
     assert status == 3, said
     assert len(said.strip().split("\n\n")) == 1

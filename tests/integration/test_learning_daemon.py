@@ -17,7 +17,7 @@ import pytest
 from controller.api.client import AsyncClient
 from controller.api.schema import LearningSummary
 from controller.daemon.daemon import Daemon
-from controller.demo.touch_row import FingerVibration, steady_contrast_db
+from controller.demo.recorder import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
 from daemon_bench import daemon_at, far_end, ready

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import model
-from controller.demo.run import Scene, example_scenes, run_demo
+from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout_file import load_layout
 from controller.sources.capture import read_capture
 from long_form import shortly

@@ -18,7 +18,7 @@ import numpy as np
 
 import patient_daemon
 from chromium import Page, open_browser
-from controller.demo.run import layout_of_people
+from controller.demo.demonstration import layout_of_people
 from gateway_bench import GatewayProcess, gateway_process, real_daemon
 from model.table.table_file import build_table
 from paper_plate import make_paper_rig

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from controller.demo.run import run_live
+from controller.demo.demonstration import run_live
 from model.rig.rig_file import example_rig_path
 from small_table import small_table
 

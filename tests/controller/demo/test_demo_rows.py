@@ -11,15 +11,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from controller.demo import far_end, run
-from controller.demo.far_end import SimulatedPlate, simulated_plate
-from controller.demo.pictures import choose_rows
-from controller.demo.recorder import TouchRecorder
-from controller.demo.touch_row import (
+from controller.demo import demonstration
+from controller.demo import recorder as far_end
+from controller.demo.demonstration import choose_rows
+from controller.demo.recorder import (
     FingerRow,
     FingerVibration,
+    SimulatedPlate,
+    TouchRecorder,
     TouchRow,
     peak_contrast_db,
+    simulated_plate,
     steady_contrast_db,
 )
 from controller.play.content import Prediction, not_served
@@ -237,10 +239,12 @@ async def test_plate_is_armed_again_after_a_fault_but_not_after_a_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After one of amplifiers that stalled it is cleared, and the recorder hears of both."""
-    monkeypatch.setattr(run, "RECOVERY", 5.0)
+    monkeypatch.setattr(demonstration, "RECOVERY", 5.0)
     async with asyncio.TaskGroup() as tasks, ready_daemon(tmp_path) as (bench, era):
         recorder = TouchRecorder(cast(SimulatedPlate, None), tasks, on_row=lambda row: None)
-        arming = asyncio.create_task(run._keep_armed(bench.daemon, bench.socket, recorder))
+        arming = asyncio.create_task(
+            demonstration._keep_armed(bench.daemon, bench.socket, recorder)
+        )
         await recorder.start()
         await until_state(era, ENABLED)
         bench.far.device.inject_fault(FaultWindow(fault="over_voltage", lasts=0.05))
@@ -263,7 +267,7 @@ async def test_fault_that_lasts_aborts_the_demonstration() -> None:
         recorder.failed(f"{FAULT}; once the cause is gone, clear and arm again")
         nothing = cast(Any, None)
         with pytest.raises(LinkError, match=f"aborted: {FAULT}$"):
-            await run._play([], 0, recorder, nothing)
+            await demonstration._play([], 0, recorder, nothing)
 
 
 async def test_far_end_terminates_process_when_not_ready_in_time(

@@ -13,7 +13,7 @@ from unittest.mock import AsyncMock
 import pytest
 from aiohttp import web
 
-from controller.demo.run import check_page
+from controller.demo.demonstration import check_page
 from controller.gateway.app import Gateway
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
 from controller.gateway.serving import listen, load_certificate, serve

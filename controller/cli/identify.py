@@ -120,7 +120,7 @@ def identify(
     """
     import time
 
-    from controller.diagnosis.plate_measurement import observation_of
+    from controller.plate_measurement import observation_of
     from model.config.fields import parse_frequencies
     from model.diagnosis.verdict import check_meaning
     from model.identification import identify as identification_report
@@ -274,7 +274,7 @@ def measured_by_amplifiers(
     """
     import asyncio
 
-    from controller.diagnosis.plate_measurement import PlateSelfMeasurement
+    from controller.plate_measurement import PlateSelfMeasurement
     from drivers.opening import Lines
 
     at = _urls_of(rig, urls)

@@ -122,7 +122,7 @@ def _measured(
     rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, has_terminal: bool
 ) -> "tuple[Rig, MeasuredPlate, Responses]":
     """Measure the plate by the sensors of its amplifiers."""
-    from controller.diagnosis.plate_measurement import observation_of
+    from controller.plate_measurement import observation_of
     from model.structure.modal_elasticity import check_measurable
 
     with rig_of_file(rig_file) as (_, rig):

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from controller.diagnosis.interleaved_tones import settling
 from controller.learning.messages import (
     HEAD,
     Answers,
@@ -28,6 +27,7 @@ from controller.learning.messages import (
     packed,
     unpacked,
 )
+from controller.plate_measurement import settling
 from model.answer.plan import prepare_answers
 from model.errors import InputError
 from model.files.array_file import remove_partial

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from controller.api.schema import BAD, LearningState, LearningStatus
-from controller.diagnosis.plate_sensors import PlateSensor, check_clocks, plate_sensors
 from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator_process import (
     DEFAULT_TIMEOUTS,
@@ -23,6 +22,7 @@ from controller.learning.estimator_process import (
 )
 from controller.learning.messages import Answers, Estimate, Note, Ready, RefreshedAnswers, Start
 from controller.learning.settled_readings import SettledReadings
+from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors
 from controller.play.loop import Controller
 from controller.play.observer import Observers, PlayReport
 from controller.sources.contacts import Change, Contact

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from controller.diagnosis.plate_sensors import PlateSensor
+from controller.plate_measurement import PlateSensor
 from controller.play.observer import PlayReport
 from controller.sources.contacts import Contact
 from drivers.errors import DriverError, Preempted

@@ -16,7 +16,7 @@ import pytest
 
 import model
 from chain import Chain
-from controller.diagnosis.tone_player import TonePlayer
+from controller.plate_measurement import TonePlayer
 from daemon_bench import READY, daemon_at, far_end, until_state
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout

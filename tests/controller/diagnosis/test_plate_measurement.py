@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_responder
-from controller.diagnosis.interleaved_tones import interleaved
-from controller.diagnosis.plate_measurement import (
+from controller.plate_measurement import (
     PlateSelfMeasurement,
+    PlateSensor,
+    TonePlayer,
     checked_level,
+    interleaved,
 )
-from controller.diagnosis.plate_sensors import PlateSensor
-from controller.diagnosis.tone_player import TonePlayer
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import Reading, SensorReading, measure_tones
 from drivers.opening import Lines

@@ -1,4 +1,20 @@
-"""Measuring a rig's plate by its own ERAs and the sensors of its amplifiers."""
+"""Driving the channels of a rig one by one while sensors measure the plate.
+
+Interleaved tones: every ERA plays at the same time, each at a frequency of its own.
+
+The range is cut into as many bands as ERAs play at once. In each step every band sounds at the same
+place within it, so that the tones of a step are a band apart; from step to step the ERAs take turns
+over the bands. One round plays every tone once; as many rounds as ERAs play it on each of them.
+
+The sensors of a rig's amplifiers as those of its plate: where they are, what they read.
+
+Small tones on the ERAs of a rig, on the path of every pattern.
+
+Routed by the wiring, admitted by the ledgers, over the wire, with the levels that amplifiers
+confirm.
+
+Measuring a rig's plate by its own ERAs and the sensors of its amplifiers.
+"""
 
 import asyncio
 import math
@@ -7,24 +23,261 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.diagnosis.interleaved_tones import Step, ToneSchedule, interleaved
-from controller.diagnosis.plate_sensors import PlateSensor, plate_sensors
-from controller.diagnosis.tone_player import TonePlayer
-from controller.play.routing import Drive
+from controller.play.capabilities import PlaybackCapabilities, playback_capabilities
+from controller.play.routing import Drive, route, tones_by_era
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.amplifier import Reading, measure_tones
+from drivers.host.amplifier import Amplifier, Reading, measure_tones, read_sensors
+from drivers.host.amplifier import Sensor as ReportedSensor
 from drivers.host.clock import CLOCK_SETTLING
+from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.protocol.definition import HEARTBEAT
+from drivers.protocol.definition import HEARTBEAT, QUANTITIES
 from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.calibration.responses import Responses
 from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
+from model.identification.forward import Sensor
 from model.identification.least_squares import MeasuredPlate, Measurement, Repeat
 from model.processes import Progress, unseen
-from model.rig.rig import Rig
-from model.vibration import Tone
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Channel, Rig
+from model.structure.attachments import footprints_of
+from model.transients.time_response import plate_in_time
+from model.vibration import Excitation, Tone
 from registry import threads
+
+WINDOW = 0.2  # s; of a reading: 1 % of noise is enough, and shorter ones hear more of it
+_TONES = 28  # over the range; theory in doubt asks for more, gains and springs for ten
+_PER_BAND = 2  # at least
+_AT_ONCE = 16  # tones of a reading
+_MARGIN = 1.01  # of a window, for frequencies as amplifiers round them
+# Of a vibration, where a plate counts as settled: readings tell the rest from their tones.
+_LEFT = 0.02
+_SETTLING = (0.2, 1.0)  # s, least and most
+
+Step = tuple[tuple[int, float], ...]
+"""Number of each ERA that plays, and its frequency [Hz]."""
+
+
+@dataclass(frozen=True)
+class ToneSchedule:
+    """Steps of interleaved tones; settling, window [s]: of each step."""
+
+    steps: tuple[Step, ...]
+    settling: float
+    window: float
+
+
+def interleaved(
+    rig: Rig, frequency_range: tuple[float, float], *, is_quick: bool = False
+) -> ToneSchedule:
+    """Tones over a range [Hz] for a rig; is_quick: one round only."""
+    low, high = frequency_range
+    steps: list[Step] = []
+    closest = high
+    numbers = range(len(rig.eras))
+    for first in range(0, len(numbers), _AT_ONCE):
+        group = numbers[first : first + _AT_ONCE]
+        own, apart = _rounds(group, low, high, count=1 if is_quick else len(group))
+        steps += own
+        closest = min(closest, apart)
+    window = max(WINDOW, _MARGIN / closest, _MARGIN / low)
+    return ToneSchedule(tuple(steps), settling(rig, frequency_range), window)
+
+
+def _rounds(
+    eras: Sequence[int], low: float, high: float, *, count: int
+) -> tuple[list[Step], float]:
+    """Rounds of a group of ERAs, and how far apart [Hz] tones of a step are."""
+    n = len(eras)
+    length = max(_PER_BAND, _TONES // n)
+    bands = np.linspace(low, high, n * length).reshape(n, length)
+    steps = [
+        tuple((era, float(bands[(j + place + number) % n, place])) for j, era in enumerate(eras))
+        for number in range(count)
+        for place in range(length)
+    ]
+    return steps, float(bands[-1, 0] - bands[-2, 0]) if n > 1 else high
+
+
+def settling(rig: Rig, frequency_range: tuple[float, float]) -> float:
+    """Time [s] until what rings within a range [Hz] has died away, on the rig as written."""
+    low, high = frequency_range
+    loads = list(rig.masses)
+    points = footprints_of(rig.eras, loads)
+    reduced = reduce_plate(rig.plate, rig.mesh, points, frequency_max=high)
+    decay = plate_in_time(reduced, rig.eras, loads=loads).decay
+    heard = decay[(decay.imag >= 2 * np.pi * low) & (decay.imag <= 2 * np.pi * high)]
+    slowest = float(heard.real.max()) if len(heard) else -np.inf
+    return float(np.clip(np.log(_LEFT) / slowest, *_SETTLING))
+
+
+_DERIVATIVES = {"ACCELERATION": 0, "VELOCITY": 1, "DISPLACEMENT": 2}
+"""How often what a sensor reads is to be differentiated in time."""
+
+
+@dataclass(frozen=True)
+class PlateSensor:
+    """A sensor of an amplifier: which of its sensors, and its place; derivatives to acceleration.
+
+    frequency_max [Hz]: of its tones.
+    """
+
+    amplifier: str
+    number: int
+    place: Sensor
+    derivatives: int
+    frequency_max: float
+
+    def accelerations(self, reading: Reading, frequencies: FloatArray) -> ComplexArray:
+        """Complex amplitudes [m/s²] (f,) of the tones [Hz] of a reading."""
+        amplitudes, degrees = np.array(reading.sensors[self.number].tones).T
+        phasors = amplitudes * np.exp(1j * np.radians(degrees))
+        return np.asarray(phasors * (2j * np.pi * frequencies) ** self.derivatives)
+
+
+@dataclass(frozen=True)
+class PlateSensors:
+    """Sensors that are used; unused: why others are not, one line each."""
+
+    used: tuple[PlateSensor, ...]
+    unused: tuple[str, ...]
+
+
+async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateSensors:
+    """Read what the sensors of open amplifiers, by name, measure and where.
+
+    Raises CommandError for an amplifier that has none, or none of use.
+    """
+    used: list[PlateSensor] = []
+    unused: list[str] = []
+    for name, amplifier in amplifiers.items():
+        reported = await read_sensors(amplifier)
+        if not reported:
+            raise CommandError(
+                f"amplifier {name} must measure the plate (feature sensors of the wire protocol), "
+                "got one without; use one with sensors, or measure with accelerometers and run "
+                "era calibrate"
+            )
+        own, rest = _of_amplifier(rig, name, reported)
+        if not own:
+            raise CommandError(
+                f"amplifier {name} must have a sensor of acceleration, velocity or displacement at "
+                "an ERA of the rig or at a place that it states, got "
+                f"{'; '.join(rest) or 'none'}"
+            )
+        used += own
+        unused += rest
+    return PlateSensors(tuple(used), tuple(unused))
+
+
+def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
+    """Raise CommandError unless all open amplifiers, by name, have one time."""
+    if len(amplifiers) < 2:
+        return
+    for name, each in amplifiers.items():
+        if not each.clock.can_be_steered:
+            raise CommandError(
+                f"amplifier {name} must have a clock that can be steered to be measured beside "
+                "others while they play, got none; see its clock_error"
+            )
+
+
+def _of_amplifier(
+    rig: Rig, amplifier: str, reported: Sequence[ReportedSensor]
+) -> tuple[list[PlateSensor], list[str]]:
+    eras = {channel: era for era, channel in rig.wiring.items()}
+    used: list[PlateSensor] = []
+    unused: list[str] = []
+    for number, sensor in enumerate(reported):
+        name = f"{amplifier}:{number}"
+        derivatives = _DERIVATIVES.get(sensor.unit)
+        era = "" if sensor.channel is None else eras.get(Channel(amplifier, sensor.channel), "")
+        if derivatives is None:
+            unused.append(f"sensor {name} measures {sensor.unit.lower()}")
+        elif era:
+            place = Sensor(era, era, amplifier=amplifier)
+            if any(each.place == place for each in used):
+                place = Sensor(name, era, amplifier=amplifier)
+            used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
+        elif sensor.channel is not None:
+            unused.append(f"sensor {name} is at channel {sensor.channel}, which has no ERA")
+        elif sensor.x is None or sensor.y is None:
+            unused.append(f"sensor {name} states no place")
+        else:
+            place = Sensor(name, x=sensor.x, y=sensor.y, amplifier=amplifier)
+            used.append(PlateSensor(amplifier, number, place, derivatives, sensor.frequency_max))
+    return used, unused
+
+
+RAMP = 0.05  # s; long enough not to excite the plate at onset or end
+_LEVEL_TOLERANCE = 0.02  # relative; more than any amplifier rounds
+_LEVEL_STEP = QUANTITIES["level"].from_wire(1)
+
+
+class TonePlayer:
+    """Plays tones on the amplifiers of a rig; lines: to them, urls: by their names.
+
+    group: of all amplifiers; ramp [s]: of what was played last; token: of its set.
+    """
+
+    def __init__(self, rig: Rig, lines: Callable[[], Lines], urls: Mapping[str, str]) -> None:
+        self.ramp = RAMP
+        self.token = 0
+        self.amplifiers: Mapping[str, Amplifier] = {}
+        self._rig = rig
+        self._lines = lines()
+        self._urls = urls
+        self.group = Group({})
+        self._ramp_max = RAMP
+
+    async def open(self) -> PlaybackCapabilities:
+        """Open all amplifiers, disarmed; what they can play. Raises DriverError, InputError."""
+        self.amplifiers = {
+            name: await self._lines.amplifier(
+                url, self._rig.limits, name=name, is_output=name in self._rig.outputs
+            )
+            for name, url in self._urls.items()
+        }
+        self.group = Group(self.amplifiers)
+        await self.group.open()
+        found = playback_capabilities(self._rig, self.amplifiers)
+        self._ramp_max = min(RAMP, found.ramp_max)
+        return found
+
+    async def silence(self) -> None:
+        """Let what plays fall silent."""
+        self.ramp = RAMP
+        await self.group.silence(RAMP)
+
+    async def play(self, excitation: Excitation) -> Drive:
+        """Play on all amplifiers; what each driven ERA plays, by name, as its amplifier confirms.
+
+        Raises CommandRefused for a level that is not played.
+        """
+        layers = route(excitation, self._rig, ramp=self._ramp_max)
+        self.ramp = max(layer.ramp for layer in layers.values())
+        played = await self.group.apply({name: [layer] for name, layer in layers.items()})
+        self.token = played.token
+        plays = tones_by_era(played.layers, self._rig)
+        for era, wired in self._rig.wiring.items():
+            tones = layers[wired.amplifier].tones
+            (requested,) = [tone.level for tone in tones if tone.channel == wired.number]
+            level = plays[era].level if era in plays else 0.0
+            if not math.isclose(requested, level, rel_tol=_LEVEL_TOLERANCE, abs_tol=_LEVEL_STEP):
+                raise CommandRefused(
+                    f"amplifier {wired.amplifier}: level of channel {wired.number} must be "
+                    f"{requested:g}, got {level:g}; let it cool down, or choose another --level"
+                )
+        return plays
+
+    async def close(self) -> None:
+        """Play silence, confirm it, disarm and close, whatever came before."""
+        try:
+            await self.group.close(RAMP)
+        finally:
+            await self._lines.close()
+
 
 LEVEL = 0.1
 """Usual level of every tone, 20 dB below full stroke."""

@@ -17,11 +17,9 @@ import pytest
 from controller.cli.main import run
 from controller.content.formats import Ahap, content_format, content_formats, read_content
 from controller.content.reading import ContentFormat
-from controller.effects.buzz import Buzz
 from controller.effects.effect import Effect
-from controller.effects.kinds import effect_kind, effect_kinds
-from controller.effects.layout import SurfaceLayout
-from controller.effects.layout_file import load_layout
+from controller.effects.kinds import Buzz, effect_kind, effect_kinds
+from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.touch import _SOURCES, TouchSource, open_source

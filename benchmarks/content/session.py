@@ -15,10 +15,10 @@ from benchmarks.promise.heard import Heard, Log
 from benchmarks.promise.session import EARLY
 from benchmarks.setting import random_contacts, support
 from controller.content.pattern import Pattern
-from controller.effects.file import File
+from controller.effects.effect import Region
+from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.play.intent import CLICK
 from model.answer.answer_report import Timing
 from model.config.fields import Circle

@@ -9,9 +9,9 @@ import numpy as np
 
 from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
+from controller.effects.effect import ON_RELEASE, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
-from controller.effects.region import ON_RELEASE, Region
 from controller.play.intent import Target, band_problem
 from model.processes import Progress, unseen
 from model.structure.plate import Plate

@@ -11,8 +11,8 @@ import numpy as np
 from controller.check.layout_check import raster
 from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, TouchSimulator
+from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
 from controller.play.chooser import ChoiceRequest, Intention
 from controller.play.content import Selection
 from controller.play.intent import Target

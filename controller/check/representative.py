@@ -3,9 +3,8 @@
 import math
 from collections.abc import Iterator
 
-from controller.effects.effect import Effect, EffectStimulus
+from controller.effects.effect import Effect, EffectStimulus, Region
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
 from controller.play.intent import Target
 from controller.sources.contacts import Contact, ContactKey
 

@@ -41,7 +41,7 @@ def check(
 
     from controller.check.layout_check import check_layout
     from controller.check.layout_together import check_together, close_pairs, matrix_of
-    from controller.effects.layout_file import load_layout
+    from controller.effects.layout import load_layout
     from model.commands.options import progress_bar
     from model.files.array_file import check_picture_name
     from model.table.table_file import load_table

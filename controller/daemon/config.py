@@ -12,9 +12,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, Strict
 
-from controller.effects.layout import SurfaceLayout, default_effects
-from controller.effects.layout_file import is_layout_document, level_problem, load_layout
-from controller.effects.strengths import read_strengths
+from controller.effects.layout import (
+    SurfaceLayout,
+    default_effects,
+    is_layout_document,
+    level_problem,
+    load_layout,
+)
+from controller.effects.player import read_strengths
 from controller.process.socket_lock import check_socket_path
 from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
 from drivers.by_hand.reaching import check_links

@@ -20,8 +20,7 @@ from controller.api.server import InputsEvent, LayoutEvent
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
 from controller.effects.layout import SurfaceLayout
-from controller.effects.player import EffectPlayer
-from controller.effects.strengths import Strengths, read_strengths
+from controller.effects.player import EffectPlayer, Strengths, read_strengths
 from controller.sources.reject_counter import RejectCounter
 from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
 from model.arrays import FloatArray

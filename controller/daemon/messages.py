@@ -51,7 +51,7 @@ from controller.api.server import (
 from controller.daemon.config import DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.effects.layout import SurfaceLayout
-from controller.effects.strengths import UNNAMED
+from controller.effects.player import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operator import LinkChange
 from controller.operation.states import DaemonState, Loss, Operation

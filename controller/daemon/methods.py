@@ -44,7 +44,7 @@ from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.daemon.messages import EventPublisher, effects_result, hello_result, playing_of
 from controller.effects.effect import MIN_DB_SL, Effect
-from controller.effects.file import File
+from controller.effects.kinds import File
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
 from controller.operation.operator import LEASE_OVER

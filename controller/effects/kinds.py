@@ -1,17 +1,578 @@
-"""Kinds of effects by name: those of the project, and those of installed packages."""
+"""Kinds of effects by name: those of the project, and those of installed packages.
 
+Buzz: a steady vibration, as long as the finger stays or for a duration.
+
+Click: one short vibration.
+
+Detents: a click at equal distances along the way of the finger.
+
+Dial: a click at equal angles about the centre of a region.
+
+Ramp: a level that rises or falls in steps.
+
+Texture: a vibration whose level follows the speed of the finger.
+
+File: content that people have, AHAP and its relatives, felt from its beginning to its end.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from operator import attrgetter
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
 
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
-from controller.effects.detents import Detents
-from controller.effects.dial import Dial
-from controller.effects.effect import Effect
-from controller.effects.file import File
-from controller.effects.ramp import Ramp
-from controller.effects.texture import Texture
+import numpy as np
+from pydantic import Field, PrivateAttr, model_validator
+
+from controller.content.formats import named_content, named_contents, read_content
+from controller.content.pattern import Pattern
+from controller.content.rendition import CLICK_DURATION, Rendition, Tap, rendered
+from controller.effects.effect import (
+    DB_SL,
+    MAX_DURATION,
+    MIN_DURATION,
+    Effect,
+    EffectRun,
+    EffectStimulus,
+    Modulation,
+    NoStimulus,
+    Region,
+    SteadyRun,
+)
+from controller.play.intent import MAX_DB_SL, Pulse
+from controller.sources.contacts import Contact
+from model.arrays import FloatArray
+from model.config.fields import ANGLE, LENGTH, LEVEL, SPEED, TIME, Quantity
 from model.errors import InputError
+from model.finger import STRONG_DB_SL
 from registry.plugins import PluginRegistry
+
+
+class Buzz(Effect):
+    """As long as the finger stays, or for a duration."""
+
+    kind: ClassVar[str] = "buzz"
+    is_for_motion: ClassVar[bool] = False
+    needs_entry: ClassVar[bool] = False
+
+    duration: (
+        Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=MAX_DURATION)] | None
+    ) = None
+    """None: as long as the finger stays."""
+
+    modulation: Modulation = None
+    """How often a second it comes and goes; none: steady."""
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start a steady vibration."""
+        pulse = None if self.duration is None else Pulse(self.duration, now)
+        return SteadyRun(level_db_sl, pulse, self.modulation)
+
+    @property
+    def has_end(self) -> bool:
+        """True with a duration."""
+        return self.duration is not None
+
+
+class Click(Effect):
+    """One short vibration."""
+
+    kind: ClassVar[str] = "click"
+    is_for_motion: ClassVar[bool] = False
+    needs_entry: ClassVar[bool] = False
+
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.5)] = 0.040
+    """The plate needs 20 ms to follow."""
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start a vibration of its duration."""
+        return SteadyRun(level_db_sl, Pulse(self.duration, now))
+
+
+# A finger has passed a detent once it is this far [m] beyond it.
+_HYSTERESIS = 0.0005
+
+
+class Notches:
+    """Clicks of a duration [s] at equal distances along a coordinate of one finger.
+
+    It starts halfway between two of them. hysteresis: how far beyond one the finger has passed it.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        *,
+        spacing: float,
+        hysteresis: float,
+        duration: float,
+        level_db_sl: float | None,
+    ) -> None:
+        self._middle = start  # of the two notches around the finger
+        self._spacing = spacing
+        self._hysteresis = hysteresis
+        self._duration = duration
+        self._level = level_db_sl
+        self._pulse: Pulse | None = None  # of the last notch
+
+    def at(self, coordinate: float, now: float) -> EffectStimulus | NoStimulus:
+        """Return a click from each passing on; several passed at once are one click."""
+        away = coordinate - self._middle
+        passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
+        if passed > 0:
+            self._middle += math.copysign(passed * self._spacing, away)
+            self._pulse = Pulse(self._duration, now)
+        return self.resting(now)
+
+    def resting(self, now: float) -> EffectStimulus | NoStimulus:
+        """Return the rest of the last click, without a further notch."""
+        if self._pulse is not None and now < self._pulse.end:
+            return EffectStimulus(self._level, until=self._pulse.end, pulse=self._pulse)
+        return NoStimulus()
+
+
+class Detents(Effect):
+    """A click at each detent that the finger passes along x or y.
+
+    The finger comes down halfway between two of them.
+    """
+
+    kind: ClassVar[str] = "detents"
+    is_for_motion: ClassVar[bool] = True
+
+    spacing: Annotated[float, Quantity(LENGTH, at_least=0.002, at_most=0.2)] = 0.010
+    """Distance between detents."""
+
+    along: Literal["x", "y"] = "x"
+    """Direction in which they are spaced."""
+
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    """Of each click."""
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start halfway between two detents."""
+        notches = Notches(
+            self.position(contact),
+            spacing=self.spacing,
+            hysteresis=_HYSTERESIS,
+            duration=self.duration,
+            level_db_sl=level_db_sl,
+        )
+        return _DetentsRun(self, notches)
+
+    def position(self, contact: Contact) -> float:
+        """Return the position [m] of a finger along the detents."""
+        return contact.x if self.along == "x" else contact.y
+
+
+class _DetentsRun(EffectRun):
+    """Follows the position of one finger between detents."""
+
+    def __init__(self, detents: Detents, notches: Notches) -> None:
+        self._detents = detents
+        self._notches = notches
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return a click from each passing on."""
+        return self._notches.at(self._detents.position(contact), now)
+
+
+# A finger has passed a detent once it is this far [rad] beyond it, or [m] where that is more.
+_DIAL_HYSTERESIS, _HYSTERESIS_LENGTH = 0.02, 0.0005
+_DEGREES_15 = 0.26179938779914946  # rad; as the file's units convert it
+# Nearer to the centre [m] the angle of a finger is noise, and does not count.
+_CENTRE_RADIUS = 0.006
+
+
+class Dial(Effect):
+    """A click at each detent that the finger passes in angle about the centre of its region.
+
+    The finger comes down halfway between two of them. Near the centre it turns nothing.
+    """
+
+    kind: ClassVar[str] = "dial"
+    is_for_motion: ClassVar[bool] = True
+    needs_region: ClassVar[bool] = True
+
+    spacing: Annotated[float, Quantity(ANGLE, at_least=0.05, at_most=3.2)] = _DEGREES_15
+    """Angle between detents."""
+
+    duration: Annotated[float, Quantity(TIME, at_least=MIN_DURATION, at_most=0.2)] = 0.030
+    """Of each click."""
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start outside of all regions: nothing is felt."""
+        return _Nothing()
+
+    def start_in(
+        self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
+    ) -> EffectRun:
+        """Start halfway between two detents."""
+        if region is None:
+            return self.start(contact, now, level_db_sl=level_db_sl)
+        return _DialRun(self, region.shape.centre, level_db_sl)
+
+
+class _Nothing(EffectRun):
+    """Nothing as long as the finger stays."""
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return nothing."""
+        return NoStimulus()
+
+
+class _DialRun(EffectRun):
+    """Follows the angle of one finger, turn after turn."""
+
+    def __init__(self, dial: Dial, centre: tuple[float, float], level_db_sl: float | None) -> None:
+        self._dial = dial
+        self._centre = centre
+        self._level = level_db_sl
+        self._angle = 0.0  # [rad], with its turns
+        self._last: float | None = None  # [rad] within one turn; None before the first
+        self._notches: Notches | None = None
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return a click from each passing on."""
+        x, y = contact.x - self._centre[0], contact.y - self._centre[1]
+        radius = math.hypot(x, y)
+        if radius < _CENTRE_RADIUS:
+            self._last = None  # it may come out at any angle
+            return NoStimulus() if self._notches is None else self._notches.resting(now)
+        angle = math.atan2(y, x)
+        if self._last is not None:
+            self._angle += math.remainder(angle - self._last, math.tau)
+        self._last = angle
+        if self._notches is None:
+            self._notches = Notches(
+                self._angle,
+                spacing=self._dial.spacing,
+                hysteresis=max(_DIAL_HYSTERESIS, _HYSTERESIS_LENGTH / radius),
+                duration=self._dial.duration,
+                level_db_sl=self._level,
+            )
+        return self._notches.at(self._angle, now)
+
+
+RAMP_STEP_DB = 2.0
+"""Step between levels of a ramp [dB], below the just noticeable difference."""
+
+
+class Ramp(Effect):
+    """From one level to another in steps of 2 dB; then over, or held at the last."""
+
+    kind: ClassVar[str] = "ramp"
+    is_for_motion: ClassVar[bool] = False
+
+    start_level: Annotated[float, DB_SL] = 6.0
+    """First level, in dB SL; the last is `level`."""
+
+    duration: Annotated[float, Quantity(TIME, at_least=0.1, at_most=MAX_DURATION)] = 1.0
+    """From the first level to the last."""
+
+    hold: bool = False
+    """Whether it holds the last level."""
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start at the first level, in steps of 2 dB, or larger ones where these are too short."""
+        end = STRONG_DB_SL if level_db_sl is None else level_db_sl
+        span = end - self.start_level
+        count = max(1, min(round(abs(span) / RAMP_STEP_DB), int(self.duration / MIN_DURATION) - 1))
+        rise = [self.start_level + span * index / count for index in range(count)]
+        levels = (*rise, level_db_sl)
+        pulse = Pulse(self.duration, now, is_raised=False)
+        return _RampRun(pulse, levels, self.duration / len(levels), self.hold)
+
+    @property
+    def has_end(self) -> bool:
+        """True unless it holds its last level."""
+        return not self.hold
+
+    def max_db_sl(self, level_db_sl: float | None) -> float:
+        """Return the higher of the first and the last level."""
+        return max(self.start_level, super().max_db_sl(level_db_sl))
+
+
+@dataclass(frozen=True)
+class _RampRun(EffectRun):
+    """Levels [dB SL] for equal steps of time [s] from the start; the last one may be held."""
+
+    pulse: Pulse
+    levels: tuple[float | None, ...]
+    step: float
+    is_held: bool
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return the level of the current step."""
+        index = max(0, int((now - self.pulse.start) / self.step))
+        if index >= len(self.levels) - 1 and self.is_held:
+            return EffectStimulus(self.levels[-1])
+        if index >= len(self.levels):
+            return None
+        until = self.pulse.start + (index + 1) * self.step
+        pulse = None if self.is_held else self.pulse
+        return EffectStimulus(self.levels[index], until, pulse=pulse)
+
+
+# Speed is measured over this time [s]; panels report 60 to 200 times a second.
+_SPEED_WINDOW = 0.060
+# A finger without movement for so long [s] is at rest.
+_REST_TIMEOUT = 0.080
+# Levels are this far apart [dB], so that not every report is another command.
+_LEVEL_STEP = 2.0
+# The level changes when the speed asks for one this far [dB] from it: hysteresis.
+_LEVEL_HYSTERESIS = 1.5
+# Reports closer together [s] are treated as this far apart; no panel is faster.
+_MIN_REPORT_INTERVAL = 0.002
+# Movement below this distance [m] is sensor noise.
+_NOISE = 0.0002
+
+
+class Texture(Effect):
+    """The faster the finger, the stronger, proportional to the logarithm of the speed.
+
+    Nothing is felt at rest.
+    """
+
+    kind: ClassVar[str] = "texture"
+    is_for_motion: ClassVar[bool] = True
+
+    slow: Annotated[float, Quantity(SPEED, above=0, at_most=1)] = 0.01
+    """Nothing is felt below it."""
+
+    fast: Annotated[float, Quantity(SPEED, above=0, at_most=5)] = 0.20
+    """`level` is reached at it; above `slow`."""
+
+    range: Annotated[float, Quantity(LEVEL, at_least=0, at_most=40)] = 14.0
+    """How many dB below `level` at `slow`."""
+
+    modulation: Modulation = None
+    """As of `buzz`."""
+
+    @model_validator(mode="after")
+    def _check_speeds(self) -> Self:
+        if self.fast <= self.slow:
+            raise ValueError(
+                f"fast must be above slow, which is {self.slow:g} m/s, got {self.fast:g} m/s"
+            )
+        return self
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start from rest."""
+        return _TextureRun(self, contact, now, level_db_sl)
+
+
+class _TextureRun(EffectRun):
+    """Follows the path of one finger."""
+
+    def __init__(
+        self, texture: Texture, contact: Contact, now: float, level_db_sl: float | None
+    ) -> None:
+        self._texture = texture
+        self._level = level_db_sl
+        self._path = deque([(now, contact.x, contact.y)])
+        self._attenuation: float | None = None  # below the level at `fast` [dB]
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return the level of the speed over the last 60 ms."""
+        before, *position = self._path[-1]
+        if math.dist((contact.x, contact.y), position) >= _NOISE:
+            if now - before >= _REST_TIMEOUT:  # it was at rest there until now
+                self._path = deque([(now - _SPEED_WINDOW, position[0], position[1])])
+            self._path.append((now, contact.x, contact.y))
+        while len(self._path) > 2 and now - self._path[1][0] >= _SPEED_WINDOW:
+            self._path.popleft()
+        rests_from = self._path[-1][0] + _REST_TIMEOUT
+        if now >= rests_from:
+            return NoStimulus()
+        speed = self._speed(contact, now)
+        if speed < self._texture.slow:
+            return NoStimulus(until=rests_from)
+        return EffectStimulus(
+            self._level_at(speed),
+            until=rests_from,
+            modulation_hz=self._texture.modulation,
+        )
+
+    def _speed(self, contact: Contact, now: float) -> float:
+        """Return the mean speed [m/s] along the stored path up to the finger."""
+        positions = [*((x, y) for _, x, y in self._path), (contact.x, contact.y)]
+        distance = sum(math.dist(one, after) for one, after in pairwise(positions))
+        return distance / max(now - self._path[0][0], _MIN_REPORT_INTERVAL)
+
+    def _level_at(self, speed: float) -> float | None:
+        """Return the level [dB SL] of a speed [m/s], linear in log speed, in steps of 2 dB."""
+        if self._level is None:
+            return None
+        slow, fast = self._texture.slow, self._texture.fast
+        fraction = math.log(min(speed, fast) / slow) / math.log(fast / slow)
+        attenuation = (1 - fraction) * self._texture.range
+        if self._attenuation is None or abs(attenuation - self._attenuation) > _LEVEL_HYSTERESIS:
+            self._attenuation = round(attenuation / _LEVEL_STEP) * _LEVEL_STEP
+        return self._level - self._attenuation
+
+
+_FREQUENCIES = tuple(float(each) for each in range(40, 501, 10))  # Hz; until a table is known
+
+
+class File(Effect):
+    """A file beside the layout, or a content by its name, once or over and over."""
+
+    kind: ClassVar[str] = "file"
+    is_for_motion: ClassVar[bool] = False
+
+    file: Annotated[str, Field(min_length=1, max_length=255)]
+    """Its path from the folder of the layout, in which it must be, or the name of a content."""
+
+    loop: bool = False
+    """Whether it begins anew at its end, as long as the finger stays."""
+
+    channel: Annotated[int, Field(ge=1, le=64)] | None = None
+    """Of a file that has several; none: the first."""
+
+    _pattern: Pattern = PrivateAttr(default=Pattern(0.0))
+    _frequencies: tuple[float, ...] = PrivateAttr(default=_FREQUENCIES)
+
+    @classmethod
+    def of(cls, pattern: Pattern, *, name: str, level_db_sl: float, loop: bool = False) -> Self:
+        """Make one of a pattern that has been read."""
+        effect = cls.model_construct({"level"}, file=name, level=level_db_sl, loop=loop)
+        effect._pattern = pattern
+        return effect
+
+    def read(self, folder: Path) -> None:
+        """Read the file; raises InputError, also for one outside of the folder."""
+        if self.file in named_contents():
+            self._pattern = _named(self.file)
+            return
+        try:
+            path = (folder / self.file).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # links in a circle, no name of a file
+            raise InputError(f"file must name a file, got {self.file!a}: {error}") from error
+        if not path.is_relative_to(folder.resolve()):
+            raise InputError(
+                f"file must be in the folder of the layout, got {self.file}; copy it there"
+            )
+        self._pattern = read_content(path, self.channel) if path.suffix else _named(self.file)
+
+    def for_table(self, frequencies: FloatArray) -> Self:
+        """Return it for the frequencies of a table [Hz]; nothing is prepared of it."""
+        effect = self.model_copy()
+        effect._frequencies, effect._rendered = tuple(frequencies.tolist()), {}
+        return effect
+
+    @cached_property
+    def _rendered(self) -> dict[float | None, tuple[Rendition, Rendition]]:
+        """Renditions by level: no part of what is compared."""
+        return {}
+
+    def is_prepared(self, level_db_sl: float | None) -> bool:
+        """Whether it is rendered at a level."""
+        return level_db_sl in self._rendered
+
+    def prepare(self, level_db_sl: float | None) -> tuple[Rendition, Rendition]:
+        """Render it at a level, for a finger that is alone, and for one among others.
+
+        Not by scaling another rendition: the faintest intensity has the same level in each.
+        """
+        if level_db_sl not in self._rendered:
+            level = MAX_DB_SL if level_db_sl is None else level_db_sl
+            alone = rendered(self._pattern, level, np.array(self._frequencies))
+            self._rendered[level_db_sl] = alone, alone.smoothed()
+        return self._rendered[level_db_sl]
+
+    def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
+        """Start at its beginning."""
+        alone, among = self.prepare(level_db_sl)
+        return _FileRun(alone, among, now, loop=self.loop, is_limit=level_db_sl is None)
+
+    @property
+    def has_end(self) -> bool:
+        """True unless it begins anew."""
+        return not self.loop
+
+
+def named_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, File]:
+    """Return an effect for each named content, at a level."""
+    return {
+        each: File.of(_named(each), name=each, level_db_sl=level_db_sl) for each in named_contents()
+    }
+
+
+@lru_cache
+def _named(name: str) -> Pattern:
+    return read_content(named_content(name))
+
+
+class _FileRun(EffectRun):
+    """A rendition from a time [s] on: what lasts of it, and its clicks in their turn."""
+
+    def __init__(
+        self, alone: Rendition, among: Rendition, now: float, *, loop: bool, is_limit: bool
+    ) -> None:
+        self._pulse = Pulse(math.inf if loop else alone.duration, now, is_raised=False)
+        self._alone, self._among, self._is_limit = alone, among, is_limit
+        among_others = self._lasting_of(among, None)
+        self._lasting = self._lasting_of(alone, among_others)
+        self._started = 0  # clicks
+        self._click: EffectStimulus | None = None
+
+    def _lasting_of(
+        self, rendition: Rendition, among_others: EffectStimulus | None
+    ) -> EffectStimulus | None:
+        if rendition.course is None:
+            return None
+        return EffectStimulus(
+            None if self._is_limit else rendition.level_db_sl,
+            pulse=self._pulse,
+            course=rendition.course,
+            band=rendition.band,
+            among_others=among_others,
+        )
+
+    def _click_of(
+        self, tap: Tap, pulse: Pulse, among_others: EffectStimulus | None
+    ) -> EffectStimulus:
+        return EffectStimulus(
+            None if self._is_limit else tap.level_db_sl,
+            pulse=pulse,
+            band=tap.band,
+            is_absolute=True,
+            among_others=among_others,
+        )
+
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
+        """Return what lasts, and the click that is due, if any."""
+        if now >= self._pulse.end:
+            return None
+        while now >= self._next_click():
+            number = self._started % len(self._alone.clicks)
+            self._started += 1
+            pulse = Pulse(CLICK_DURATION, now)
+            among_others = self._click_of(self._among.clicks[number], pulse, None)
+            self._click = self._click_of(self._alone.clicks[number], pulse, among_others)
+        until = min(self._next_click(), self._pulse.end)
+        if self._click is not None and self._click.pulse is not None:
+            if now < self._click.pulse.end:
+                until = min(until, self._click.pulse.end)
+            else:
+                self._click = None
+        wakes = until if until < math.inf else None
+        if self._lasting is not None:
+            return replace(self._lasting, until=wakes, click=self._click)
+        return NoStimulus(wakes) if self._click is None else replace(self._click, until=wakes)
+
+    def _next_click(self) -> float:
+        """When [s] the next click starts; infinite for none."""
+        found, count = self._alone, len(self._alone.clicks)
+        if not count or (self._started >= count and self._pulse.duration < math.inf):
+            return math.inf
+        turns, number = divmod(self._started, count)
+        return self._pulse.start + turns * found.duration + found.clicks[number].time
+
 
 BUILT_IN: tuple[type[Effect], ...] = (Buzz, Click, Detents, Dial, File, Ramp, Texture)
 """The kinds of the project itself."""

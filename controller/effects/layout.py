@@ -1,17 +1,39 @@
-"""A surface layout: which regions of the plate have which effects."""
+"""A surface layout: which regions of the plate have which effects.
+
+The file of a surface layout: read, checked, and a kind of configuration for `era config`.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any, Self
 
-from controller.effects.effect import Effect
-from controller.effects.file import named_effects
-from controller.effects.kinds import BUILT_IN
-from controller.effects.region import USES, Region
+from pydantic import Field
+
+from controller.effects.effect import (
+    DEFAULT_MAX_DB_SL,
+    ON_MOVE,
+    ON_RELEASE,
+    USES,
+    Effect,
+    Level,
+    Region,
+    TunedSection,
+)
+from controller.effects.kinds import BUILT_IN, effect_kind, effect_kinds, named_effects
 from controller.play.intent import Band, band_problem
+from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
+from model.config.document import Document, KeyPath, read_document
+from model.config.fields import LEVEL, Quantity, Section, ShapedSection, Validation
+from model.config.file_kinds import CheckedFile, ConfigKind
+from model.errors import InputError
 from model.finger import STRONG_DB_SL
+from model.rig.actuator_keys import Identifier
+from model.structure.plate import Plate
+from registry.plugins import did_you_mean
 
 BUZZ = "buzz"
 """Name of the effect that plays without a layout."""
@@ -107,3 +129,250 @@ class SurfaceLayout:
             "regions": [region.as_json() for region in self.regions],
             "elsewhere": self.elsewhere,
         }
+
+
+_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
+
+
+_HighestLevel = Annotated[
+    float, Quantity(LEVEL, at_least=DEFAULT_MAX_DB_SL, at_most=MAX_LEVEL_DB_SL)
+]
+
+
+class RegionSection(ShapedSection, TunedSection):
+    """A region of the plate and its effects."""
+
+    on_press: Identifier | None = None
+    on_move: Identifier | None = None
+    on_release: Identifier | None = None
+    level: Level | None = None
+    priority: Annotated[int, Field(ge=0, le=100)] = 0
+    own: bool = False
+    may_share: bool = False
+    protected: bool = False
+
+
+class LayoutSection(Section):
+    """A surface layout."""
+
+    effects: Annotated[
+        dict[Identifier, dict[str, Any]], Field(max_length=_MAX_EFFECTS, default_factory=dict)
+    ]
+    regions: Annotated[
+        dict[Identifier, RegionSection], Field(max_length=_MAX_REGIONS, default_factory=dict)
+    ]
+    elsewhere: Identifier | None = BUZZ
+    max_level_db_sl: _HighestLevel = DEFAULT_MAX_DB_SL
+
+
+def load_layout(
+    path: Path, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
+) -> SurfaceLayout:
+    """Read a layout; raises ConfigError with every problem of the file.
+
+    plate: must contain all regions, None for any. level_db_sl: of the default effects.
+    """
+    return layout_of(read_document(path), plate, level_db_sl=level_db_sl)
+
+
+def layout_of(
+    document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
+) -> SurfaceLayout:
+    """Make the layout of a document; arguments and errors as of `load_layout`."""
+    _check_kind(document)
+    validation = Validation(document, LayoutSection)
+    effects = _effects(document, validation, level_db_sl)
+    for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
+        _check_region(validation, ("regions", name), effects, plate)
+    elsewhere = validation.field(("elsewhere",), LayoutSection)
+    _check_use(validation, ("elsewhere",), elsewhere, effects, is_for_motion=None)
+    _check_levels(validation, effects)
+    section = validation.finish()
+    return SurfaceLayout(
+        regions=tuple(_region(name, region) for name, region in section.regions.items()),
+        effects={name: effect for name, effect in effects.items() if effect is not None},
+        elsewhere=section.elsewhere,
+    )
+
+
+def is_layout_document(document: Document) -> bool:
+    """Whether a configuration file is a surface layout."""
+    own = LayoutSection.model_fields.keys()
+    return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
+
+
+def _check_kind(document: Document) -> None:
+    """Refuse another kind of file as a whole instead of all its unknown keys."""
+    if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
+        kind = "a rig" if "plate" in document.data else "a daemon file"
+        raise InputError(
+            f"{document.source}: must be a surface layout, got {kind}; "
+            "era config init layout.yaml --kind layout  writes one"
+        )
+
+
+def _effects(
+    document: Document, validation: Validation[LayoutSection], level_db_sl: float
+) -> dict[str, Effect | None]:
+    """Return effects by name, with the default ones; None for an invalid one."""
+    effects: dict[str, Effect | None] = {**default_effects(level_db_sl)}
+    own = validation.mapping(("effects",))
+    effects |= dict.fromkeys(own)
+    for name, parameters in islice(own.items(), _MAX_EFFECTS):
+        path = ("effects", name)
+        if not isinstance(parameters, dict):
+            continue  # reported with the section of the layout
+        kind = parameters.get("kind", name)
+        try:
+            section = effect_kind(kind if isinstance(kind, str) else repr(kind))
+        except InputError as error:
+            where = (*path, "kind") if "kind" in parameters else path
+            is_named = "kind" in parameters or name in effect_kinds()
+            validation.add(where, f"{error}" if is_named else f"needs a kind; {error}")
+            continue
+        effects[name] = effect = validation.nested(path, section, without="kind")
+        try:
+            if effect is not None:
+                effect.read(document.beside(""))
+        except InputError as error:
+            validation.add((*path, "file"), f"{error}")
+    return effects
+
+
+def _check_region(
+    validation: Validation[LayoutSection],
+    path: KeyPath,
+    effects: dict[str, Effect | None],
+    plate: Plate | None,
+) -> None:
+    """Check that a region has one shape, on the plate, and that its effects exist."""
+    region = validation.part(path, RegionSection)
+    if region is None:
+        return
+    sides = None if plate is None else (plate.length, plate.width)
+    if problem := region.shape_problem(sides):
+        validation.add((*path, *problem[0]), problem[1])
+    if not any(getattr(region, key) for key in USES):
+        for key in ("level", "band", "frequency", "own", "may_share"):
+            given = getattr(region, key)
+            if given is not None and given is not False:  # a level may be 0
+                validation.add(
+                    (*path, key), f"has no effect to apply to; add an effect or remove the {key}"
+                )
+    if region.own and region.may_share:
+        validation.add(
+            (*path, "may_share"), "must not be true beside own: its content is shared; remove one"
+        )
+    for key in USES:
+        name = getattr(region, key)
+        _check_use(validation, (*path, key), name, effects, is_for_motion=key == ON_MOVE)
+
+
+def _check_levels(validation: Validation[LayoutSection], effects: dict[str, Effect | None]) -> None:
+    """Check that no level is above the highest one of the layout."""
+    highest = validation.field(("max_level_db_sl",), LayoutSection)
+    levels: dict[KeyPath, float] = {
+        ("effects", name): effect.max_db_sl(effect.level_db_sl)
+        for name, effect in effects.items()
+        if effect is not None and effect.level_db_sl is not None
+    }
+    for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
+        region = validation.part(("regions", name), RegionSection)
+        if region is not None and isinstance(region.level, float):
+            levels["regions", name, "level"] = region.level
+    for path, level in levels.items():
+        if problem := level_problem(level, highest):
+            validation.add(path, problem)
+
+
+def level_problem(level_db_sl: float, highest: float | None = None) -> str | None:
+    """Return why a level [dB SL] is too high for a layout; highest: None for the default."""
+    highest = DEFAULT_MAX_DB_SL if highest is None else highest
+    if level_db_sl <= highest:
+        return None
+    return (
+        f"level must be up to {highest:g} dB SL, got {level_db_sl:g}; lower it, or raise "
+        "max_level_db_sl of the layout"
+    )
+
+
+def _check_use(
+    validation: Validation[LayoutSection],
+    path: KeyPath,
+    name: str | None,
+    effects: dict[str, Effect | None],
+    *,
+    is_for_motion: bool | None,
+) -> None:
+    """Check that an effect exists and fits its use; is_for_motion: None if any effect fits."""
+    if name is None:
+        return
+    if name not in effects:
+        validation.add(
+            path,
+            f"unknown effect {name!r}; {did_you_mean(name, effects)}"
+            f"choose one of {', '.join(effects)}"
+            + f"; or define it, as `{name}: {{}}` under effects"
+            * (name in effect_kinds()),
+        )
+        return
+    effect = effects[name]
+    if effect is None:
+        return
+    if is_for_motion is None:
+        if effect.needs_region:
+            validation.add(path, f"{name} is felt in regions only; put it under on_move of one")
+        return
+    if effect.is_for_motion and not is_for_motion:
+        validation.add(path, f"{name} is for motion; put it under on_move")
+    elif is_for_motion and not effect.is_for_motion:
+        validation.add(path, f"{name} is not for motion; put it under on_press or on_release")
+    elif path[-1] == ON_RELEASE and not effect.has_end:
+        can_end = "duration" in type(effect).model_fields
+        remedy = "give it a duration" if can_end else "choose an effect that does"
+        validation.add(path, f"{name} must end by itself; {remedy}")
+
+
+def _region(name: str, section: RegionSection) -> Region:
+    return Region(
+        name=name,
+        shape=section.shape,
+        on_press=section.on_press,
+        on_move=section.on_move,
+        on_release=section.on_release,
+        level_db_sl=section.level if isinstance(section.level, float) else None,
+        has_level=section.level is not None,
+        priority=section.priority,
+        band=section.tuned_band,
+        is_own=section.own,
+        may_share=section.may_share,
+        is_protected=section.protected,
+    )
+
+
+def _checked(document: Document) -> CheckedFile:
+    """Read a layout; raises ConfigError. Its fit on a plate shows in the daemon's file."""
+    layout = layout_of(document, None)
+    unused = default_effects().keys() - {name for _, _, name in layout.uses()}
+    return CheckedFile(
+        f"good: regions {', '.join(region.name for region in layout.regions) or 'none'}; "
+        f"effects {', '.join(name for name in layout.effects if name not in unused) or 'none'}; "
+        f"elsewhere {layout.elsewhere or 'nothing'}. "
+        "Check the daemon's file that names it to see whether it fits the plate",
+    )
+
+
+def _keys() -> dict[str, Any]:
+    """The JSON schema of a layout; the kinds of effects are under `$defs`."""
+    schema = LayoutSection.model_json_schema()
+    kinds = {f"effect {name}": effect_kind(name).model_json_schema() for name in effect_kinds()}
+    return {**schema, "$defs": {**schema.get("$defs", {}), **kinds}}
+
+
+LAYOUT = ConfigKind(
+    "A surface layout of era-haptics",
+    recognises=is_layout_document,
+    check=_checked,
+    example_file=Path(__file__).with_name("example.yaml"),
+    keys=_keys,
+)

@@ -1,18 +1,136 @@
-"""From contacts to a haptic intent by a surface layout: which finger feels which effect."""
+"""From contacts to a haptic intent by a surface layout: which finger feels which effect.
 
+What a strength may be, over the API and in the file that keeps it.
+
+Strengths: a gain on what a source or client brings, or a region has, kept by its name.
+"""
+
+import json
 import math
-from collections.abc import Collection, Sequence
+import os
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
 
-from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
-from controller.effects.strengths import Strengths
 from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact, ContactKey
+from model.config.document import read_bytes
+from model.errors import InputError, shown
+from model.files.array_file import whole_or_nothing
 from model.transients.excursions import CLICKS_APART
 from registry.plugins import WrongResultError
+
+SourceName: TypeAlias = Annotated[str, Field(min_length=1, max_length=2048)]
+"""A name that has a strength; those of senders are escaped, and so may be long."""
+
+GainDb: TypeAlias = Annotated[float, Field(ge=-40, le=0)]
+"""The gain [dB] of a name."""
+
+
+MAX_NAMES = 64
+"""How many touch sources are remembered, and how many names may have a gain."""
+
+UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
+"""Clients that no strength is kept for: commands, and browsers that have given no name."""
+
+_MAX_SIZE = 1 << 21  # bytes; of as many names of the greatest length, each character escaped
+
+_Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
+_GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
+
+
+class Strengths:
+    """Gains [dB] by name, 0 at most, which is what holds where none is set.
+
+    A name is that of a touch input of the configuration, of a sender there
+    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, of a client, or of a
+    region of a layout. At a finger the gains of its names, of its region and of the client that
+    plays its effect add up, each once.
+    """
+
+    def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
+        self.gains_db = gains_db or {}
+        """Those that were set, by name; also to 0."""
+        self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
+        """The clients: the origin with which the keys of their sources begin, and their names."""
+        self.sources: Sequence[str] = ()
+        """Names of touch sources that had fingers."""
+
+    def note(self, source: str) -> None:
+        """Note that a touch source has a finger."""
+        name, _ = self._names_of(source)
+        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
+
+    def gain_db(self, source: str, player: str | None = None, region: str | None = None) -> float:
+        """Return the gain at a finger of a source; player: the client that plays its effect.
+
+        region: in which the effect is felt.
+        """
+        names = {*self._names_of(source), player, region} if self.gains_db else ()
+        return sum([gain for name, gain in self.gains_db.items() if name in names])
+
+    def set(self, name: str, gain_db: float) -> None:
+        """Set the gain [dB] of a name from now on.
+
+        For one name more than there may be the oldest at 0 is removed. Raises InputError if all
+        others are lower.
+        """
+        gains = {**self.gains_db, name: gain_db}
+        if len(gains) > MAX_NAMES:
+            gains.pop(next((each for each, gain in gains.items() if not gain), name))
+        if gain_db and name not in gains:
+            raise InputError(
+                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
+                "another to 0 dB first"
+            )
+        self.gains_db = gains
+
+    def save(self, file: Path) -> None:
+        """Write the gains that are set, atomically; raises OSError."""
+        with whole_or_nothing(file) as stream:
+            stream.write(json.dumps(self.gains_db, indent=1).encode())
+
+    def _names_of(self, source: str) -> tuple[str, str]:
+        """Return the two names of a source, its own first."""
+        first, second, *rest = f"{source}::".split(":", 2)
+        client = dict(self.clients()).get(f"{first}:{second}")
+        return (source, first) if client is None else (rest[0][:-2], client)
+
+
+def read_strengths(file: Path | None) -> Mapping[str, float]:
+    """Read the gains [dB] of a file, none where there is no file; raises InputError."""
+    if file is None or not os.path.lexists(file):
+        return {}
+    text = read_bytes(file, _MAX_SIZE, is_for="remove it", give="a file of strengths")
+    try:
+        # A number of many digits becomes infinite, and is refused as such.
+        gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
+        return _GAINS.validate_python(gains, strict=True)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
+    except ValidationError as error:
+        raise InputError(
+            f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
+            "remove it"
+        ) from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON; raises InputError for a name that is repeated."""
+    found = dict[str, Any]()
+    for name, value in pairs:
+        if name in found:
+            raise InputError(f"strengths must have each name once, got {shown(name)} twice")
+        found[name] = value
+    return found
+
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
 # until it is this far [m] from where it entered.

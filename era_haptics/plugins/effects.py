@@ -1,8 +1,7 @@
 """Interfaces for effects: entry points `era_haptics.effects`."""
 
-from controller.effects.effect import Effect, EffectRun, EffectStimulus, Level, NoStimulus
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, Level, NoStimulus, Region
 from controller.effects.kinds import effect_kind
-from controller.effects.region import Region
 from controller.play.intent import Pulse
 from controller.sources.contacts import Contact, ContactKey
 from model.config.fields import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME, Quantity

@@ -52,7 +52,7 @@ class ConfigKind:
 
 KINDS = {
     "daemon": "controller.daemon.config:DAEMON",
-    "layout": "controller.effects.layout_file:LAYOUT",
+    "layout": "controller.effects.layout:LAYOUT",
     DEFAULT_KIND: "model.rig.rig_summary:RIG",
 }
 """Where each is, by name: this package does not import those above it."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from controller.content.formats import read_content
-from controller.effects.layout_file import load_layout
-from controller.effects.strengths import read_strengths
+from controller.effects.layout import load_layout
+from controller.effects.player import read_strengths
 from controller.gateway.settings import read_token
 from controller.sources.capture import read_capture
 from drivers.errors import CommandError

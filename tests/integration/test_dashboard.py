@@ -20,7 +20,7 @@ import patient_daemon
 from chromium import Browser, Page
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
-from controller.effects.layout_file import LAYOUT, load_layout
+from controller.effects.layout import LAYOUT, load_layout
 from daemon_bench import PATIENCE
 from dashboard_pictures import (
     PLACES,

@@ -8,7 +8,7 @@ import pytest
 
 import model
 from controller.demo.demonstration import Scene, example_scenes, run_demo
-from controller.effects.layout_file import load_layout
+from controller.effects.layout import load_layout
 from controller.sources.capture import read_capture
 from long_form import shortly
 from model.rig.rig_file import load_rig

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from chain import Chain, Position
-from controller.effects.buzz import Buzz
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.content import Content, Selection
 from controller.play.intent import Target

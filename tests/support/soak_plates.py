@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from controller.content.pattern import Pattern, Transient
-from controller.effects.buzz import Buzz
-from controller.effects.file import File
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, File, Texture
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
-from controller.effects.texture import Texture
 from controller.play.intent import IntentSource
 from model.answer.answer_report import Timing
 from model.config.fields import Rectangle

@@ -17,18 +17,9 @@ from controller.check.layout_check import CheckedEffect, check_layout
 from controller.check.representative import strongest_target
 from controller.cli.main import run as run_era
 from controller.content.pattern import Pattern
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
-from controller.effects.detents import Detents
-from controller.effects.dial import Dial
-from controller.effects.effect import Effect
-from controller.effects.file import File
-from controller.effects.kinds import BUILT_IN
-from controller.effects.layout import SurfaceLayout
-from controller.effects.layout_file import load_layout
-from controller.effects.ramp import Ramp
-from controller.effects.region import Region
-from controller.effects.texture import Texture
+from controller.effects.effect import Effect, Region
+from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Dial, File, Ramp, Texture
+from controller.effects.layout import SurfaceLayout, load_layout
 from era_haptics.lab.cli import app
 from long_form import in_turn
 from model.config.fields import Circle, Rectangle

@@ -11,12 +11,10 @@ import pytest
 
 from controller.check import layout_together
 from controller.check.layout_together import Together, check_together, close_pairs, matrix_of
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
-from controller.effects.effect import Effect
+from controller.effects.effect import Effect, Region
+from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.play.chooser import Chooser
 from controller.play.content import Prediction
 from controller.play.intent import HapticIntent

@@ -151,7 +151,7 @@ async def test_reload_costs_the_loop_nothing(
     async with ready_daemon(tmp_path, "level_db_sl: 20\n") as (bench, era):
         await era.subscribe("layout", "log")
         await era.arm("me", lease_s=60)
-        for name in ("controller.daemon.config", "controller.effects.layout_file"):
+        for name in ("controller.daemon.config", "controller.effects.layout"):
             monkeypatch.setattr(f"{name}.read_document", fail)
         with (tmp_path / "daemon.yaml").open("a", encoding="utf-8") as file:
             file.write("layouts: {large: large.yaml}\n")
@@ -186,7 +186,7 @@ def test_plugin_installed_meanwhile_needs_a_restart(
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: late-effect\nVersion: 1\n")
     (info / "entry_points.txt").write_text("[era_haptics.effects]\nlate = late_effect:Late\n")
     (package / "late_effect.py").write_text(
-        "from controller.effects.click import Click\nclass Late(Click):\n    kind = 'late'\n"
+        "from controller.effects.kinds import Click\nclass Late(Click):\n    kind = 'late'\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(package))  # of children started from now on
     (folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")

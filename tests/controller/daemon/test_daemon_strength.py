@@ -15,7 +15,7 @@ import pytest
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.demo.demonstration import layout_of_people
-from controller.effects.strengths import MAX_NAMES
+from controller.effects.player import MAX_NAMES
 from daemon_bench import DaemonBench, ready_daemon
 from drivers.protocol.definition import QUANTITIES
 from model.arrays import FloatArray

@@ -5,12 +5,10 @@ from collections.abc import Sequence
 
 import pytest
 
-from controller.effects.click import Click
-from controller.effects.dial import Dial
-from controller.effects.effect import EffectStimulus, NoStimulus
+from controller.effects.effect import EffectStimulus, NoStimulus, Region
+from controller.effects.kinds import Click, Dial
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
 from model.config.fields import Circle, Polygon, Rectangle
 

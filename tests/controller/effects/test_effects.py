@@ -15,16 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.daemon.messages import effects_result
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
-from controller.effects.detents import Detents
-from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus
-from controller.effects.kinds import BUILT_IN
+from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
+from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Ramp, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.ramp import Ramp
-from controller.effects.region import Region
-from controller.effects.texture import Texture
 from controller.sources.contacts import Contact, ContactKey
 from model.config.fields import Circle, Polygon, Rectangle
 

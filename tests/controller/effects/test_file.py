@@ -9,10 +9,8 @@ import pytest
 
 from controller.content.formats import named_contents
 from controller.content.pattern import Pattern, Transient
-from controller.effects.buzz import Buzz
-from controller.effects.file import File
-from controller.effects.layout import SurfaceLayout
-from controller.effects.layout_file import load_layout
+from controller.effects.kinds import Buzz, File
+from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import Target
 from controller.sources.contacts import Contact, ContactKey

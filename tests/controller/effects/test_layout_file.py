@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from controller.effects.click import Click
-from controller.effects.detents import Detents
 from controller.effects.effect import Effect, TunedSection
-from controller.effects.layout_file import LayoutSection, RegionSection, load_layout
+from controller.effects.kinds import Click, Detents
+from controller.effects.layout import LayoutSection, RegionSection, load_layout
 from key_tables import key_rows
 from model.config.document import ConfigError
 from model.config.fields import CircleSection, Rectangle, RectangleSection
@@ -73,7 +72,7 @@ def test_of_too_many_effects_the_number_is_said_and_no_more_are_read(
         f"effects: {{{effects}}}\nregions: {{a: {{{shape}, on_press: e999}}}}\n", "utf-8"
     )
     monkeypatch.setattr(
-        "controller.effects.layout_file.effect_kind", lambda kind: read.append(kind) or Click
+        "controller.effects.layout.effect_kind", lambda kind: read.append(kind) or Click
     )
     with pytest.raises(ConfigError) as caught:
         load_layout(path, None)

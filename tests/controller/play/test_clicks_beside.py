@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
+from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.play.chooser import Chooser
 from controller.play.content import Prediction, Selection, sums_db

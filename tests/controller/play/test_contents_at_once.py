@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from controller.daemon.messages import PlateView
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
+from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target

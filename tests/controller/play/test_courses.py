@@ -10,7 +10,7 @@ import pytest
 
 from chain import Chain
 from controller.content.pattern import Pattern, Transient
-from controller.effects.file import File
+from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.sources.contacts import Contact

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from chain import Position
-from controller.effects.click import Click
+from controller.effects.kinds import Click
 from controller.play.crossfades import Crossfades
 from controller.play.intent import Target
 from controller.play.layers import CROSSFADE

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from controller.content.pattern import Pattern
-from controller.effects.buzz import Buzz
-from controller.effects.file import File
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, File
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
 from model.answer.answer_report import Timing
 from model.answer.stimulus import STRONGEST
 from model.config.fields import Circle

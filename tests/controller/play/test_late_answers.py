@@ -8,9 +8,9 @@ import pytest
 
 from chain import Position
 from controller.daemon.messages import PlateView
-from controller.effects.buzz import Buzz
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
 from controller.play.content import BEING_CHOSEN
 from controller.play.selection import BLOCKED, GIVEN_UP
 from drivers.protocol.definition import HEARTBEAT

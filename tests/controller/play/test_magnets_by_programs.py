@@ -15,14 +15,10 @@ import pytest
 
 from chain import Chain
 from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
-from controller.effects.effect import Effect
-from controller.effects.file import File
+from controller.effects.effect import Effect, Region
+from controller.effects.kinds import Buzz, Click, File, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.effects.region import Region
-from controller.effects.texture import Texture
 from long_form import shortly
 from magnets import Magnets, Outputs
 from model.answer.answer_report import Timing

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.signal import hilbert
 
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
 from controller.play.content import Content
 from controller.play.intent import Pulse, Target
 from controller.play.layer_content import LayerContent

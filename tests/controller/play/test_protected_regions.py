@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 
 from controller.daemon.messages import PlateView
-from controller.effects.buzz import Buzz
-from controller.effects.click import Click
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
-from controller.effects.region import Region
 from controller.sources.contacts import Contact, ContactKey
 from model.config.fields import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table

@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 
 from chain import Chain, Sent
-from controller.effects.click import Click
+from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import HapticIntent, Target

@@ -58,7 +58,7 @@ def gateway(
 
     require_gateway()
     from controller.api.link import find_socket
-    from controller.gateway.serving import serve
+    from controller.gateway.app import serve
 
     host, port = _host_and_port(listen)
     chosen = {} if token_file is None else {"token": read_token(token_file)}

@@ -1,19 +1,30 @@
-"""The gateway's routes: the page, the API over HTTP with its OpenAPI description, the WebSocket."""
+"""The gateway's routes: the page, the API over HTTP with its OpenAPI description, the WebSocket.
+
+The gateway's server process: aiohttp, its socket, and its end within a second.
+"""
 
 import asyncio
 import contextlib
 import json
+import logging
 import mimetypes
+import os
+import signal
+import socket
+import ssl
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from aiohttp import HttpVersion11, WSCloseCode, web
+from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic.json_schema import models_json_schema
 
 from controller.api.client import AsyncClient
+from controller.api.connection import allow_many_descriptors
 from controller.api.jsonrpc import (
     ERROR_MEANINGS,
     ErrorCode,
@@ -31,13 +42,19 @@ from controller.api.methods import Method
 from controller.api.registered import METHODS, SILENCING
 from controller.api.schema import API_VERSION, Message
 from controller.api.summaries import SUMMARIES
-from controller.gateway.access import SUBPROTOCOL, VERSIONS, Access
-from controller.gateway.bridge import bridge
-from controller.gateway.connections import CLIENT_TIMEOUT, CONNECTION, CONTINUE
+from controller.gateway.connections import (
+    CLIENT_TIMEOUT,
+    CONNECTION,
+    CONTINUE,
+    ConnectionAcceptor,
+    bridge,
+)
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import Settings
+from controller.gateway.settings import SUBPROTOCOL, VERSIONS, Access, Settings
 from controller.process.rate_limit import RateLimiter, Rates
+from model.errors import InputError
+from registry.threads import no_long_collections
 
 HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
 """Methods available over HTTP: notifications need a WebSocket."""
@@ -351,3 +368,105 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPRequestTimeout(text="the body is not complete") from error
     parse_json(body or b"{}")
     return body.replace(b"\n", b"\r") or b"{}"  # both are spaces, and neither is within a text
+
+
+_MAX_LINE = 1 << 13  # bytes; of the head of a request
+_MAX_LINES = 64
+_SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
+_RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
+_QUEUE = 512  # connections that wait to be accepted
+_NICENESS = 10  # added, so that the daemon's control loop has priority
+_SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
+
+
+async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
+    """Serve until SIGINT or SIGTERM; announce: called with the port. Raises InputError."""
+    with contextlib.suppress(OSError):  # a service may be forbidden to
+        os.nice(_NICENESS)
+    allow_many_descriptors()
+    tls = load_certificate(settings)
+    gateway = Gateway(settings)
+    listening = listen(settings)
+    failures = logging.getLogger(f"{__name__}.requests")
+    failures.addFilter(_is_own_failure)
+    runner = web.AppRunner(
+        gateway.app,
+        access_log=None,
+        logger=failures,
+        auto_decompress=False,  # no decompression bombs
+        max_line_size=_MAX_LINE,
+        max_field_size=_MAX_LINE,
+        max_headers=_MAX_LINES,
+        lingering_time=0,  # the connections'
+        read_bufsize=1 << 12,  # bytes of a body that wait to be read
+        keepalive_timeout=2 * CLIENT_TIMEOUT,  # the acceptor's comes first
+        shutdown_timeout=_SHUTDOWN_TIMEOUT,
+    )
+    await runner.setup()
+    assert runner.server is not None  # noqa: S101 (it is set up)
+    over = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, over.set)
+    # It never ends by itself: a part that fails ends the process, which then says why.
+    own = asyncio.gather(
+        gateway.field.run(),
+        gateway.keep_connected(),
+        ConnectionAcceptor(runner.server, tls).run(listening),
+    )
+    own.add_done_callback(lambda _: over.set())
+    announce(listening.getsockname()[1])
+    with no_long_collections():  # of connections that a storm leaves, nothing else is visited
+        await over.wait()
+    listening.close()
+    await runner.cleanup()
+    own.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await own
+
+
+def _is_own_failure(record: logging.LogRecord) -> bool:
+    """Whether it is not of a client, which has left or sends what is not HTTP."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not isinstance(error, OSError | HttpProcessingError)
+
+
+def load_certificate(settings: Settings) -> ssl.SSLContext | None:
+    """Load certificate and key, None without; raises InputError unless they match."""
+    if settings.certificate is None:
+        return None
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        tls.load_cert_chain(
+            *(settings.certificate, settings.key),
+            password="",  # without it OpenSSL would prompt for one
+        )
+    except (OSError, ValueError) as error:
+        reason = str(getattr(error, "strerror", None) or error).partition(" (_ssl.c")[0]
+        raise InputError(
+            f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}); give a "
+            "certificate chain and its key, both PEM, the key without password"
+        ) from error
+    return tls
+
+
+def listen(settings: Settings) -> socket.socket:
+    """Listen on a socket of its own; raises InputError."""
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        listening = socket.create_server(
+            (settings.host, settings.port),
+            family=family,
+            backlog=_QUEUE,
+            dualstack_ipv6=family == socket.AF_INET6,
+        )
+    except OSError as error:
+        raise InputError(
+            f"cannot listen on {settings.host} port {settings.port} "
+            f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
+            "(--listen; of a daemon --dashboard, or dashboard in its file)"
+        ) from error
+    # Inherited by accepted connections; the system's default limits are some megabytes.
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    listening.setblocking(False)
+    return listening

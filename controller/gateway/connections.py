@@ -2,20 +2,210 @@
 
 Silent, slow or non-reading clients cannot exhaust connections or memory. Timeouts count from the
 last complete request, so sending byte by byte gains nothing.
+
+Clients' connections to the daemon: of a browser on a WebSocket, and those that HTTP keeps.
+
+On a WebSocket frames are lines of the API to the daemon, and the other way.
+
+Heads of the frames that a WebSocket client sends, checked for what aiohttp does not bound.
 """
 
 import asyncio
+import contextlib
+import itertools
 import json
 import socket
 import ssl
-from collections.abc import Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-from controller.gateway.access import HEADERS
-from controller.gateway.bridge import KeptLink
-from controller.gateway.frames import FrameHeads
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from controller.api.jsonrpc import ErrorCode, RpcError, read_request
+from controller.api.link import DaemonLink, Unreachable
+from controller.api.registered import SILENCING
+from controller.gateway.field import DrawnField
+from controller.gateway.settings import HEADERS
+from controller.process.rate_limit import RateLimiter
+
+SEND_TIMEOUT = 5.0  # s; for one frame
+_LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for
+# all of them
+
+_INVALID_CODES = (WSCloseCode.ABNORMAL_CLOSURE, *range(5000, 1 << 16))  # of those that aiohttp
+# takes; RFC 6455 7.4: the first is never sent, and the others are not defined
+NO_DAEMON = 4001  # one of those for private use; the page connects again
+
+_numbers = itertools.count(1)
+
+
+async def bridge(
+    socket: web.WebSocketResponse, client: str, daemon: Path, field: DrawnField | None
+) -> None:
+    """Pass frames and lines on until the browser or the daemon at a socket closes.
+
+    client: the address of the browser; field: None unless it wants the vibration.
+    The first frame is the daemon's reply to a hello, whose id is the browser's name in the daemon's
+    log. The daemon carries out what it was sent before the browser left, and lifts its fingers.
+    """
+    try:
+        link = await DaemonLink.open(daemon, f"web:{next(_numbers)} {client}")
+        with contextlib.closing(link):
+            try:
+                await socket.send_str(link.hello.decode())
+                async with asyncio.TaskGroup() as ways:
+                    ways.create_task(_to_daemon(socket, link))
+                    ways.create_task(
+                        _to_browser(
+                            link.next_line, partial(socket.send_frame, opcode=WSMsgType.TEXT)
+                        )
+                    )
+                    if field is not None:
+                        ways.create_task(_to_browser(field.frames().__anext__, socket.send_bytes))
+            finally:
+                await _silence(socket, link)
+    except* (RpcError, Unreachable):
+        await socket.close(code=NO_DAEMON, message=b"the daemon does not respond")
+    except* (TimeoutError, ConnectionError):
+        pass  # closed, or does not read
+
+
+async def _to_daemon(socket: web.WebSocketResponse, link: DaemonLink) -> None:
+    """Pass the browser's frames on; raises ConnectionResetError at their end."""
+    async for message in socket:
+        if message.type is WSMsgType.TEXT and "\n" not in message.data:
+            await link.send(message.data.encode() + b"\n")
+        else:  # without effect on one that is closed for an invalid frame
+            await socket.close(
+                code=WSCloseCode.UNSUPPORTED_DATA, message=b"send text frames of one line"
+            )
+        await asyncio.sleep(0)  # between two of those that wait others are served
+    is_invalid = socket.close_code in _INVALID_CODES
+    await socket.close(
+        code=WSCloseCode.PROTOCOL_ERROR if is_invalid else WSCloseCode.OK, drain=False
+    )
+    raise ConnectionResetError
+
+
+async def _silence(socket: web.WebSocketResponse, link: DaemonLink) -> None:
+    """Send the daemon what may silence of the frames that still wait, whoever else is at an end."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + _LAST_FRAMES
+    with contextlib.suppress(TimeoutError):  # there is no further one
+        async with asyncio.timeout(_LAST_FRAME) as limit:
+            async for message in socket:
+                line = message.data.encode() if message.type is WSMsgType.TEXT else b""
+                with contextlib.suppress(RpcError):
+                    is_whole = link.is_open and b"\n" not in line
+                    if is_whole and read_request(line).method in SILENCING:
+                        link.write(line + b"\n")
+                await asyncio.sleep(0)
+                limit.reschedule(min(end, loop.time() + _LAST_FRAME))
+
+
+async def _to_browser(
+    take: Callable[[], Awaitable[bytes]], send: Callable[[bytes], Awaitable[None]]
+) -> None:
+    """Pass the daemon's lines, or pictures, on; raises TimeoutError if one is not read."""
+    while True:
+        message = await take()
+        async with asyncio.timeout(SEND_TIMEOUT):
+            await send(message)
+        await asyncio.sleep(0)  # of lines that came together none goes to a browser that has left
+
+
+MAX_KEPT = 8  # connections; the daemon has 32
+
+
+@dataclass(eq=False)
+class KeptLink:
+    """The connection to the daemon that an HTTP connection keeps, from its first request on.
+
+    kept: those of all HTTP connections, which leave places of the daemon to others.
+    """
+
+    kept: "set[KeptLink]"
+    _link: DaemonLink | None = None
+    _is_over: bool = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is one now."""
+        return self._link is not None and self._link.is_open
+
+    async def request(
+        self, path: Path, name: str, method: str, params: bytes, *, may_open: Callable[[], bool]
+    ) -> bytes:
+        """Send a request of a client by its name, and return the response.
+
+        may_open: whether a connection may be opened now, which counts it; called only where it has
+        a place. Raises RpcError and Unreachable.
+        """
+        try:
+            if self._link is None or not self._link.is_open:
+                if len(self.kept - {self}) >= MAX_KEPT or not may_open():
+                    raise RpcError(ErrorCode.BUSY, "too many connections", remedy="keep one open")
+                self.kept.add(self)
+                self._link = await DaemonLink.open(path, name)
+            if self._is_over:  # sent all the same
+                asyncio.get_running_loop().call_soon(self.close)
+            return await self._link.request(method, params, id=name)
+        finally:
+            if not self.is_open:
+                self.kept.discard(self)
+
+    def close(self) -> None:
+        """Close it: the HTTP connection is over."""
+        self._is_over = True
+        if self._link is not None:  # else it may be on its way, and has its place until then
+            self.kept.discard(self)
+            if self._link.is_open:
+                self._link.close()
+
+
+MAX_FRAGMENTS = 64  # per message; a browser sends 64 KiB in one or two
+MAX_CONTROL_RATE = 100.0  # 1/s; pings and pongs of one WebSocket; one in ten seconds is needed
+_LENGTH_BYTES = {126: 2, 127: 8}  # that follow the first two bytes, by the length in the second
+_MASKING_KEY = 4  # bytes
+
+
+class FrameHeads:
+    """Follows the heads of frames (RFC 6455 5.2) through the bytes of one client."""
+
+    def __init__(self) -> None:
+        self._incomplete = b""  # head at the end of the last bytes
+        self._payload_left = 0  # bytes of the last frame
+        self._fragments = 0  # of the last message
+        self._controls = RateLimiter(MAX_CONTROL_RATE, clock=asyncio.get_running_loop().time)
+
+    def accept(self, data: bytes) -> bool:
+        """Whether all frames that begin in the next bytes are allowed.
+
+        They are masked, as RFC 6455 5.1 demands, control frames come at a bounded rate, and
+        fragments of a message in a bounded number: the size of empty ones is no bound.
+        """
+        data, at = self._incomplete + data, self._payload_left
+        while at + 1 < len(data):
+            is_final, is_control = data[at] & 0x80, data[at] & 0x08
+            is_masked, length = data[at + 1] & 0x80, data[at + 1] & 0x7F
+            start = at + 2
+            end = start + _LENGTH_BYTES.get(length, 0)
+            if end > len(data):
+                break
+            if not is_control:
+                self._fragments = 0 if is_final else self._fragments + 1
+            has_rate = not is_control or self._controls.take()
+            if not is_masked or self._fragments > MAX_FRAGMENTS or not has_rate:
+                return False
+            at = end + _MASKING_KEY + int.from_bytes(data[start:end] or bytes([length]), "big")
+        self._incomplete = data[at:]
+        self._payload_left = max(0, at - len(data))
+        return True
+
 
 CLIENT_TIMEOUT = 5.0  # s; for a handshake, a complete request, or reading a response
 MAX_WAITING = 128  # connections without a complete request, and as many unread

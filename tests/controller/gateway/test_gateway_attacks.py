@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import httpx
 import pytest
 
-from controller.gateway.frames import MAX_FRAGMENTS, FrameHeads
+from controller.gateway.connections import MAX_FRAGMENTS, FrameHeads
 from gateway_bench import (
     ARM,
     TOKEN,

@@ -22,11 +22,10 @@ from controller.api.methods import StatusResult
 from controller.api.schema import Message, PlayedTone
 from controller.api.server import Hub, PatternEvent
 from controller.gateway import app
-from controller.gateway.access import Access
+from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
-from controller.gateway.serving import serve
-from controller.gateway.settings import Settings
+from controller.gateway.settings import Access, Settings
 from daemon_bench import PATIENCE, ready_daemon, until
 from gateway_bench import ScriptedDaemon
 from model.arrays import ComplexArray

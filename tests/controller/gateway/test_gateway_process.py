@@ -14,9 +14,8 @@ import pytest
 from aiohttp import web
 
 from controller.demo.demonstration import check_page
-from controller.gateway.app import Gateway
+from controller.gateway.app import Gateway, listen, load_certificate, serve
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
-from controller.gateway.serving import listen, load_certificate, serve
 from controller.gateway.settings import Settings, read_token
 from daemon_bench import PATIENCE, until
 from gateway_attacks import make_certificate
@@ -307,7 +306,7 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
         raise InputError("reached")
 
     monkeypatch.setattr("os.nice", forbidden)
-    monkeypatch.setattr("controller.gateway.serving.load_certificate", reached)
+    monkeypatch.setattr("controller.gateway.app.load_certificate", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
 

@@ -14,7 +14,7 @@ from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.schema import API_VERSION
-from controller.gateway import bridge
+from controller.gateway import connections
 from daemon_bench import PATIENCE
 from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon
 
@@ -96,17 +96,17 @@ async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
     full_queue: Path,
 ) -> None:
     """Until their connections have failed: else any number of them would wait for the daemon."""
-    kept: set[bridge.KeptLink] = set()
+    kept: set[connections.KeptLink] = set()
 
     def request() -> "asyncio.Task[bytes]":
-        connection = bridge.KeptLink(kept)
+        connection = connections.KeptLink(kept)
         may_open = Mock(return_value=True)
         call = connection.request(full_queue, "http", "status", b"{}", may_open=may_open)
         task = asyncio.create_task(call)
         asyncio.get_running_loop().call_soon(connection.close)
         return task
 
-    waiting = [request() for _ in range(bridge.MAX_KEPT)]
+    waiting = [request() for _ in range(connections.MAX_KEPT)]
     await asyncio.sleep(0)
     with pytest.raises(RpcError, match="too many connections"):
         await request()
@@ -179,7 +179,7 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     However its name is written; what only looks like it is not passed on.
     """
     path, read = busy_daemon
-    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.05)
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.05)
     opened = await link.DaemonLink.open(path, "browser")
     monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
     browser = DeafBrowser()
@@ -191,7 +191,7 @@ async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
     for text in [touch] * 1000 + [stop, play]:
         browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, text, ""))
     async with asyncio.timeout(PATIENCE):
-        await bridge.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+        await connections.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
         lines = await read
     opened.abort()
     await asyncio.sleep(0)
@@ -204,13 +204,13 @@ async def test_others_have_a_turn_after_each_frame(
 ) -> None:
     """However many frames of a browser wait."""
     path, read = busy_daemon
-    monkeypatch.setattr(bridge, "SEND_TIMEOUT", 0.5)
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.5)
     opened = await link.DaemonLink.open(path, "browser")
     monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
     browser = DeafBrowser()
     for _ in range(100):
         browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, "{}", ""))
-    bridging = asyncio.create_task(bridge.bridge(browser, "", path, None))  # type: ignore[arg-type]
+    bridging = asyncio.create_task(connections.bridge(browser, "", path, None))  # type: ignore[arg-type]
     turns = 0
     async with asyncio.timeout(PATIENCE):
         while not browser.frames.empty():
@@ -250,7 +250,7 @@ async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
     async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
         opened = await link.DaemonLink.open(path, "browser")
         monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
-        await bridge.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+        await connections.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
     opened.abort()
     await asyncio.sleep(0)
     assert 1 <= browser.sent < 10

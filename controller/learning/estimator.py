@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from controller.learning.messages import (
+from controller.learning.estimator_process import (
     HEAD,
     Answers,
     Estimate,

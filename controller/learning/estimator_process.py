@@ -2,21 +2,150 @@
 
 Whatever happens to the process, the daemon goes on: one that dies, or does not answer in time, is
 replaced after a growing pause, and after so many in a row without an answer no longer.
+
+Messages between the daemon and its estimator, in Python's pickle format.
+
+A message is its length, 8 bytes, and its pickle. The estimator answers each request by one message,
+a list of replies. Both sides are the same program, and no other process has their pipes.
+
+The answers that the control loop gives, and their replacement in one step.
+
+A replacement is prepared before: by the estimator, and here, a frequency at a time, the onsets and
+endings, whose shapes are taken over from the answers before until then.
 """
 
 import asyncio
 import contextlib
+import io
 import logging
 import os
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from controller.learning.messages import HEAD, Note, Reply, Request, Start, packed, unpacked
+from controller.play.loop import Controller
 from controller.process.child import child_command, ended
+from model.answer.answer_report import Timing
+from model.errors import InputError
+from model.identification.forward import Sensor
 from model.identification.settled_patterns import SettledPattern
+from model.rig.rig import Rig
+from model.table.table import LocalizationTable
 from registry import threads
 from registry.plugins import failure_text
 from registry.threads import Backoff
+
+HEAD = 8
+"""Bytes of a message's length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What an estimator starts from.
+
+    table: of the rig as built, never changed; sensors: where readings are from; drive_mode: of the
+    questions that answers are prepared for; file: of what is learned.
+    """
+
+    rig: Rig
+    table: LocalizationTable
+    sensors: tuple[Sensor, ...]
+    drive_mode: str
+    file: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """A table in place of the one that it corrects, prepared for its first touch.
+
+    base: fingerprint of the table that it corrects; is_complete: whether onsets and endings are
+    shaped anew for it, too.
+    """
+
+    base: str
+    table: LocalizationTable
+    is_complete: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Ready:
+    """The estimator takes patterns.
+
+    settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
+    nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
+    as learned before, None for the table as built; cautious: for a plate that is not known;
+    change: how it had changed in a way that nothing known explains, as found then, or nothing.
+    """
+
+    settling: float
+    note: str
+    only_alarms: str
+    answers: Answers | None
+    cautious: Answers
+    change: str
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a pattern has shown.
+
+    time [s]: of the pattern; alarm: whether the plate is not as known; is_held: whether answers
+    wait for an explanation; explanation: what has changed, where that was found now; change: how
+    the plate has changed in a way that nothing known explains, or nothing; answers: None for the
+    same.
+    """
+
+    time: float
+    alarm: bool
+    is_held: bool
+    explanation: str
+    change: str
+    answers: Answers | None
+
+
+@dataclass(frozen=True, eq=False)
+class RefreshedAnswers:
+    """Answers prepared whole while nothing else was to be done, and cautious ones of that plate."""
+
+    answers: Answers
+    cautious: Answers
+
+
+@dataclass(frozen=True)
+class Note:
+    """For the log; is_final: why the estimator cannot work."""
+
+    text: str
+    is_final: bool = False
+
+
+Request: TypeAlias = Start | SettledPattern | None
+"""None: to save and prepare what is due."""
+
+Reply: TypeAlias = Ready | Estimate | RefreshedAnswers | Note
+
+
+def packed(message: Request | list[Reply]) -> bytes:
+    """A message with its length."""
+    content = pickle.dumps(message, protocol=5)
+    return len(content).to_bytes(HEAD, "big") + content
+
+
+def unpacked(content: bytes) -> Any:
+    """The message of a pickle; raises pickle.UnpicklingError for what an amplifier could play."""
+    return _Reader(io.BytesIO(content)).load()
+
+
+class _Reader(pickle.Unpickler):
+    """Makes nothing of `drivers`: commands pass the guard only as calls of it."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module.partition(".")[0] == "drivers":
+            raise pickle.UnpicklingError(f"{module}.{name} must not be in a message")
+        return super().find_class(module, name)
+
 
 MAX_WAITING = 16
 """Patterns that wait for the estimator; newer ones are dropped."""
@@ -161,3 +290,39 @@ async def _exchange(process: asyncio.subprocess.Process, request: bytes) -> byte
         return await process.stdout.readexactly(int.from_bytes(head, "big"))
     except asyncio.IncompleteReadError:
         return None
+
+
+_PAUSE = 0.02  # s; between frequencies, which take a millisecond or two each
+
+
+class AnswersInUse:
+    """The answers of a controller; table, timing: of the rig as built, with which it starts."""
+
+    def __init__(self, controller: Controller, table: LocalizationTable, timing: Timing) -> None:
+        self._controller = controller
+        self._base = table, timing
+        self.table, self._timing = table, timing
+
+    def replace(self, answers: Answers) -> None:
+        """Answer by a corrected table from now on; raises InputError for one of another table."""
+        fingerprint = self._base[0].fingerprint
+        if answers.base != fingerprint:
+            raise InputError(f"answers must be those of table {fingerprint}, got {answers.base}")
+        self._use(answers.table, self._timing.following(answers.table))
+
+    def reset(self) -> None:
+        """Answer by the table as built from now on."""
+        self._use(*self._base)
+
+    async def shape_anew(self) -> None:
+        """Shape onsets and endings for the present table, while nothing is on its way."""
+        timing, frequencies = Timing(self.table), self.table.frequencies.tolist()
+        while frequencies:
+            if not self._controller.cycle.is_preparing:
+                timing.prepare([frequencies.pop()])
+            await asyncio.sleep(_PAUSE)
+        self._use(self.table, timing.following(self.table))
+
+    def _use(self, table: LocalizationTable, timing: Timing) -> None:
+        self.table, self._timing = table, timing
+        self._controller.replace_answers(table, timing)

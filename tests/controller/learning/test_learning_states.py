@@ -15,13 +15,12 @@ import pytest
 
 from controller.api.schema import LearningState
 from controller.learning import learning as module
-from controller.learning.answers_in_use import AnswersInUse
 from controller.learning.estimator import Estimator
-from controller.learning.estimator_process import EstimatorTimeouts
-from controller.learning.learning import Learning
-from controller.learning.messages import (
+from controller.learning.estimator_process import (
     Answers,
+    AnswersInUse,
     Estimate,
+    EstimatorTimeouts,
     Note,
     Ready,
     RefreshedAnswers,
@@ -29,6 +28,7 @@ from controller.learning.messages import (
     Start,
     unpacked,
 )
+from controller.learning.learning import Learning
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
 from drivers.playing.contents import Layer, Tone

@@ -53,8 +53,8 @@ from controller.daemon.layouts import LayoutChoice
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import UNNAMED
 from controller.learning.learning import Learning
+from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.operator import LinkChange
-from controller.operation.states import DaemonState, Loss, Operation
 from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
 from controller.play.observer import Observers, PlayReport, SilenceReport

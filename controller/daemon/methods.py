@@ -47,8 +47,7 @@ from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.kinds import File
 from controller.learning.learning import Learning
 from controller.operation.links import Supervisor
-from controller.operation.operator import LEASE_OVER
-from controller.operation.states import (
+from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
     DaemonState,
@@ -56,6 +55,7 @@ from controller.operation.states import (
     Operation,
     Trigger,
 )
+from controller.operation.operator import LEASE_OVER
 from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
 from controller.sources.contacts import Contact

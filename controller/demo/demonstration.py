@@ -33,7 +33,7 @@ from controller.demo.recorder import (
     simulated_plate,
 )
 from controller.effects.layout import BUZZ
-from controller.operation.states import DaemonState
+from controller.operation.operation_states import DaemonState
 from controller.process.log import LogThread, start_log
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock

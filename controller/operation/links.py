@@ -9,16 +9,17 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from controller.operation.deferred_calls import call_guarded
-from controller.operation.operator import LinkChange, Operator, StateObserver, remedy_of
-from controller.operation.read_back import are_silent, find_problem
-from controller.operation.states import (
+from controller.operation.operation_states import (
     ENERGISED,
     Action,
     DaemonEvent,
     DaemonState,
     Trigger,
+    are_silent,
+    call_guarded,
+    find_problem,
 )
+from controller.operation.operator import LinkChange, Operator, StateObserver, remedy_of
 from controller.play.observer import Observers
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier

@@ -13,7 +13,7 @@ from controller.daemon.config import (
     LogSection,
     TouchSection,
 )
-from controller.operation.states import DaemonState
+from controller.operation.operation_states import DaemonState
 from model.config.fields import Section
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"

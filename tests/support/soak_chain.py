@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
-from controller.operation.states import DaemonEvent, DaemonState, Trigger
+from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger
 from controller.play.observer import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError

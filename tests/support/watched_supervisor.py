@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from controller.operation.links import Supervisor
-from controller.operation.states import DaemonEvent, DaemonState, Lease, Trigger
+from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from courses import Acted, Planted, Step
 from drivers.errors import LinkError
 from registry import threads

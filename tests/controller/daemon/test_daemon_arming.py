@@ -16,7 +16,7 @@ from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
 from controller.daemon.methods import check_lease
 from controller.operation.links import Supervisor
-from controller.operation.states import (
+from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
     DaemonState,

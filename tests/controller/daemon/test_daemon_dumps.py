@@ -10,7 +10,7 @@ import pytest
 
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import ErrorCode
-from controller.operation.dumps import (
+from controller.operation.operator import (
     MAX_DECISIONS,
     MAX_LINE,
     MAX_RECORDS,

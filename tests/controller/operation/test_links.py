@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.messages import amplifier_statuses
-from controller.operation.states import DaemonEvent, DaemonState, Trigger
+from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger
 from controller.play.loop import Controller
 from courses import courses, follow
 from drivers.errors import CommandRefused

@@ -2,7 +2,7 @@
 
 import pytest
 
-from controller.operation.states import (
+from controller.operation.operation_states import (
     Action,
     DaemonEvent,
     DaemonState,

@@ -7,12 +7,12 @@ from itertools import product
 import pytest
 
 from controller.operation import operator
-from controller.operation.deferred_calls import DeferredCalls
-from controller.operation.states import (
+from controller.operation.operation_states import (
     TRANSITIONS,
     Action,
     DaemonEvent,
     DaemonState,
+    DeferredCalls,
     Operation,
     Trigger,
 )

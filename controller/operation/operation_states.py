@@ -9,15 +9,26 @@ State names follow CiA 402.
 - COMM_LOST ends with RECONNECTED, not before any lost amplifier's watchdog has certainly expired;
   it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
+
+Calls of observers, apart from what they observe.
+
+Read-back of disarmed amplifiers: silent and without a fault.
 """
 
+import asyncio
+import logging
 import math
 import re
 import secrets
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import NamedTuple, Self
+
+from drivers.host.amplifier import Amplifier
+from drivers.protocol.definition import FAULTS, STATES, name_of
+from drivers.protocol.records import Values
 
 _REMEDIES = {
     "WATCHDOG": "end programs that take the processor, or check the wire: it received nothing in "
@@ -304,3 +315,81 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
         degraded=(),
         lease=updated.lease if to in ENERGISED else None,
     )
+
+
+_DELAY = 0.001  # s; the actions of a transition have begun by then
+_MAX_PENDING = 256
+
+_logger = logging.getLogger(__name__)
+
+
+class DeferredCalls:
+    """Calls callbacks a moment later, one per iteration of the event loop, in order.
+
+    An exception of one is logged and affects no other. Of more pending calls than a bound the
+    oldest are dropped.
+    """
+
+    def __init__(self) -> None:
+        self._pending: deque[Callable[[], object]] = deque(maxlen=_MAX_PENDING)
+        self._handle: asyncio.Handle | None = None
+
+    def add(self, callback: Callable[[], object]) -> None:
+        """Call back a moment later."""
+        self._pending.append(callback)
+        if self._handle is None:
+            self._handle = asyncio.get_running_loop().call_later(_DELAY, self._call_next)
+
+    def flush(self) -> None:
+        """Make all pending calls now."""
+        while self._pending:
+            call_guarded(self._pending.popleft())
+        if self._handle is not None:
+            self._handle.cancel()
+            self._handle = None
+
+    def _call_next(self) -> None:
+        callback, self._handle = self._pending.popleft(), None
+        if self._pending:
+            self._handle = asyncio.get_running_loop().call_soon(self._call_next)
+        call_guarded(callback)
+
+
+def call_guarded(callback: Callable[[], object]) -> None:
+    """Call an observer; its exception is only logged."""
+    try:
+        callback()
+    except Exception:
+        _logger.exception("observer failed")
+
+
+READ_BACK_INTERVAL = 0.02  # s
+
+_ENABLED = STATES["OPERATION_ENABLED"]
+_DISARMED = (STATES["SWITCH_ON_DISABLED"],)
+
+
+def are_silent(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> bool:
+    """Whether all amplifiers report that nothing plays, and nothing can before they are armed."""
+    return not is_any_armed(statuses) and all(
+        amplifiers[name].is_silent(status) for name, status in statuses.items()
+    )
+
+
+def is_any_armed(statuses: Mapping[str, Values]) -> bool:
+    """Whether an amplifier reports that it is armed."""
+    return any(each["state"] == _ENABLED for each in statuses.values())
+
+
+def find_problem(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> str | None:
+    """Describe the first amplifier that is not disarmed, not at level zero or in a fault."""
+    for name, status in statuses.items():
+        if status["state"] not in _DISARMED or status["fault"]:
+            fault = f", fault {name_of(FAULTS, status['fault'])}" if status["fault"] else ""
+            return f"amplifier {name} is in {name_of(STATES, status['state'])}{fault}"
+        if not amplifiers[name].is_silent(status):
+            return (
+                f"amplifier {name}: levels of all channels must be 0 while it is disarmed, got "
+                f"{status['levels']}"
+            )
+    return None

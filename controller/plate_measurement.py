@@ -23,8 +23,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.play.capabilities import PlaybackCapabilities, playback_capabilities
-from controller.play.routing import Drive, route, tones_by_era
+from controller.play.routing import (
+    Drive,
+    PlaybackCapabilities,
+    playback_capabilities,
+    route,
+    tones_by_era,
+)
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.amplifier import Amplifier, Reading, measure_tones, read_sensors
 from drivers.host.amplifier import Sensor as ReportedSensor

@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.promise.heard import Heard, Log, Span
 from controller.effects.player import CLICK_ABOVE_DB
-from controller.play.content import Prediction
 from controller.play.intent import CLICK, Pulse, Target
-from controller.play.observer import PlayReport
+from controller.play.layer_contents import Prediction
+from controller.play.planner import PlayReport
 from controller.sources.contacts import ContactKey
 from registry import threads
 

@@ -22,7 +22,7 @@ from benchmarks.clocks.__main__ import ARRANGEMENTS
 from benchmarks.clocks.session import NAMES, Arrangement, armed, run_virtual
 from benchmarks.promise.cases import LEVEL_DB_SL, Case
 from benchmarks.setting import random_contacts
-from controller.play.counted_clocks import MARGIN
+from controller.play.routing import MARGIN
 from model.answer.answer import Answer
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Placement, Stimulus

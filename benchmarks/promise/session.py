@@ -29,10 +29,10 @@ from benchmarks.promise.cases import (
 from benchmarks.promise.clicked import Clicked, clicks, measured, owner_of
 from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
-from controller.play.content import Prediction
 from controller.play.intent import HapticIntent, Target
+from controller.play.layer_contents import Prediction
 from controller.play.layers import CROSSFADE, FALL_AFTER
-from controller.play.observer import PlayReport
+from controller.play.planner import PlayReport
 from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS
 from registry import threads

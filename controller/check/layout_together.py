@@ -13,10 +13,10 @@ from controller.check.representative import strongest_target
 from controller.check.simulated_touch import Position, TouchSimulator
 from controller.effects.effect import Region
 from controller.effects.layout import SurfaceLayout
-from controller.play.chooser import ChoiceRequest, Intention
-from controller.play.content import Selection
 from controller.play.intent import Target
-from controller.play.joint_answer import fingers_of, selection_of
+from controller.play.joint_answers import fingers_of, selection_of
+from controller.play.layer_contents import Selection
+from controller.play.selection import ChoiceRequest, Intention
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import MIN_CONTRAST_DB, Answer
 from model.answer.plan import answer

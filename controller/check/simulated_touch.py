@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.chooser import Chooser
 from controller.play.intent import Target
-from controller.play.joint_answer import answered
+from controller.play.joint_answers import answered
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.selection import Chooser
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import exposures

@@ -30,7 +30,7 @@ from controller.operation.links import Supervisor
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation
 from controller.operation.operator import FaultDumps
 from controller.play.loop import Controller
-from controller.play.observer import Observers
+from controller.play.planner import Observers
 from controller.process.log import LogThread, open_log_file, start_log
 from controller.process.service_manager import ServiceManager
 from controller.process.socket_lock import SocketLock

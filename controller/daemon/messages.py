@@ -55,9 +55,9 @@ from controller.effects.player import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.operator import LinkChange
-from controller.play.content import BEING_CHOSEN, leaks_db_sl
 from controller.play.intent import NO_CONTACTS
-from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.play.layer_contents import BEING_CHOSEN, leaks_db_sl
+from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.play.routing import Drive
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier

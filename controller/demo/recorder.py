@@ -26,9 +26,8 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.play.content import Prediction
-from controller.play.layer_content import LayerContent
-from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.play.layer_contents import LayerContent, Prediction
+from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.process.child import ended
 from controller.sources.contacts import Change, Contact, ContactKey
 from drivers.errors import LinkError

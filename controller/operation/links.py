@@ -20,7 +20,7 @@ from controller.operation.operation_states import (
     find_problem,
 )
 from controller.operation.operator import LinkChange, Operator, StateObserver, remedy_of
-from controller.play.observer import Observers
+from controller.play.planner import Observers
 from drivers.errors import CommandRefused, DriverError, FrameError, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import GroupState

@@ -4,6 +4,8 @@ The ledgers are asked before a set is made: what they do not admit is played alo
 without the newest content, and nothing where none is left. A vibration ends by itself if the host
 or a touch source falls silent, so it is renewed only while sources confirm the contacts that it is
 for.
+
+Layers that play courses: the set of the next piece, and when the one after it is due.
 """
 
 import logging
@@ -13,17 +15,18 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from controller.play.capabilities import PlaybackCapabilities
-from controller.play.content import Content
-from controller.play.course_layers import MIN_LEFT, CourseLayers
-from controller.play.intent import CLICK, FADED_AFTER
-from controller.play.layer_content import LayerContent
-from controller.play.pieces import HELD, PLAIN_STEP
+from controller.play.intent import CLICK, FADED_AFTER, Pulse
+from controller.play.layer_contents import Content, LayerContent
 from controller.play.routing import (
     BESIDE_CLICK,
+    HELD,
+    PLAIN_STEP,
     Drive,
     PlateLayer,
+    PlaybackCapabilities,
     SetBuilder,
+    full_drive,
+    piece_of,
     tones_by_era,
 )
 from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
@@ -35,7 +38,78 @@ from drivers.protocol.sets import is_vibrating
 from model.answer import answer
 from model.answer.answer import FADE_RAMP
 from model.answer.answer_report import Timing
+from model.answer.stimulus import Course
 from model.rig.rig import Rig
+
+MIN_LEFT = 0.001
+"""Time [s] of a pulse that is about to end."""
+
+
+class CourseLayers:
+    """Makes the pieces of courses; knots: of an envelope, 0 for ramps."""
+
+    def __init__(self, builder: SetBuilder, knots: int) -> None:
+        self._builder, self._knots = builder, knots
+
+    def piece(
+        self,
+        number: int,
+        content: Content,
+        course: Course,
+        pulse: Pulse,
+        now: float,
+        *,
+        among: int,
+        playing: Drive,
+        before: LayerContent | None = None,
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set of the piece of a content's course that is played next, and its layer.
+
+        From where the pulse is at a time [s] on, or once the piece before ends, if that has not
+        ended yet. number: of the layer; among: pieces that are sent together; playing: what plays
+        there; before: with the piece before, None for the first.
+        """
+        is_after, knots, starts = False, self._knots, now
+        if before is None:
+            knots = min(knots, self._builder.support.onset_knots)
+        elif now < before.course_until:
+            is_after, starts = True, before.course_until
+        piece = piece_of(
+            course,
+            pulse,
+            0.0 if pulse.started_at is None else starts - pulse.started_at,
+            knots=max(knots // among, 1) if knots else 0,
+            is_first=before is None,
+        )
+        has_ended = before is not None and now >= before.ends_at
+        return self._builder.build_piece(
+            number,
+            content.layer,
+            piece,
+            playing={} if has_ended else playing,
+            valid_for=piece.duration + HELD,
+            is_after=is_after and piece.has_knots,
+        )
+
+    def confirmed(
+        self, one: LayerContent, played: answer.Layer, since: float, now: float, *, is_first: bool
+    ) -> LayerContent:
+        """Return what plays of a course once a piece is confirmed that starts at a time [s].
+
+        The next one follows the first at once, and is sent when half of any other has been played.
+        """
+        until = since + replace(one, layer=played).settled_after
+        due = now + MIN_LEFT if is_first else (since + until) / 2
+        due = due if played.onset else until
+        pulse = one.content.targets[0][1].pulse
+        is_over = pulse is not None and until > pulse.end - MIN_LEFT
+        return replace(
+            one,
+            drive=full_drive(one.content.layer.excitation, self._builder.rig),
+            course_until=until,
+            ending_due=math.inf if is_over else due,
+        )
+
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010

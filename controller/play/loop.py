@@ -1,24 +1,330 @@
-"""The controller of a plate: its amplifiers are opened, armed, stopped and released here."""
+"""The controller of a plate: its amplifiers are opened, armed, stopped and released here.
+
+The cycle of the control loop: plan, send what changes, then feed the amplifiers' watchdogs.
+"""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from typing import Any
+import logging
+import math
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, ParamSpec
 
-from controller.play.capabilities import limits_of, playback_capabilities
-from controller.play.cycle import Cycle
 from controller.play.intent import IntentSource
-from controller.play.planner import Planner
-from drivers.errors import LinkError
+from controller.play.layers import RELEASE_RAMP
+from controller.play.planner import Observers, Plan, Planner, play_report, silence_report
+from controller.play.routing import limits_of, playback_capabilities
+from controller.sources.contacts import Change, ContactTracker
+from controller.sources.reject_counter import RejectCounter
+from controller.sources.touch import TouchFrame
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    DriverError,
+    LinkDegraded,
+    LinkError,
+    Overtaken,
+    Preempted,
+)
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
 from drivers.host.dialogue import UNREACHED, Stopped
 from drivers.host.group import Group, GroupState
 from drivers.opening import Lines
-from drivers.protocol.definition import REPLY_TIMEOUT
+from drivers.protocol.definition import HEARTBEAT, REPLY_TIMEOUT
+from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
+from model.quantities import counted
 from model.rig.rig import Rig
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+from registry import threads
+
+# s; the loop runs even with nothing to do, for a supervisor that checks whether it is alive.
+IDLE_INTERVAL = 0.5
+
+_P = ParamSpec("_P")
+_logger = logging.getLogger(__name__)
+
+
+class Cycle:
+    """The cycle of the control loop of one plate; fingers are followed amid it, too.
+
+    group: all amplifiers, which are opened and armed elsewhere.
+    """
+
+    def __init__(self, plate: Plate, group: Group) -> None:
+        self.group = group
+        """All amplifiers together; replaced while `sending` is held."""
+        self.planner: Planner | None = None
+        """Plans for the amplifiers; None until they were open."""
+        self.observers = Observers()
+        self.tracker = ContactTracker(plate)
+        """The contacts, also while no amplifier is open."""
+        self.sending = asyncio.Lock()
+        """Held while a turn sends."""
+        self.is_closed = False
+        """Whether `run` ends."""
+        self.rejects = RejectCounter(_logger)
+        """What of touches was rejected, at the sources and as contacts: the only such counter."""
+        self.clicks_too_late = 0
+        """Short vibrations that came too late to be felt while armed, since the start.
+
+        They were over, or had lost their touch, before the amplifiers were to play them; with
+        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
+        do not allow.
+        """
+        self._plan: Plan | None = None  # that is on its way to the amplifiers
+        self._wake = asyncio.Event()
+        self._heartbeat_due = 0.0
+        self._is_armed_anew = False  # until the next turn, which sends again what is to play
+        self._expiry: asyncio.TimerHandle | None = None
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether a change of contacts is on its way to the amplifiers."""
+        planner, plan = self.planner, self._plan
+        if planner is None:
+            return False
+        if plan is not None and self.group.members.last_sent_at < plan.since:
+            return True
+        return planner.is_waiting
+
+    async def run(self) -> None:
+        """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
+
+        It sends only while they are armed. A loss is reported to observers; all others are stopped
+        by then; a loss while disarmed shows in the next request, as the supervisor checks.
+        """
+        while not self.is_closed:
+            await self.step()
+            _report(self.observers.cycle_completed)
+            await self._wait_for_event()
+
+    async def step(self) -> None:
+        """Run the loop once: plan, send what changes, then the heartbeat if it is due."""
+        planner, now = self.planner, threads.now()
+        self._expire(now)
+        self._wake.clear()
+        if planner is None:
+            return
+        if self._is_armed_anew:  # not amid a turn, whose set may be on the wire
+            self._is_armed_anew = False
+            planner.forget()
+        plan = planner.plan(now)
+        try:
+            async with self.sending:
+                with suppress(LinkDegraded):  # what plays is unknown, and planned anew; others feed
+                    if plan is not None and self.group.is_armed:
+                        await self._send(planner, plan)
+                # Not after a set that was given up: the next cycle silences it first.
+                if self._is_heartbeat_due(planner):
+                    # From its beginning: the watchdog has run since its request was sent.
+                    due = self._heartbeat_due = threads.now() + HEARTBEAT
+                    try:
+                        await self.group.beat()
+                    finally:
+                        if self._heartbeat_due == due:  # none replies again since
+                            rest = HEARTBEAT / 2  # on a slow wire
+                            self._heartbeat_due = max(due, threads.now() + rest)
+        except (Preempted, LinkDegraded):
+            pass  # what plays is unknown, and planned anew
+        except LinkError as error:
+            _report(self.observers.link_lost, str(error))
+        except DriverError as error:
+            _report(self.observers.refused, str(error))
+
+    async def _send(self, planner: Planner, plan: Plan) -> None:
+        """Send what a plan changes, and report the outcome; raises DriverError.
+
+        While an amplifier is degraded nothing starts or is prolonged.
+        """
+        if self.group.members.degraded:
+            plan = planner.only_ends(plan)
+        self._plan = plan
+        try:
+            outcome = await self._play(planner, plan)
+            if isinstance(outcome, CommandRefused):
+                plan = planner.refused(plan, outcome, now=threads.now())
+                outcome = await self._play(planner, plan)
+        finally:
+            self._plan = None
+        if reason := plan.sets.reason:
+            _report(self.observers.refused, reason)
+        if plan.is_reported:
+            sent_at = outcome if isinstance(outcome, float) else None
+            self._report_playing(planner, plan, sent_at=sent_at)
+
+    async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
+        """Play the sets of a plan on all amplifiers, from one moment on.
+
+        Returns when [s] they start, None where nothing is to be sent, or why they were
+        refused. Whatever is raised instead leaves it unknown what plays.
+        """
+        if not (sets := plan.sets):
+            return None
+        try:
+            if sets.silence is not None:
+                sent_at = await self.group.silence(sets.silence)
+                planner.layers.may_play = frozenset()
+                return sent_at
+            if self.group.sets.is_in_doubt:
+                await self.group.silence(RELEASE_RAMP)  # before the next pattern
+            played = await self.group.apply(
+                sets.by_amplifier,
+                (lambda: self._wake.is_set() and threads.now() < sets.preempted_until)
+                if sets.endings
+                else None,
+            )
+        except Overtaken:  # endings, by what has come since: they follow it
+            return None
+        except BaseException as error:
+            is_overtaken = isinstance(error, Preempted) or not self.group.is_armed
+            if isinstance(error, CommandRefused) and not is_overtaken and sets.silence is None:
+                return error
+            planner.not_played(plan)
+            raise
+        planner.confirm(sets, played, now=threads.now())
+        return played.starts_at
+
+    def count_too_late(self, clicks: int) -> None:
+        """Count clicks that came too late to be felt, while armed."""
+        if self.group.is_armed:
+            self.clicks_too_late += clicks
+            _logger.warning(
+                "%s came too late to be felt: replies are late", counted(clicks, "click")
+            )
+
+    def wake(self) -> None:
+        """Look at once at what is to be done."""
+        self._wake.set()
+
+    def feed_at_once(self) -> None:
+        """Feed the watchdogs at once."""
+        self._heartbeat_due = threads.now()
+        self._wake.set()
+
+    def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
+        """Note that the amplifiers have been armed: what is to play is sent, watchdogs are fed.
+
+        limits: of the amplifiers as they are now; was_armed: also before, so that what plays goes
+        on. Raises CommandError without a planner.
+        """
+        if self.planner is None:
+            raise CommandError("controller must be open; call open() first")
+        self._is_armed_anew = True
+        if not was_armed:
+            self.planner.layers.may_play = frozenset()
+        self.planner.replace_limits(limits)
+        self._schedule_expiry()  # fingers may have rested since before
+        self.feed_at_once()
+
+    def deliver(self, frame: TouchFrame) -> None:
+        """Process a touch frame; to be called in the loop's thread."""
+        # Contacts that came since the last cycle have not been decided yet.
+        is_undecided = self._wake.is_set() and self.group.is_armed
+        change = self.tracker.update(frame, keeps_taps=is_undecided)
+        if change:
+            self._follow(change)
+        self._schedule_expiry()
+        for reason in change.rejected:
+            self.rejects.count(reason, f"touch of {frame.source}")
+
+    def lift(self, prefix: str) -> None:
+        """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
+        for source in self.tracker.sources_of(prefix):
+            try:
+                self.deliver(TouchFrame(source, threads.now(), ()))
+            except Exception:
+                _logger.exception("loop: fingers of %s not lifted", source)
+
+    def request_update(self) -> None:
+        """Query the intent source again, because its intent changed without a touch."""
+        if self.planner is not None:
+            self.planner.look_again()
+        self._wake.set()
+
+    def _is_heartbeat_due(self, planner: Planner) -> bool:
+        """Whether to feed the watchdogs now; pending silence has priority."""
+        if not self.group.is_armed or planner.is_silence_pending:
+            return False
+        return threads.now() >= min(self._heartbeat_due, self.group.members.lost_from)
+
+    def _follow(self, change: Change) -> None:
+        """Act on a change of contacts, also while amplifiers are being awaited."""
+        planner = self.planner
+        self._wake.set()
+        if change.up and planner is not None:  # else the amplifiers were never open
+            planner.note_lifts(change.up)
+            if planner.is_silence_pending:
+                self.group.abort_exchange()
+        _report(self.observers.contacts_changed, self.tracker.contacts, change)
+
+    def _schedule_expiry(self) -> None:
+        """Check for expired sources when the next one times out.
+
+        A timer that is due before stays: nothing is set anew for every frame of a source.
+        """
+        due = self.tracker.next_expiry
+        if self._expiry is not None:
+            if self._expiry.when() <= due < math.inf:
+                return
+            self._expiry.cancel()
+            self._expiry = None
+        if due < math.inf:
+            pause = max(0.0, due - threads.now())
+            self._expiry = asyncio.get_running_loop().call_later(pause, self._time_out)
+
+    def _time_out(self) -> None:
+        self._expiry = None
+        self._expire(threads.now())
+        self._schedule_expiry()
+
+    def _expire(self, now: float) -> None:
+        """Lift fingers that no source has confirmed in time: here alone, and before every plan."""
+        if (change := self.tracker.expire(now)).up:
+            self._follow(change)
+
+    def _report_playing(self, planner: Planner, plan: Plan, *, sent_at: float | None) -> None:
+        """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
+        now = threads.now()
+        if plan.selection.contents and plan.sets.silence is None:
+            playing, timing = planner.layers.contents, planner.timing
+            applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=timing)
+            _report(self.observers.pattern_applied, applied)
+            return
+        silenced = silence_report(plan, sent_at=sent_at, now=now)
+        _report(self.observers.silenced, silenced)
+
+    async def _wait_for_event(self) -> None:
+        """Wait for a change, a heartbeat, or the expiry of an intent."""
+        if self._wake.is_set():
+            return
+        now = threads.now()
+        until = now + IDLE_INTERVAL
+        if self.planner is not None:
+            until = min(until, self.planner.due)
+        if self.group.is_armed:
+            until = min(until, self._heartbeat_due, self.group.members.lost_from)
+            if self.planner is not None and now < (due := self.planner.layers.ending_due):
+                until = min(until, due)
+        pause = max(0.0, until - now)
+        timer = asyncio.get_running_loop().call_later(pause, self._wake.set)
+        try:
+            await self._wake.wait()
+        finally:
+            timer.cancel()
+
+
+def _report(callbacks: Iterable[Callable[_P, object]], *args: _P.args, **kwargs: _P.kwargs) -> None:
+    """Call all observers of an event; their exceptions are logged."""
+    for callback in callbacks:
+        try:
+            callback(*args, **kwargs)
+        except Exception:
+            _logger.exception("loop: observer failed")
+
 
 CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 

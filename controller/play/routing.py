@@ -5,40 +5,400 @@ the wire; `sim/bench` translates back by the same wiring. An onset of fewer knot
 curve in longer steps, which keeps quiet fingers quieter than a ramp does down to a single knot; an
 ending is sent whole or not at all. The last value of an envelope, the pattern itself or silence, is
 that of the command and not among the knots on the wire.
+
+Capabilities of the open amplifiers of a rig together, in the terms of the table.
+
+A set takes its onset with it, so a touch waits for that; its ending follows in a set of its own,
+which takes no longer. The knots that the wires carry in time are arithmetic, done once when the
+amplifiers are open.
+
+Errors of the amplifiers' clocks as answers count them, so that a promise holds while they vary.
+
+They are counted anew where one is worse than counted, and where all have become far better: not at
+each reading, of which every one differs.
+
+Pieces of a course: what of it goes out at once, as an onset of knots, or as a plain ramp.
+
+An amplifier plays a piece along straight lines between its knots, and holds one more that waits for
+the end of the first: so pieces follow each other without a gap though the host is late, by half a
+piece at most. The first is short, since a touch waits for it.
 """
 
+import logging
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Self
 
 import numpy as np
 
-from controller.play.capabilities import EnvelopeSupport
-from controller.play.pieces import Piece
-from drivers.playing.contents import Layer, Tone
-from drivers.protocol.definition import QUANTITIES
+from controller.play.intent import Pulse
+from drivers.host.amplifier import Amplifier
+from drivers.host.line import Line
+from drivers.playing.contents import Layer as ContentsLayer
+from drivers.playing.contents import Tone
+from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
 from model import vibration as physics
 from model.answer import answer
-from model.answer.answer import FADE_RAMP
+from model.answer.answer import FADE_RAMP, Layer, Limits, amplitudes_of
 from model.answer.answer_report import Timing
-from model.answer.stimulus import Placement
+from model.answer.stimulus import KNOT_STEP, Course, Placement
+from model.drive_modes import DRIVE_MODES, playable_drive_modes
+from model.ensemble.draws import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.errors import InputError
 from model.rig.rig import Rig
+from model.table.table import LocalizationTable
+from model.transients.base_motion import KNOT_STEP as BASE_MOTION_KNOT_STEP
 from model.transients.base_motion import BaseEnvelope, Envelopes
+from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
+from registry import threads
+
+MARGIN = 1.25
+"""By how much more is counted than is known."""
+
+SETTLED = 10.0
+"""Time [s] for which a clock is held until that is said, with how often it was not."""
+
+_FAR_BETTER = 2.0  # times what is counted
+
+_logger = logging.getLogger(__name__)
+
+
+class CountedClocks:
+    """Errors by amplifier of a rig; now: gives what is known, rms [s], infinite if unknown."""
+
+    def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
+        self._rig, self._now = rig, now
+        self._names = sorted(rig.channel_counts)
+        self._counted = EXACT_CLOCKS
+        self._losses = dict.fromkeys(self._names, 0)  # since it was last said to be held
+        self._held_since: dict[str, float] = {}  # not said yet
+        self.errors: dict[str, float] = {}
+        """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
+
+    @property
+    def known(self) -> Mapping[str, float]:
+        """What is known by name now, rms [s]; empty where nothing is counted."""
+        return self._now() if self.errors else {}
+
+    def counted_by(
+        self, table: LocalizationTable, known: Mapping[str, float] | None = None
+    ) -> LocalizationTable:
+        """The table with the clocks as they are counted now; takes no time.
+
+        known: of now, if that was looked up.
+        """
+        if len(self._names) < 2:
+            return table
+        known = known or self._now()
+        if self._is_other(known):
+            before, errors = self.errors, {name: MARGIN * known[name] for name in self._names}
+            eras = [era.name for era in table.eras]
+            self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
+            self.errors = errors
+            self._note(before)
+        for name in [*self._held_since]:  # mostly none
+            if threads.now() - self._held_since[name] >= SETTLED:
+                self._say_held(name)
+        return table.with_clocks(self._counted)
+
+    def is_one_lost(self, known: Mapping[str, float]) -> bool:
+        """Whether one is held no longer to those with which its amplifier shares contents.
+
+        known: of now.
+        """
+        for name, counted in self.errors.items():  # with each plan: no further calls
+            if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
+                return True
+        return False
+
+    def _is_other(self, known: Mapping[str, float]) -> bool:
+        """Whether a clock is worse than counted, or one far better."""
+        for name, counted in self.errors.items():  # as often
+            if known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted:
+                return True
+        return not self.errors
+
+    def _note(self, before: Mapping[str, float]) -> None:
+        """Count losses; log which amplifiers play contents of their own from now on, once.
+
+        No clock is known when its line has just been opened, so that it is no warning then.
+        """
+        level = logging.WARNING if before else logging.INFO
+        for name, error in self.errors.items():
+            was_alone = before.get(name, 0.0) > MAX_HELD
+            if error <= MAX_HELD:
+                if was_alone:
+                    self._held_since[name] = threads.now()
+            elif not was_alone:
+                self._held_since.pop(name, None)
+                if not self._losses[name]:
+                    _logger.log(
+                        level,
+                        "amplifier %s: its clock is not held to the others', so its ERAs play "
+                        "contents of their own; if that lasts, see its clock_error in era amp "
+                        "status",
+                        name,
+                    )
+                self._losses[name] += 1
+
+    def _say_held(self, name: str) -> None:
+        """Log that an amplifier's clock has been held for long, and how often it was not."""
+        _logger.info(
+            "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the others'; "
+            "losses before: %d",
+            name,
+            1e6 * self.errors[name],
+            SETTLED,
+            self._losses[name],
+        )
+        self._losses[name] = 0
+        del self._held_since[name]
+
+
+PLAIN_STEP = 0.050
+"""Time [s] of ramps, where amplifiers have no knots, of which each is a set of its own."""
+
+HELD = 0.1
+"""How long [s] a layer lasts beyond its last piece: if no other comes by then it ends by itself."""
+
+_AMID = 0.020  # s; between knots of a first piece that leads there from something else
+_FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces, the last one where knots are few
+
+MAX_STEP = _SHORTEST / 2
+"""Time [s] between knots where an envelope has one."""
+
+_ROUNDING = 1e-9  # s
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Shares of a course a step [s] apart, the first one a step after its start."""
+
+    step: float
+    shares: tuple[float, ...]
+
+    @property
+    def duration(self) -> float:
+        """Time of its last share [s]."""
+        return self.step * len(self.shares)
+
+    @property
+    def has_knots(self) -> bool:
+        """Whether it is more than a ramp."""
+        return len(self.shares) > 1
+
+
+def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first: bool) -> Piece:
+    """Return the piece of a course that is played from a time [s] after the start of its pulse on.
+
+    It begins anew until the pulse ends, at 0. knots: of an envelope, 0 for ramps; is_first: of its
+    layer.
+    """
+    if not knots:
+        step, count = PLAIN_STEP, 1
+    else:
+        least = _AMID if is_first and since > 0 else KNOT_STEP
+        count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
+        step = max(least, _SHORTEST / count)
+        left = min((pulse.duration - since) / step, count)
+        count = max(math.ceil(left - _ROUNDING), 2)
+    times = since + step * np.arange(1, count + 1)
+    shares = np.asarray(course.at(np.mod(times, course.duration)))
+    shares[times > pulse.duration - _ROUNDING] = 0.0
+    return Piece(step, tuple(shares.tolist()))
+
+
+MAX_SET_TIME, MAX_PIECE_TIME = 0.010, 0.020
+"""How long [s] a set may take on its wire, so that its onset does not delay a touch, and one that
+continues a course, for which a touch may have to wait."""
+
+_FREQUENCY, _LEVEL, _RAMP = (QUANTITIES[name] for name in ("frequency", "level", "ramp"))
+_PHASE_STEP = QUANTITIES["phase_step"]
+_STEP = QUANTITIES["envelope_step"]
+_LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
+_PART_WORDS = 3  # of a message: session, token, part
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeSupport:
+    """Knots of an onset and of an ending that every channel may have; 0: ramps."""
+
+    onset_knots: int
+    ending_knots: int = 0
+
+
+RAMPS_ONLY = EnvelopeSupport(0)
+"""Support of ramps only."""
+
+
+@dataclass(frozen=True)
+class PlaybackCapabilities:
+    """Capabilities that all amplifiers of a rig share.
+
+    drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
+    play; limits: of a drive; envelope_support: knots that every amplifier plays; ramp_max [s];
+    layers: contents at once; course_knots: of a piece of a course, 0: ramps.
+    """
+
+    drive_mode: str
+    playable: tuple[str, ...]
+    limits: Limits
+    envelope_support: EnvelopeSupport
+    ramp_max: float = math.inf
+    layers: int = 1
+    course_knots: int = 0
+
+    def left_by(self, layers: Sequence[Layer], table: LocalizationTable) -> Self:
+        """Return what layers leave of the limits, their peaks together."""
+        drives = [each for layer in layers for each in layer.drives]
+        taken, strokes = amplitudes_of([each for each, _ in drives]), table.full_levels
+        levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
+        limits = self.limits
+        left = replace(
+            limits,
+            amplitudes={
+                name: max(highest - taken.get(name, 0.0), 1e-12)
+                for name, highest in (limits.amplitudes or strokes).items()
+            },
+            power=max(math.sqrt(limits.power) - math.hypot(*levels), 1e-9) ** 2,
+            excursion=max(limits.excursion - table.excursion_of(drives), 1e-9),
+        )
+        return replace(self, limits=left)
+
+
+def playback_capabilities(
+    rig: Rig, amplifiers: Mapping[str, Amplifier], *, drive_mode: str | None = None
+) -> PlaybackCapabilities:
+    """Return what the open amplifiers of a rig, by name, can play.
+
+    drive_mode: None for the best that all can. Raises InputError for a drive mode that one cannot
+    play, or a wired channel that its amplifier does not have.
+    """
+    for era, wired in rig.wiring.items():
+        channels = amplifiers[wired.amplifier].ledger.capabilities["channels"]
+        if wired.number >= channels:
+            raise InputError(
+                f"channel of ERA {era} must be 0 to {channels - 1} on amplifier "
+                f"{wired.amplifier}, got {wired.number}; change its wiring in the rig file"
+            )
+    each = [
+        playable_drive_modes(
+            level_step=_LEVEL.from_wire(one.ledger.capabilities["level_step"]),
+            phase_step=_PHASE_STEP.from_wire(one.ledger.capabilities["phase_step"]),
+        )
+        for one in amplifiers.values()
+    ]
+    playable = tuple(name for name in DRIVE_MODES if all(name in modes for modes in each))
+    if drive_mode is not None and drive_mode not in playable:
+        raise InputError(
+            f"drive mode must be one that all amplifiers play ({', '.join(playable)}), got "
+            f"{drive_mode}; leave it out for the best"
+        )
+    return PlaybackCapabilities(
+        drive_mode=drive_mode or playable[-1],
+        playable=playable,
+        limits=limits_of(rig, amplifiers),
+        envelope_support=envelope_support(rig, amplifiers),
+        ramp_max=min(
+            _RAMP.from_wire(one.ledger.capabilities["ramp_max"]) for one in amplifiers.values()
+        ),
+        layers=min(one.ledger.capabilities["layers"] for one in amplifiers.values()),
+        course_knots=_knots(rig, amplifiers, within=MAX_PIECE_TIME, step=MAX_STEP),
+    )
+
+
+def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
+    """Return what the amplifiers of a rig, by name, allow as they were identified last."""
+    limits = {name: one.ledger.limits for name, one in amplifiers.items()}
+    levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
+    return Limits(
+        (
+            max(_FREQUENCY.from_wire(one.frequency_min) for one in limits.values()),
+            min(_FREQUENCY.from_wire(one.frequency_max) for one in limits.values()),
+        ),
+        {era.name: era.full_level * levels[rig.wiring[era.name].amplifier] for era in rig.eras},
+        power=min(one.power for one in limits.values()),
+        slew=min(one.slew for one in limits.values()),
+    )
+
+
+def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
+    """Return what all open amplifiers, by name, play, and their wires carry within 10 ms."""
+    knots, onset, ending = _knots(rig, amplifiers), ONSET_KNOTS - 1, ENDING_KNOTS - 1
+    return EnvelopeSupport(min(knots, onset), ending if knots >= ending else 0)
+
+
+def _knots(
+    rig: Rig,
+    amplifiers: Mapping[str, Amplifier],
+    *,
+    within: float = MAX_SET_TIME,
+    step: float = BASE_MOTION_KNOT_STEP,
+) -> int:
+    """Return how many knots all open amplifiers play, and their wires carry within a time [s].
+
+    step [s]: the longest between two of them.
+    """
+    wired: dict[str, int] = defaultdict(int)
+    for channel in rig.wiring.values():
+        wired[channel.amplifier] += 1
+    by_line: dict[Line, list[str]] = defaultdict(list)
+    for name in wired:
+        by_line[amplifiers[name].line].append(name)
+    carried = [
+        _knots_on(line, [wired[name] for name in names], within) for line, names in by_line.items()
+    ]
+    carried += [
+        _knots_in(amplifiers[name].ledger.capabilities["set_words"], [count])
+        for name, count in wired.items()
+    ]
+    each = min([_knots_of(amplifiers[name], step) for name in wired], default=0)
+    return min(max(min(carried, default=0), 0), each)
+
+
+def _knots_of(amplifier: Amplifier, max_step: float) -> int:
+    """Return how many knots an envelope of an amplifier may have.
+
+    In steps from that of the model to a longest one, max_step [s].
+    """
+    can = amplifier.ledger.capabilities
+    low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
+    return int(can["knots"]) if low <= BASE_MOTION_KNOT_STEP <= max_step <= high else 0
+
+
+def _knots_on(line: Line, channels: list[int], within: float) -> int:
+    """Return the knots of each channel that a line carries in time, for its amplifiers' sets."""
+    takes = line.wire.transit(MAX_WORDS)
+    if takes <= 0:
+        return int(QUANTITIES["knots"].maximum)
+    return _knots_in(int(MAX_WORDS * within / takes), channels)
+
+
+def _knots_in(words: int, channels: list[int]) -> int:
+    """Return the knots of each channel for which a number of words suffices."""
+    parts = -(-words // MAX_WORDS)
+    heads = len(channels) * _LAYER_WORDS + max(parts, len(channels)) * _PART_WORDS
+    each = _COMMAND_WORDS + _ENVELOPE_WORDS
+    return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))
+
 
 Drive = Mapping[str, Tone]
 """What ERAs play, by name, without silent ones."""
 
-PlateLayer = Mapping[str, Layer]
+PlateLayer = Mapping[str, ContentsLayer]
 """What one layer plays on every amplifier, by name."""
 
 BESIDE_CLICK = 0.100
 """Fade-out [s] beside a short pulse, below which a shorter one would be felt with it."""
 
-_STEP, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("envelope_step", "level", "phase"))
-_FREQUENCY = QUANTITIES["frequency"]
+_ROUTING_STEP, _ROUTING_LEVEL, _PHASE = (
+    QUANTITIES[name] for name in ("envelope_step", "level", "phase")
+)
+_ROUTING_FREQUENCY = QUANTITIES["frequency"]
 _DIGITS = 6  # of a step of the wire
 
 
@@ -186,7 +546,7 @@ class SetBuilder:
 
     def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
         """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
-        layer = Layer(number, ramp=ramp, valid_for=valid_for, renew=True)
+        layer = ContentsLayer(number, ramp=ramp, valid_for=valid_for, renew=True)
         return dict.fromkeys(self.rig.amplifiers, layer)
 
     def build_fall(
@@ -197,7 +557,7 @@ class SetBuilder:
         Not to silence, on the way to which no later set could end it sooner, as under a finger that
         lifts. playing: what each ERA plays now in this layer.
         """
-        least = _LEVEL.from_wire(1)
+        least = _ROUTING_LEVEL.from_wire(1)
         faint = {
             name: replace(tone, amplitude=least * self.rig.full_levels[name])
             for name, tone in excitation.items()
@@ -216,7 +576,7 @@ class SetBuilder:
     def build_end(self, number: int, ramp: float, *, has_endings: bool) -> PlateLayer:
         """Build the set that ends a layer along its endings, or along a ramp [s]."""
         if has_endings:
-            return dict.fromkeys(self.rig.amplifiers, Layer(number, ramp=ramp))
+            return dict.fromkeys(self.rig.amplifiers, ContentsLayer(number, ramp=ramp))
         return route({}, self.rig, ramp=ramp, number=number)
 
 
@@ -231,7 +591,7 @@ def route(
     valid_for: float = 0.0,
     onset: Envelopes | None = None,
     ending: Envelopes | None = None,
-) -> dict[str, Layer]:
+) -> dict[str, ContentsLayer]:
     """Return the layer of a number for every amplifier of the rig, by name.
 
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
@@ -278,7 +638,9 @@ def route(
             rise += was.level
         least = rise / rig.limits.slew
         ramp = least if least > ramp else ramp  # ledgers refuse NaN
-    return {name: Layer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()}
+    return {
+        name: ContentsLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
+    }
 
 
 def tones_by_era(
@@ -295,8 +657,8 @@ def tones_by_era(
     return {
         name: Tone(
             channel.number,
-            command.frequency / _FREQUENCY.per_unit,
-            command.level / _LEVEL.per_unit,
+            command.frequency / _ROUTING_FREQUENCY.per_unit,
+            command.level / _ROUTING_LEVEL.per_unit,
             command.phase / _PHASE.per_unit,
         )
         for name, channel in rig.wiring.items()
@@ -337,7 +699,9 @@ def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
     count, steps = len(first.knots), knots + 1
     if count <= steps:
         return envelopes
-    step = math.ceil(round(first.duration * _STEP.per_unit) / steps) / _STEP.per_unit
+    step = (
+        math.ceil(round(first.duration * _ROUTING_STEP.per_unit) / steps) / _ROUTING_STEP.per_unit
+    )
     at = np.minimum(step * np.arange(1, steps + 1), first.duration) / first.step
     since = np.minimum(at.astype(int), count - 1)
     values = np.array([(each.start, *each.knots) for each in envelopes.values()])
@@ -357,7 +721,7 @@ def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[di
             motions += one.knots[:-1]
             units += [strokes[name]] * (len(one.knots) - 1)
     each = np.array(motions, dtype=complex) / units
-    levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
+    levels = np.rint(np.abs(each) * _ROUTING_LEVEL.per_unit).astype(int)
     phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
     phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
     knots = zip(levels.tolist(), phases.tolist(), strict=True)
@@ -365,6 +729,6 @@ def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[di
     for envelopes in several:
         found.append({})
         for name, one in envelopes.items() if envelopes else ():
-            step = math.ceil(round(one.step * _STEP.per_unit, _DIGITS))
+            step = math.ceil(round(one.step * _ROUTING_STEP.per_unit, _DIGITS))
             found[-1][name] = Envelope(step, tuple(islice(knots, len(one.knots) - 1)))
     return found

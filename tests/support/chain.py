@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self, cast
 
 from controller.play.loop import Controller
-from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values

@@ -16,7 +16,7 @@ from chain import Chain
 from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.play.observer import PlayReport
+from controller.play.planner import PlayReport
 from drivers.judge.watching.capture import Violation
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.play import joint_answer, planner
+from controller.play import joint_answers, planner
 from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
 from model.answer.plan import answer, prepare_answers, query
 from model.answer.promise import scaled
@@ -201,7 +201,7 @@ def _prepare(table: Any, drive_mode: str | None) -> None:
     getattr(table, "prepare", partial(prepare_answers, table))(drive_mode)
 
 
-joint_answer.answer = _answer
+joint_answers.answer = _answer
 planner.prepare_answers, planner.query = _prepare, _query
 
 

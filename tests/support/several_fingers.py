@@ -16,11 +16,11 @@ from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.content import Content, Selection
 from controller.play.intent import Target
-from controller.play.joint_answer import answered, selection_of
-from controller.play.observer import PlayReport
+from controller.play.joint_answers import answered, selection_of
+from controller.play.layer_contents import Content, Selection
+from controller.play.planner import PlayReport
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.playing.contents import Layer
@@ -279,7 +279,7 @@ class Pressed:
         """
         with pytest.MonkeyPatch.context() as patched:
             if not self.is_shaped:
-                plain = "controller.play.capabilities.envelope_support"
+                plain = "controller.play.routing.envelope_support"
                 patched.setattr(plain, lambda rig, amplifiers: RAMPS_ONLY)
             return run_virtual(self._run(ways, held))
 

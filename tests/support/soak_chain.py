@@ -14,7 +14,7 @@ from chain import Chain
 from controller.api.jsonrpc import RpcError
 from controller.operation.links import Supervisor
 from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger
-from controller.play.observer import PlayReport
+from controller.play.planner import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
 from drivers.judge.watching.config import TimeLimits

@@ -15,10 +15,9 @@ from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.play.chooser import Chooser
-from controller.play.content import Prediction
 from controller.play.intent import HapticIntent
-from controller.play.selection import Selector
+from controller.play.layer_contents import Prediction
+from controller.play.selection import Chooser, Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.config.fields import Rectangle
 from only import phased, wants

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from controller.api.client import AsyncClient
-from controller.play.content import BEING_CHOSEN
 from controller.play.intent import NO_CONTACTS
+from controller.play.layer_contents import BEING_CHOSEN
 from controller.play.selection import GIVEN_UP
 from daemon_bench import (
     ENABLED,

@@ -11,7 +11,7 @@ from controller.cli.shown import show_status
 from controller.daemon.children import gateway_options
 from controller.effects.layout import default_effects
 from controller.gateway.settings import read_token
-from controller.play.observer import SilenceReport
+from controller.play.planner import SilenceReport
 from daemon_bench import (
     ENABLED,
     READY,

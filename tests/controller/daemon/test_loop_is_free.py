@@ -23,7 +23,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.registered import METHODS
 from controller.api.server import TOPICS
 from controller.effects.kinds import File
-from controller.play.chooser import Chooser
+from controller.play.selection import Chooser
 from controller.sources import udp_source
 from daemon_bench import ENABLED, DaemonBench, daemon_table, holding, ready_daemon
 from memory_machine import MemoryMachine

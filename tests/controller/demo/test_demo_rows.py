@@ -24,8 +24,8 @@ from controller.demo.recorder import (
     simulated_plate,
     steady_contrast_db,
 )
-from controller.play.content import Prediction, not_served
-from controller.play.observer import Observers, PlayReport, SilenceReport
+from controller.play.layer_contents import Prediction, not_served
+from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.sources.contacts import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError

@@ -7,9 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.play.ahead import MARGIN_DB, STRETCH, felt_on_ways, with_ways
 from controller.play.intent import Target
-from controller.play.joint_answer import answered, selection_of
+from controller.play.joint_answers import (
+    MARGIN_DB,
+    STRETCH,
+    answered,
+    felt_on_ways,
+    selection_of,
+    with_ways,
+)
 from controller.sources.contacts import Contact, ContactKey
 from controller.sources.motion import AT_REST, Motion
 from model.answer.plan import answer

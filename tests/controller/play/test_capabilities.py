@@ -8,12 +8,15 @@ from typing import Any
 
 import pytest
 
-from controller.play.capabilities import (
+from controller.play.routing import (
     EnvelopeSupport,
     envelope_support,
+    on_wire,
     playback_capabilities,
+    route,
+    thinned,
+    tones_by_era,
 )
-from controller.play.routing import on_wire, route, thinned, tones_by_era
 from drivers.host.ledger import Ledger
 from drivers.playing.contents import Layer
 from drivers.playing.contents import Tone as Played

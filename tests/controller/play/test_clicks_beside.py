@@ -9,12 +9,10 @@ import pytest
 
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout, default_effects
-from controller.play.chooser import Chooser
-from controller.play.content import Prediction, Selection, sums_db
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.play.layer_content import LayerContent
-from controller.play.observer import PlayReport
-from controller.play.selection import Selector
+from controller.play.layer_contents import LayerContent, Prediction, Selection, sums_db
+from controller.play.planner import PlayReport
+from controller.play.selection import Chooser, Selector
 from controller.sources.contacts import Contact, ContactKey
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, fingers_on, playable, table
 from virtual_loop import in_virtual_time

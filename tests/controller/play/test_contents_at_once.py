@@ -11,13 +11,11 @@ import pytest
 from controller.daemon.messages import PlateView
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
-from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.layer_content import LayerContent
+from controller.play.layer_contents import LayerContent
 from controller.play.layers import Layers, Sets
-from controller.play.observer import PlayReport
-from controller.play.planner import ENDED
-from controller.play.selection import Selector
+from controller.play.planner import ENDED, PlayReport
+from controller.play.selection import Chooser, Selector
 from controller.sources.contacts import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.protocol.sets import LayerSet
@@ -374,7 +372,7 @@ async def test_a_click_that_cannot_be_played_is_said_though_no_layer_changes(
         def refuse(*_: Any, **__: Any) -> None:
             raise InputError("nothing is felt there")
 
-        monkeypatch.setattr("controller.play.chooser.answered", refuse)
+        monkeypatch.setattr("controller.play.selection.answered", refuse)
         fingers.at[2] = (0.162, 0.049)
         await fingers.hold(0.02)
         assert len(fingers.committed) == count
@@ -494,7 +492,7 @@ async def test_an_answer_that_fails_silences_all_and_says_why(
 
     async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
         with monkeypatch.context() as patched:
-            patched.setattr("controller.play.chooser.answered", fail)
+            patched.setattr("controller.play.selection.answered", fail)
             fingers.at[2] = RIGHT
             await fingers.hold(0.5)
         assert calls == 1

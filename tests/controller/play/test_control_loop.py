@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.play.observer import Observers
+from controller.play.planner import Observers
 from controller.sources.touch import Touch, TouchFrame
 from courses import Acted, courses, follow
 from set_chain import FINGER, set_running

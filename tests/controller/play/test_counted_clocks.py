@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from controller.play.counted_clocks import CountedClocks
+from controller.play.routing import CountedClocks
 from model.ensemble.draws import EXACT_CLOCKS
 from model.rig.rig import Channel
 from paper_table import smooth_rig, smooth_table
@@ -55,7 +55,7 @@ def test_clocks_that_come_and_go_are_told_once_with_how_often(
     seconds, now = [0.0], {"a": 4e-6, "b": 4e-6}
     monkeypatch.setattr(threads, "now", lambda: seconds[0])
     clocks, table = CountedClocks(HALVES, lambda: now), smooth_table()
-    with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
+    with caplog.at_level(logging.INFO, logger="controller.play.routing"):
         table = clocks.counted_by(table)
         for _ in range(5):
             for now["b"], groups in ((math.inf, (0, 1, 0, 1)), (4e-6, ())):
@@ -81,7 +81,7 @@ def test_clocks_that_come_and_go_are_told_once_with_how_often(
 def test_clock_that_is_not_known_yet_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
     """When its line has just been opened."""
     clocks = CountedClocks(HALVES, lambda: {"a": 4e-6, "b": math.inf})
-    with caplog.at_level(logging.INFO, logger="controller.play.counted_clocks"):
+    with caplog.at_level(logging.INFO, logger="controller.play.routing"):
         assert clocks.counted_by(smooth_table()).clocks.groups == (0, 1, 0, 1)
     assert [each.levelno for each in caplog.records] == [logging.INFO]
 

@@ -13,10 +13,10 @@ import pytest
 
 from chain import Position
 from controller.effects.kinds import Click
-from controller.play.crossfades import Crossfades
 from controller.play.intent import Target
+from controller.play.joint_answers import Crossfades
 from controller.play.layers import CROSSFADE
-from controller.play.observer import PlayReport
+from controller.play.planner import PlayReport
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Limits
 from model.config.fields import Rectangle

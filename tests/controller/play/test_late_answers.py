@@ -11,7 +11,7 @@ from controller.daemon.messages import PlateView
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
-from controller.play.content import BEING_CHOSEN
+from controller.play.layer_contents import BEING_CHOSEN
 from controller.play.selection import BLOCKED, GIVEN_UP
 from drivers.protocol.definition import HEARTBEAT
 from model.config.fields import Rectangle

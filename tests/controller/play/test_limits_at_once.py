@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.play.capabilities import PlaybackCapabilities
-from controller.play.chooser import Chooser
-from controller.play.content import Selection
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.selection import Selector
+from controller.play.layer_contents import Selection
+from controller.play.routing import PlaybackCapabilities
+from controller.play.selection import Chooser, Selector
 from controller.sources.contacts import Contact, ContactKey
 from several_fingers import LEFT, RIGHT, chosen_for, playable, table
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from magnets import STEP, Magnets
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing

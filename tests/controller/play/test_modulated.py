@@ -10,9 +10,8 @@ from scipy.signal import hilbert
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
-from controller.play.content import Content
 from controller.play.intent import Pulse, Target
-from controller.play.layer_content import LayerContent
+from controller.play.layer_contents import Content, LayerContent
 from controller.play.layers import Layers, Sets
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Layer

@@ -9,10 +9,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from controller.play.capabilities import RAMPS_ONLY, PlaybackCapabilities
-from controller.play.chooser import Chooser
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.selection import Selector
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.selection import Chooser, Selector
 from controller.sources.contacts import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.stimulus import Finger, Stimulus

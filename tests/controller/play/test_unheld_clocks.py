@@ -11,8 +11,8 @@ import pytest
 
 from chain import FarEnd
 from controller.effects.player import EffectPlayer
-from controller.play.content import leaks_db_sl
-from controller.play.counted_clocks import CountedClocks
+from controller.play.layer_contents import leaks_db_sl
+from controller.play.routing import CountedClocks
 from controller.sources.contacts import Contact, ContactKey
 from drivers.host.group import Group
 from drivers.protocol.definition import CLOCK_UNKNOWN

@@ -1,0 +1,771 @@
+"""Where moving fingers are going to be, so that answers are made, and promised, for their next way.
+
+An answer to a place is best as it is asked, and the finger is elsewhere when it plays. One that
+moves is answered for the next 8 mm of its way, at three places at once, its own content and as
+quiet for all others: from where it is once the weights have half changed, to where they do again.
+Weights that change have side bands, which a steady promise does not count: a margin does.
+
+Threads for answers that take longer than the control loop may.
+
+An answer that hangs cannot be ended, only left behind: its thread holds up neither the next answer
+nor the end of the process, and what it returns at last is dropped.
+
+Contents of fingers from one answer of the table, a layer for each.
+
+A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
+one serves more fingers. What promises more is led over to once all rest (`crossfades`).
+
+The way from what plays to a better answer, once all fingers rest: one content at a time.
+
+What fingers feel depends on who came first, since a frequency that is felt is kept. The answer with
+none kept is led to along cross-fades, a content after the other, so that others feel little of it;
+where only weights change, as after a finger has left, along the same ramp within the layer. Each
+step keeps 30 Hz between all that sounds at once, the old tone included; where no order of the
+contents does, what plays is left. Between the steps the promise is that of what plays then.
+"""
+
+import asyncio
+import cmath
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from controller.play.intent import MAX_DB_SL, Target, band_of_table
+from controller.play.layer_contents import Content, Prediction, Selection, Targets, not_served
+from controller.play.routing import PlaybackCapabilities
+from controller.sources.contacts import Contact, ContactKey
+from model.answer.answer import (
+    HELD_BACK,
+    IMPERCEPTIBLE_DB_SL,
+    MIN_CONTRAST_DB,
+    MIXED,
+    ONSET_RAMP,
+    OWN,
+    OWN_CONTRAST_DB,
+    SAME_LEVEL,
+    SHARED,
+    Answer,
+    Layer,
+    Sensation,
+    verdict_of,
+)
+from model.answer.plan import answer, worst_of
+from model.answer.promise import with_tones
+from model.answer.stimulus import ANY, APART_HZ, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
+from model.arrays import NEARLY, Complex64Array, FloatArray, Point
+from model.drive_modes import UNRESTRICTED
+from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS
+from model.structure.attachments import MIN_LOAD
+from model.structure.plate import Plate
+from model.table.table import LocalizationTable
+from model.vibration import Excitation, base_amplitudes
+from registry.threads import DaemonThreads
+
+STRETCH = 0.008
+"""Way [m] that a moving finger is answered for: until it has gone that far it is not asked anew."""
+
+MARGIN_DB = 2.0
+"""By how much less is promised while a finger moves, to it and beside it, than if it rested."""
+
+_ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
+
+
+def with_ways(
+    fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
+) -> list[Finger]:
+    """Return fingers of contacts with those that move where they are going to be.
+
+    At a time [s]. Behind all of them come the two ends of the way of each, as fingers of the same
+    stimulus that share its load. Fingers that may share with others, whose strength comes and goes,
+    or that come too near another are only moved.
+    """
+    found, ends = [*fingers], list[Finger]()
+    for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
+        vx, vy = contact.motion.velocity(now)
+        if not (speed := math.hypot(vx, vy)):
+            continue
+        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
+        way = [
+            _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
+            for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)
+        ]
+        others = [each for each in (*found, *ends) if each is not finger]
+        if any(math.dist(at, each.at) < FINGERTIP_RADIUS for at in way for each in others):
+            continue
+        found[number] = replace(finger, at=way[1])
+        is_one = len({*way}) == len(way) and len(found) + len(ends) + 2 <= MAX_CONTACTS
+        if is_one and _is_steady_and_alone(finger, others):
+            name = finger.name or f"finger {number}"
+            stimulus = finger.stimulus and replace(finger.stimulus, name=name)
+            one = replace(finger, stimulus=stimulus, load=MIN_LOAD, sharing=MUST)
+            ends += [replace(one, at=at) for at in (way[0], way[2])]
+            found[number] = replace(one, at=way[1], load=finger.load - 2 * MIN_LOAD)
+    return [*found, *ends]
+
+
+def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
+    """Return what the first fingers of an answer get on their ways, the rest being these.
+
+    Of weights that change for a way those who rest feel side bands, too.
+    """
+    if len(found.fingers) == count:
+        return [*found.fingers]
+    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
+
+
+def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
+    """Return what they feel of others there at most, by set of thresholds [dB SL]."""
+    levels = found.tones.foreign_db_sl
+    heard = np.where(np.isnan(levels), -math.inf, levels)
+    if len(heard) == count:
+        return heard.tolist()  # type: ignore[no-any-return]
+    return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]
+
+
+def _ways(found: Answer, count: int) -> list[list[int]]:
+    """The numbers of the fingers that stand for each of the first, itself before its ends."""
+    ways, places = [[number] for number in range(count)], [each.at for each in found.asked]
+    for end in range(count, len(places)):
+        near = [math.dist(at, places[end]) for at in places[:count]]
+        ways[near.index(min(near))].append(end)
+    return ways
+
+
+def _on_plate(at: Point, plate: Plate) -> Point:
+    x, y = at
+    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
+
+
+def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
+    """Whether a finger feels nothing, or what is steady and no other finger may feel."""
+    if finger.stimulus is None:
+        return True
+    may_share = any(finger.may_feel_one_with(each) for each in others)
+    return finger.stimulus.modulation_hz is None and not may_share
+
+
+def _on_way(places: Sequence[Sensation]) -> Sensation:
+    """What a finger gets at least on its way, of several places, while it moves."""
+    first = places[0]
+    if first.verdict == HELD_BACK:
+        return first
+    least = dict[str, Any]()
+    for name, (sign, margin) in _WORST.items():
+        values = [each for one in places if (each := getattr(one, name)) is not None]
+        if values:
+            least[name] = sign * min(sign * each for each in values) - sign * margin
+    found: Sensation = replace(first, **least)
+    if found.verdict not in (OWN, MIXED):
+        return found
+    judged = found.promised_contrast_db, found.foreign_level_db_sl
+    return replace(found, verdict=verdict_of(*judged, pauses=found.pauses))
+
+
+_WORST = {
+    "level_db_sl": (1, 0.0),
+    "promised_level_db_sl": (1, 0.0),
+    "contrast_db": (1, 0.0),
+    "median_contrast_db": (1, 0.0),
+    "promised_contrast_db": (1, MARGIN_DB),
+    "foreign_level_db_sl": (-1, MARGIN_DB),
+}
+"""Figures of a sensation: whether less of it is worse or more (-1), and the margin on it [dB]."""
+
+
+T = TypeVar("T")
+
+TIME_LIMIT = 1.0
+"""Time [s] after which an answer is given up; it takes some tens of milliseconds."""
+
+MAX_LATE = 2
+"""Answers that may still be computed after they were given up; until one ends none is begun."""
+
+_logger = logging.getLogger(__name__)
+
+
+class AnswerThread(Generic[T]):
+    """Answers one question at a time, each in a thread, until it has come or is given up.
+
+    arrived: called in the loop when there is something to `take`; freed: when an answer that was
+    given up has ended, before that.
+    """
+
+    def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
+        self._arrived, self._freed = arrived, freed
+        self._threads = DaemonThreads()
+        self.is_busy = False
+        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
+        self._answer: asyncio.Future[T] | None = None
+        self._late = set[asyncio.Future[T]]()  # given up, and still computed
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether too many answers that were given up are still computed."""
+        return len(self._late) >= MAX_LATE
+
+    def compute(self, question: Callable[[], T], *, instead: T) -> None:
+        """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
+        loop = asyncio.get_running_loop()
+        self._answer, self.is_busy = loop.run_in_executor(self._threads, question), True
+        self._answer.add_done_callback(self._note)
+        loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
+
+    def take(self) -> T | None:
+        """Return the answer that was not taken yet; None without any; raises its error."""
+        answer = self._answer
+        if answer is None or not answer.done():
+            return None
+        self._answer, self.is_busy = None, False
+        return None if answer.cancelled() else answer.result()
+
+    def _give_up(self, answer: "asyncio.Future[T]", instead: T) -> None:
+        if not answer.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._late.add(answer)
+            self._answer = asyncio.get_running_loop().create_future()
+            self._answer.set_result(instead)
+            self._arrived()
+
+    def _note(self, answer: "asyncio.Future[T]") -> None:
+        if answer in self._late:
+            self._late.remove(answer)
+            answer.exception()  # of no interest any more
+            self._freed()
+        self._arrived()
+
+
+_SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
+_SIDE_BANDS = 2
+
+LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
+NEIGHBOURS_LEAVE_NOTHING = (
+    "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
+    "not; lift or move that finger away"
+)
+
+Shape = Callable[[Placement, Layer, bool], Layer]
+"""Adds the envelopes of a layer; whether it continues what plays in it, without an onset."""
+
+
+def answered(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    *,
+    before: Mapping[tuple[ContactKey, int], Content],
+    protected: frozenset[ContactKey] = frozenset(),
+    keeps: bool = True,
+    now: float = math.inf,
+    avoided_hz: Sequence[float] = (),
+) -> Answer:
+    """Answer the fingers of targets and of quiet contacts, those that move on their ways.
+
+    before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
+    fingers, or more strongly; now [s]: infinite where all rest; avoided_hz: frequencies that
+    play beside it. Raises InputError for fingers that are too close.
+    """
+    is_shaped = capabilities.envelope_support.onset_knots > 0
+    fingers = fingers_of(table, targets, quiet, capabilities, protected)
+    if len(targets) > 1 or targets[0][1].modulation_hz is not None:
+        fingers = _as_layers_allow(fingers, len(targets), capabilities)
+    if math.isfinite(now):
+        contacts = [*[contact for contact, _ in targets], *quiet]
+        fingers = with_ways(fingers, contacts, now, table.plate)
+    request = partial(
+        answer,
+        table,
+        drive_mode=capabilities.drive_mode,
+        shaped=is_shaped and not targets[0][1].is_short,  # all or none
+        limits=capabilities.limits,
+        avoided_hz=avoided_hz,
+    )
+    kept = _kept(fingers, targets, before) if keeps else fingers
+    if kept == fingers:
+        return request(fingers)
+    found = request(kept)
+    served, lowered = len(found.layers), _lowered_db(found)
+    is_loud = lowered < _SHORT_OF
+    if is_loud and served == len(targets):
+        return found
+    other = request(fingers)
+    is_better = not is_loud and _lowered_db(other) < lowered
+    return other if (len(other.layers), is_better) > (served, False) else found
+
+
+def selection_of(
+    table: LocalizationTable,
+    found: Answer,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    *,
+    before: Mapping[tuple[ContactKey, int], Content],
+    shape: Shape | None = None,
+    protected: frozenset[ContactKey] = frozenset(),
+    is_in_phase: bool = True,
+) -> Selection:
+    """Return the contents of an answer to the fingers of targets and quiet contacts.
+
+    before: what fingers feel now, whose phases are kept if is_in_phase.
+    """
+    count = len(targets) + len(quiet)
+    sensed = felt_on_ways(found, count)
+    here = replace(found, asked=found.asked[:count])  # without the ends of ways
+    fields: Complex64Array | None = None  # seldom needed
+    contents: list[Content] = []
+    skipped: list[Prediction] = []
+    felt, unfelt = [*zip(targets, sensed, strict=False)], set[ContactKey]()
+    for (contact, _), each in felt:
+        if each.verdict == HELD_BACK:
+            skipped.append(_held_back(contact, each))
+        elif (reason := _why_unfelt(each)) is not None:
+            unfelt.add(contact.key)
+            skipped.append(not_served(contact, reason))
+    for layer in found.layers:
+        layer = replace(layer, fingers=tuple([each for each in layer.fingers if each < count]))
+        own, sensations = list[tuple[Contact, Target]](), list[Sensation]()
+        for number in layer.fingers:
+            finger, sensation = felt[number]
+            if finger[0].key not in unfelt:
+                own.append(finger)
+                sensations.append(sensation)
+        if not own:
+            continue
+        (contact, target), placed, voices = own[0], here.placement(layer), layer.voices
+        carrier = before.get((contact.key, target.voice))
+        is_continued = carrier is not None and all(
+            (then := before.get((contact.key, voice))) is not None
+            and then.frequency == played.frequency
+            for voice, played in enumerate(voices)
+        )
+        for voice, played in enumerate(voices):
+            if layer.side_bands or (is_in_phase and carrier is not None):
+                if fields is None:
+                    places = [each.finger.at for each in sensed[: len(targets)]]
+                    fields = table.unit_fields(np.array(places), contacts=places)
+                then = carrier if is_continued else None
+                played = _in_phase(played, then, fields, layer.fingers[0], table)
+            contents.append(
+                Content(
+                    (contact.key, target.voice + voice),
+                    tuple(own),
+                    placed,
+                    shape(placed, played, is_continued) if shape and not target.course else played,
+                    () if voice else _predictions(own, sensations, layer),
+                )
+            )
+    contacts = [*[contact for contact, _ in targets], *quiet]
+    levels = zip(contacts, foreign_on_ways(found, count), strict=True)
+    return Selection(
+        tuple(targets),
+        tuple(quiet),
+        tuple(contents),
+        None if contents else skipped[0].held_back,
+        tuple(skipped),
+        foreign_levels={contact.key: by_set for contact, by_set in levels},
+        protected=protected,
+    )
+
+
+def fingers_of(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    protected: frozenset[ContactKey] = frozenset(),
+) -> list[Finger]:
+    """Return the fingers of targets, then the quiet ones.
+
+    protected: contacts that must not notice the vibrations of others. The duration counts of a
+    single target, and of what ends before an onset would have settled.
+    """
+    found = []
+    for contact, target in targets:
+        is_over = target.course is None and (len(targets) == 1 or target.is_short)
+        duration = None
+        if is_over and target.pulse is not None and target.pulse.is_raised:
+            duration = target.pulse.duration
+        stimulus = Stimulus(
+            MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
+            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
+            duration,
+            None if duration is not None else target.modulation_hz,
+            is_limit=target.level_db_sl is None,
+            name=target.content,
+            course=target.course,
+        )
+        never = target.is_own or target.course is not None  # each has begun at its own time
+        sharing = NEVER if never else ANY if target.may_share else BY_NAME
+        found.append(
+            Finger(
+                (contact.x, contact.y),
+                stimulus,
+                contact.load,
+                target.priority,
+                sharing,
+                min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+                max_foreign_db_sl=IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf,
+            )
+        )
+    for contact in quiet:
+        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
+        found.append(Finger((contact.x, contact.y), load=contact.load, max_foreign_db_sl=bound))
+    return found
+
+
+def playable_band(
+    band: tuple[float, float] | None, frequencies: FloatArray, playable: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the lowest and highest frequency [Hz] of a band that can be played.
+
+    A band that shares no frequency of a table with what is playable is ignored.
+    """
+    low, high = playable
+    if band is not None:
+        of_table = band_of_table(band, frequencies)
+        together = max(low, of_table[0]), min(high, of_table[1])
+        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
+            low, high = together
+    return low, high
+
+
+def _as_layers_allow(
+    fingers: Sequence[Finger], targets: int, capabilities: PlaybackCapabilities
+) -> list[Finger]:
+    """The fingers, steady where there are no layers for side bands, of low priority first.
+
+    A layer is left to a click.
+    """
+    found, spare = [*fingers], capabilities.layers - targets - 1
+    for number in sorted(range(targets), key=lambda each: -found[each].priority):
+        stimulus = found[number].stimulus
+        if stimulus is not None and stimulus.modulation_hz is not None:
+            if spare >= _SIDE_BANDS:
+                spare -= _SIDE_BANDS
+            else:
+                steady = replace(stimulus, modulation_hz=None)
+                found[number] = replace(found[number], stimulus=steady)
+    return found
+
+
+def _kept(
+    fingers: Sequence[Finger],
+    targets: Sequence[tuple[Contact, Target]],
+    before: Mapping[tuple[ContactKey, int], Content],
+) -> list[Finger]:
+    """The fingers with the frequencies that they feel now, where their bands allow it."""
+    kept = [*fingers]
+    for number, (contact, target) in enumerate(targets):
+        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
+        frequency = None if then is None else then.frequency
+        if stimulus is None or frequency is None:
+            continue
+        low, high = stimulus.band_hz
+        if low <= frequency <= high:
+            tuned = replace(stimulus, band_hz=(frequency, frequency))
+            kept[number] = replace(fingers[number], stimulus=tuned)
+    return kept
+
+
+def _lowered_db(found: Answer) -> float:
+    """By how much the weakest finger is weaker than asked."""
+    return max([each.lowered_db for each in found.fingers], default=0.0)
+
+
+def felt_db_sl(felt: Sensation) -> float:
+    """Return the level of a finger: promised of what lasts, over its duration as modelled."""
+    stimulus = felt.finger.stimulus
+    lasts = stimulus is None or stimulus.duration is None
+    return felt.promised_level_db_sl if lasts else felt.level_db_sl
+
+
+def _why_unfelt(felt: Sensation) -> str | None:
+    """Return why a finger would not feel what is played for it; None if it does."""
+    stimulus = felt.finger.stimulus
+    if felt.layer is None or stimulus is None:
+        return None
+    if stimulus.is_limit and felt.level_db_sl <= 0:
+        return NEIGHBOURS_LEAVE_NOTHING
+    return LIMITS_LEAVE_NOTHING if felt_db_sl(felt) < 0 <= stimulus.level_db_sl else None
+
+
+def _predictions(
+    targets: Sequence[tuple[Contact, Target]],
+    sensations: Sequence[Sensation],
+    layer: Layer,
+) -> tuple[Prediction, ...]:
+    """What is predicted of a layer's finger, and of those that share it."""
+    first, own = targets[0]
+    shares = (
+        f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
+        "apart"
+    )
+    predictions: list[Prediction] = []
+    for (contact, target), felt in zip(targets, sensations, strict=True):
+        predictions.append(
+            Prediction(
+                contact,
+                felt_db_sl(felt),
+                felt.contrast_db,
+                felt.verdict,
+                shares if felt.verdict == SHARED and contact is not first else None,
+                felt.promised_contrast_db,
+                felt.foreign_level_db_sl,
+                layer.frequency,
+                own.content,
+                felt.level_db_sl,
+                pauses=felt.pauses or target.pulse is not None,
+            ).judged()
+        )
+    return tuple(predictions)
+
+
+def _held_back(contact: Contact, felt: Sensation) -> Prediction:
+    """What is said of a finger whose vibration is held back, and by how much."""
+    had = felt.promised_contrast_db
+    least = max(MIN_CONTRAST_DB, felt.finger.min_contrast_db)
+    if felt.is_disturbing:
+        reason = "a protected finger would notice it; lower its level, or lift that finger"
+    elif had is not None and had >= least:
+        reason = (
+            "too many contents for this plate: beside it another finger would not have had the "
+            f"{MIN_CONTRAST_DB:g} dB of contrast, or more, that it requires; lift a finger, move "
+            "it away, or widen its band"
+        )
+    else:
+        figure = "" if had is None or not math.isfinite(had) else f", only {had:.1f} dB"
+        reason = (
+            f"too many contents for this plate: beside the others it would not have had {least:g} "
+            f"dB of contrast{figure}; lift a finger, move it away, or widen its band"
+        )
+    return replace(
+        not_served(contact, reason),
+        promised_contrast_db=had,
+        foreign_level_db_sl=felt.foreign_level_db_sl,
+    )
+
+
+def _in_phase(
+    layer: Layer,
+    before: Content | None,
+    fields: Complex64Array,
+    number: int,
+    table: LocalizationTable,
+) -> Layer:
+    """Turn a layer so that its finger feels it in the phase of the tone before, 0 without any.
+
+    Side bands in phase with their carrier modulate its amplitude, not its frequency: all have the
+    phase of the carrier before. fields (f, eras, fingers): of each ERA at full stroke; number: of
+    the finger.
+    """
+    fields = fields[:, :, number]
+    felt = _felt(layer.excitation, fields, table)
+    felt_before = {} if before is None else _felt(before.layer.excitation, fields, table)
+    (then,) = felt_before.values() if len(felt_before) == 1 else (1.0,)
+    turned = {}
+    for name, tone in layer.excitation.items():
+        now = felt[tone.frequency]
+        change = cmath.phase(then / now) if now and then else 0.0
+        turned[name] = replace(tone, phase=tone.phase + change)
+    return replace(layer, excitation=turned)
+
+
+def _felt(
+    excitation: Excitation, fields: Complex64Array, table: LocalizationTable
+) -> dict[float, complex]:
+    """Complex acceleration at a finger, by frequency [Hz]."""
+    frequencies, bases = base_amplitudes(excitation, table.eras)
+    rows = table.rows_of(frequencies)
+    weights = bases / table.highest_drives[rows]
+    felt = (weights * fields[rows]).sum(axis=1)
+    return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))
+
+
+WORTH, WORTH_OF_WEIGHTS = 2.0, 0.5
+"""How much more [dB] the worst finger must be promised for other frequencies, or weights alone."""
+
+_SAME = 0.01  # of the largest amplitude of two drives: a difference that is not felt
+
+_Voices = Mapping[ContactKey, tuple[Content, ...]]
+"""What fingers feel: a content, and its side bands, by the finger whose content it is."""
+
+
+@dataclass(frozen=True)
+class Crossfades:
+    """Finds the way from what plays to a better answer for the same fingers.
+
+    targets, quiet: contacts where they rest; playing: what they feel, by finger and voice; shape:
+    adds envelopes.
+    """
+
+    table: LocalizationTable
+    targets: Targets
+    quiet: Sequence[Contact]
+    capabilities: PlaybackCapabilities
+    playing: Mapping[tuple[ContactKey, int], Content]
+    protected: frozenset[ContactKey] = frozenset()
+    shape: Shape | None = None
+
+    def steps(self) -> tuple[Selection, ...]:
+        """What plays after each step, the content that is led to marked.
+
+        Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5;
+        either to the same fingers, and not more weakly. It ends where a step promises no more.
+        Where nothing is better, what plays, if it promises another contrast where fingers rest by
+        0.5 dB than it did on their ways.
+        """
+        if self.capabilities.drive_mode != UNRESTRICTED:
+            return ()
+        playing, same = _by_finger(self.playing.values()), tuple[Selection, ...]()
+        for keeps in (False, True):
+            goal = answered(
+                self.table,
+                self.targets,
+                self.quiet,
+                self.capabilities,
+                before=self.playing,
+                protected=self.protected,
+                keeps=keeps,
+            )
+            found = _by_finger(self._selection(goal, shape=self.shape).contents)
+            if _served(found) != _served(playing) or len(goal.layers) != len(playing):
+                continue
+            now = self._mixed(goal, playing)
+            same = self._restated(now, playing)
+            led = {key: each for key, each in found.items() if _differ(each, playing[key])}
+            is_tuned = any(_is_tuned(playing[key], each) for key, each in led.items())
+            gain = worst_of(goal) - worst_of(now)
+            if gain < (WORTH if is_tuned else WORTH_OF_WEIGHTS) or _is_weaker(goal, now):
+                continue
+            if steps := self._in_order(goal, playing, led):
+                return steps
+        return same
+
+    def _restated(self, now: Answer, playing: _Voices) -> tuple[Selection, ...]:
+        """What plays with what it promises now; nothing if that has been said."""
+        found, said = self._felt(now, playing), dict[ContactKey, float]()
+        for content in self.playing.values():
+            for each in content.predictions:
+                said[each.contact.key] = each.promised_contrast_db or 0.0
+        for each in found.predictions:
+            promised = each.promised_contrast_db or 0.0
+            if abs(promised - said.get(each.contact.key, promised)) >= WORTH_OF_WEIGHTS:
+                return (found,)
+        return ()
+
+    def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:
+        """What plays after each step to contents, the best first; none where none may follow.
+
+        One that may follow hinders no other after: no other order goes on where this one ends.
+        """
+        left, steps, before = {**led}, list[Selection](), -math.inf
+        while left:
+            options = []
+            for key, voices in left.items():
+                if self._may_follow(playing, key, voices):
+                    after = {**playing, key: voices}
+                    options.append((self._mixed(goal, after), key, after))
+            if not options:
+                return ()
+            mixed, key, playing = max(options, key=lambda each: worst_of(each[0]))
+            del left[key]
+            if left or not steps or worst_of(mixed) >= before + SAME_LEVEL:
+                steps.append(self._felt(mixed, playing))
+            before = worst_of(mixed)
+        return tuple(steps)
+
+    def _may_follow(self, playing: _Voices, key: ContactKey, voices: tuple[Content, ...]) -> bool:
+        """Whether a finger's content may be led to another beside all that plays.
+
+        While both sound they are 30 Hz from all others and each other, and within the limits of the
+        amplifiers.
+        """
+        beside = [one for each in playing.values() for one in each]
+        if not _is_tuned(playing[key], voices):
+            beside = [one for one in beside if one not in playing[key]]
+        elif any(
+            abs((voices[0].frequency or 0.0) - (each[0].frequency or 0.0)) < APART_HZ
+            for each in playing.values()
+        ):
+            return False
+        total = [one.layer for one in (*beside, *voices)]
+        return self.capabilities.limits.factor_within(total, self.table) >= 1 - NEARLY
+
+    def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
+        """The answer with the tones of contents that are felt together, and what these promise."""
+        drives, owners = [], list[int]()
+        rows, table = list[int](), self.table
+        for number, stream in enumerate(goal.contents.streams):
+            for one in voices[self.targets[stream.targets[0]][0].key]:
+                frequencies, bases = base_amplitudes(one.layer.excitation, table.eras)
+                at = table.rows_of(frequencies)
+                rows += at.tolist()
+                drives += (bases / table.highest_drives[at]).tolist()
+                owners += [number] * len(frequencies)
+        every = np.array(rows), drives, np.array(owners), np.ones(len(rows))
+        return with_tones(table, goal, *every)
+
+    def _felt(self, mixed: Answer, voices: _Voices) -> Selection:
+        """What is felt of contents together, with what is predicted of them."""
+        found = self._selection(mixed)
+        contents = [
+            replace(one, predictions=predicted.predictions)
+            for key, each in _by_finger(found.contents).items()
+            for one, predicted in zip(voices[key], each, strict=True)
+        ]
+        return replace(found, contents=tuple(contents))
+
+    def _selection(self, found: Answer, *, shape: Shape | None = None) -> Selection:
+        given = self.table, found, self.targets, self.quiet
+        chosen = selection_of(*given, before=self.playing, shape=shape, protected=self.protected)
+        led = [replace(each, is_led=True) for each in chosen.contents]
+        return replace(chosen, contents=tuple(led))
+
+
+def _by_finger(contents: Iterable[Content]) -> _Voices:
+    found: dict[ContactKey, tuple[Content, ...]] = {}
+    for each in sorted(contents, key=lambda one: one.key[1]):
+        found[each.key[0]] = (*found.get(each.key[0], ()), each)
+    return found
+
+
+def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
+    """How many voices the content of each finger has, and who feels it."""
+    return {
+        key: (len(each), {contact.key for contact, _ in each[0].targets})
+        for key, each in voices.items()
+    }
+
+
+def _is_tuned(then: Sequence[Content], now: Sequence[Content]) -> bool:
+    """Whether another frequency plays."""
+    return [each.frequency for each in then] != [each.frequency for each in now]
+
+
+def _differ(now: Sequence[Content], then: Sequence[Content]) -> bool:
+    """Whether two contents of a finger are felt to differ by anyone."""
+    if _is_tuned(then, now):
+        return True
+    for one, other in zip(now, then, strict=True):
+        new, old = (
+            {name: tone.phasor for name, tone in each.layer.excitation.items()}
+            for each in (one, other)
+        )
+        least = _SAME * max(map(abs, (*new.values(), *old.values())))
+        if any(abs(new.get(name, 0) - old.get(name, 0)) > least for name in {*new, *old}):
+            return True
+    return False
+
+
+def _is_weaker(goal: Answer, now: Answer) -> bool:
+    """Whether a finger feels clearly less of its own."""
+    return any(
+        new.promised_level_db_sl < old.promised_level_db_sl - _SHORT_OF
+        for new, old in zip(goal.fingers, now.fingers, strict=True)
+        if new.layer is not None
+    )

@@ -39,7 +39,7 @@ from typing import Any, cast
 from controller.api.jsonrpc import MAX_LINE_LENGTH, ErrorCode, InvalidRequest, RpcError, error_line
 from controller.api.link import credentials_of
 from controller.api.schema import Topic
-from controller.process.rate_limit import RateLimiter, Rates
+from controller.process.log import RateLimiter, Rates
 
 MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client
 _MAX_UNREAD_NOTIFICATIONS = MAX_UNREAD_BYTES // 2  # bytes; the rest is reserved for responses

@@ -236,7 +236,7 @@ def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
     Raises InputError, also where the daemon runs: it holds the amplifiers.
     """
     from controller.daemon.config import daemon_config_of, file_of, is_daemon_document
-    from controller.process.socket_lock import SocketLock
+    from controller.process.daemon_process import SocketLock
     from model.config.document import read_document
     from model.rig.rig_file import rig_of
 

@@ -31,9 +31,8 @@ from controller.operation.operation_states import ENERGISED, DaemonState, Operat
 from controller.operation.operator import FaultDumps
 from controller.play.loop import Controller
 from controller.play.planner import Observers
+from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread, open_log_file, start_log
-from controller.process.service_manager import ServiceManager
-from controller.process.socket_lock import SocketLock
 from drivers.errors import DriverError
 from drivers.host.amplifier import WATCHDOG, Amplifier
 from drivers.opening import Lines

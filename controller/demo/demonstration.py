@@ -34,9 +34,8 @@ from controller.demo.recorder import (
 )
 from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
+from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread, start_log
-from controller.process.service_manager import ServiceManager
-from controller.process.socket_lock import SocketLock
 from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
 from controller.sources.tuio import RESTART_PAUSE
 from drivers.errors import LinkError

@@ -52,7 +52,7 @@ from controller.gateway.connections import (
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import SUBPROTOCOL, VERSIONS, Access, Settings
-from controller.process.rate_limit import RateLimiter, Rates
+from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections
 

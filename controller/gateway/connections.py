@@ -30,7 +30,7 @@ from controller.api.link import DaemonLink, Unreachable
 from controller.api.registered import SILENCING
 from controller.gateway.field import DrawnField
 from controller.gateway.settings import HEADERS
-from controller.process.rate_limit import RateLimiter
+from controller.process.log import RateLimiter
 
 SEND_TIMEOUT = 5.0  # s; for one frame
 _LAST_FRAME, _LAST_FRAMES = 0.1, 1.0  # s; for the next frame of a browser which is given up, for

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from controller.cli.commands import app
-from controller.process.socket_lock import SocketLock
+from controller.process.daemon_process import SocketLock
 from drivers.errors import CommandError, LinkError
 from examples.make_measured import record_responses, scanning_grid
 from model.calibration.responses import write_responses_csv, write_responses_uff

@@ -22,9 +22,8 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
+from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread
-from controller.process.service_manager import ServiceManager
-from controller.process.socket_lock import SocketLock
 from drivers.host.amplifier import WATCHDOG
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

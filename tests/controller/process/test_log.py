@@ -23,8 +23,8 @@ from controller.operation.operator import (
     FaultDumps,
     write_dump,
 )
+from controller.process.daemon_process import ServiceManager
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
-from controller.process.service_manager import ServiceManager
 from drivers.wires.wire import Reply
 from full_disk import full_disk
 from gateway_bench import wait_for

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.children import gateway_options
-from controller.process.socket_lock import SocketLock
+from controller.process.daemon_process import SocketLock
 from full_disk import full_disk
 from model.errors import InputError
 

@@ -15,9 +15,8 @@ import numpy as np
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.capture import HEADER, RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
-from controller.sources.tuio import ADDRESS
+from controller.sources.tuio import ADDRESS, HEADER, RecordedDatagram
 
 PLATE = np.array([0.3048, 0.2286])  # metres
 MARGIN, APART = 0.015, 0.06  # metres

@@ -21,8 +21,7 @@ from controller.effects.effect import Effect
 from controller.effects.kinds import Buzz, effect_kind, effect_kinds
 from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
-from controller.sources.contacts import Contact, ContactKey
-from controller.sources.touch import _SOURCES, TouchSource, open_source
+from controller.sources.touch import _SOURCES, Contact, ContactKey, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
 from drivers.wires.known import address_of

@@ -7,9 +7,9 @@ import sys
 import time
 
 from controller.cli.main import main
-from controller.sources.datagrams import Peer
 from controller.sources.touch import TouchFrame
 from controller.sources.tuio import TuioReader
+from controller.sources.udp_source import Peer
 
 if __name__ == "__main__":
     delay, read = float(sys.argv[1]), TuioReader.read

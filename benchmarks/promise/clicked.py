@@ -18,7 +18,7 @@ from controller.effects.player import CLICK_ABOVE_DB
 from controller.play.intent import CLICK, Pulse, Target
 from controller.play.layer_contents import Prediction
 from controller.play.planner import PlayReport
-from controller.sources.contacts import ContactKey
+from controller.sources.touch import ContactKey
 from registry import threads
 
 DURATION, LEVEL_DB_SL, RINGING, PAUSE = 0.040, 20.0, 0.060, 0.6  # s, dB SL

@@ -53,7 +53,7 @@ from controller.api.schema import (
     Topic,
     TouchInputStatus,
 )
-from controller.sources.contacts import CONTACT_TIMEOUT
+from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 from registry import threads

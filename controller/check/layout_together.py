@@ -17,7 +17,7 @@ from controller.play.intent import Target
 from controller.play.joint_answers import fingers_of, selection_of
 from controller.play.layer_contents import Selection
 from controller.play.selection import ChoiceRequest, Intention
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import MIN_CONTRAST_DB, Answer
 from model.answer.plan import answer
 from model.arrays import FloatArray, best_of

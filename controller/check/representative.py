@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from controller.effects.effect import Effect, EffectStimulus, Region
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 
 _REPORT = 0.01  # s; between two reports of the panel
 _WATCHED = 3.0  # s; of an effect that changes with time

@@ -10,7 +10,7 @@ from controller.play.intent import Target
 from controller.play.joint_answers import answered
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import exposures
 from model.arrays import NEARLY, FloatArray

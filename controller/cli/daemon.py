@@ -182,7 +182,7 @@ def touch(
     import asyncio
 
     from controller.cli.shown import show_status
-    from controller.sources.capture import read_capture, replay_capture
+    from controller.sources.tuio import read_capture, replay_capture
     from model.config.fields import parse_point
 
     if (at is None) == (replay is None):

@@ -72,7 +72,7 @@ def demo(
         run_live,
         write_pictures,
     )
-    from controller.sources.capture import read_capture
+    from controller.sources.tuio import read_capture
     from model.rig.rig_file import example_rig_path, load_rig
     from model.table.table_file import cached_table
 

@@ -21,8 +21,7 @@ from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer, Strengths, read_strengths
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import ALIGNED, TouchFrame, TouchSource
+from controller.sources.touch import ALIGNED, RejectCounter, TouchFrame, TouchSource
 from model.arrays import FloatArray
 from model.errors import InputError
 from registry import threads

@@ -59,7 +59,7 @@ from controller.play.intent import NO_CONTACTS
 from controller.play.layer_contents import BEING_CHOSEN, leaks_db_sl
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.play.routing import Drive
-from controller.sources.contacts import Change, Contact, ContactKey
+from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import REPORT_LIFE, REPORTS, ReportKind
 from drivers.host.dialogue import Stopped

@@ -58,8 +58,7 @@ from controller.operation.operation_states import (
 from controller.operation.operator import LEASE_OVER
 from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
-from controller.sources.contacts import Contact
-from controller.sources.touch import Touch, TouchFrame
+from controller.sources.touch import Contact, Touch, TouchFrame
 from drivers.host.dialogue import Stopped
 from model.compiled.kernels import why_slow
 from model.errors import InputError

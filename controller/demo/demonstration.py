@@ -36,8 +36,7 @@ from controller.effects.layout import BUZZ
 from controller.operation.operation_states import DaemonState
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread, start_log
-from controller.sources.capture import RecordedDatagram, read_capture, replay_capture
-from controller.sources.tuio import RESTART_PAUSE
+from controller.sources.tuio import RESTART_PAUSE, RecordedDatagram, read_capture, replay_capture
 from drivers.errors import LinkError
 from model.answer.answer import Sensation
 from model.answer.stimulus import Finger

@@ -29,7 +29,7 @@ from pydantic import BaseModel, ValidationError
 from controller.play.layer_contents import LayerContent, Prediction
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.process.child import ended
-from controller.sources.contacts import Change, Contact, ContactKey
+from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
 from model.answer.answer import HELD_BACK, Layer
 from model.arrays import FloatArray

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 from pydantic import Strict, model_validator
 
 from controller.play.intent import Band, Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray
 from model.config.fields import FREQUENCY, LEVEL, Quantity, Section, Shape

@@ -43,7 +43,7 @@ from controller.effects.effect import (
     SteadyRun,
 )
 from controller.play.intent import MAX_DB_SL, Pulse
-from controller.sources.contacts import Contact
+from controller.sources.touch import Contact
 from model.arrays import FloatArray
 from model.config.fields import ANGLE, LENGTH, LEVEL, SPEED, TIME, Quantity
 from model.errors import InputError

@@ -20,7 +20,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.document import read_bytes
 from model.errors import InputError, shown
 from model.files.array_file import whole_or_nothing

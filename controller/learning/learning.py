@@ -39,7 +39,7 @@ from controller.learning.estimator_process import (
 from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors
 from controller.play.loop import Controller
 from controller.play.planner import Observers, PlayReport
-from controller.sources.contacts import Change, Contact
+from controller.sources.touch import Change, Contact
 from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier import Amplifier, Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing

@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.stimulus import SHAPED_FROM, Course
 from model.arrays import FloatArray, best_of
 from model.finger import STRONG_DB_SL

@@ -38,7 +38,7 @@ import numpy as np
 from controller.play.intent import MAX_DB_SL, Target, band_of_table
 from controller.play.layer_contents import Content, Prediction, Selection, Targets, not_served
 from controller.play.routing import PlaybackCapabilities
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import (
     HELD_BACK,
     IMPERCEPTIBLE_DB_SL,

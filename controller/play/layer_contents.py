@@ -12,7 +12,7 @@ import numpy as np
 
 from controller.play.intent import Gains, Pulse, Target
 from controller.play.routing import Drive
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer import answer
 from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
 from model.answer.stimulus import Course, Placement

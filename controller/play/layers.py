@@ -29,7 +29,7 @@ from controller.play.routing import (
     piece_of,
     tones_by_era,
 )
-from controller.sources.contacts import MAX_CONTACT_TIMEOUT, ContactKey
+from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.playing.contents import Layer, Tone

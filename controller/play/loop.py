@@ -14,9 +14,7 @@ from controller.play.intent import IntentSource
 from controller.play.layers import RELEASE_RAMP
 from controller.play.planner import Observers, Plan, Planner, play_report, silence_report
 from controller.play.routing import limits_of, playback_capabilities
-from controller.sources.contacts import Change, ContactTracker
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import TouchFrame
+from controller.sources.touch import Change, ContactTracker, RejectCounter, TouchFrame
 from drivers.errors import (
     CommandError,
     CommandRefused,

@@ -22,7 +22,7 @@ from controller.play.layer_contents import (
 from controller.play.layers import RELEASE_RAMP, RETRY, Check, Layers, Sets
 from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
+from controller.sources.touch import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.definition import HEARTBEAT

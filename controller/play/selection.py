@@ -42,7 +42,7 @@ from controller.play.layer_contents import (
 )
 from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.routing import PlaybackCapabilities
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer
 from model.answer.plan import MAX_SEPARATE
 from model.answer.promise import scaled

@@ -2,21 +2,79 @@
 
 A calibration is an affine map from coordinates of a sensor to those of the plate: x' = a x + b y +
 c, y' = d x + e y + f on coordinates 0..1 from the top left corner.
+
+Counting rejected input without flooding the log.
+
+Loads of fingers, by what a panel reports: force, or size of the contact.
+
+A load is relative to the rig's `fingertip`, a finger that presses lightly, and grows with the area
+of contact (`Fingertip.scaled`). Area grows as the force to the power of two thirds (Hertz), and so
+does the load: between the third of Hertz's stiffness and the first power of a pulp that stiffens
+exponentially. docs/concepts/people.md has the sources, and how well this is known.
+
+How fast a finger moves, from the places that its source reports, whose errors are a millimetre.
+
+Velocity is the slope of places over time by least squares, of the last 60 ms. Of a finger whose
+places differ by less than 3 mm in that time nothing is known but that it moves slowly: it rests.
+
+Which contact gives way where a plate has as many as it can, so that no sender takes all.
+
+The contacts on the plate, from any sequence of touch frames.
 """
 
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 from urllib.parse import parse_qsl
 
-from controller.sources.reject_counter import RejectCounter
 from model.errors import InputError
+from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
+from registry import threads
 from registry.plugins import PluginRegistry
+
+LOG_INTERVAL = 1.0  # s
+
+
+class RejectCounter:
+    """Counts by reason, and logs each new one, others at most once per LOG_INTERVAL; clock [s]."""
+
+    def __init__(
+        self,
+        logger: logging.Logger,
+        *,
+        clock: Callable[[], float] = threads.now,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}
+        """The newest detail of each reason, printable."""
+        self._logger = logger
+        self._clock = clock
+        self._unlogged = 0
+        self._logged_at = -math.inf
+
+    def count(self, reason: str, detail: str) -> None:
+        """Count one rejection; log its detail if the reason is new or the last line long ago."""
+        self.counts[reason] += 1
+        self.examples[reason] = detail if detail.isprintable() else ascii(detail)
+        self._unlogged += 1
+        now = self._clock()
+        if self.counts[reason] > 1 and now - self._logged_at < LOG_INTERVAL:
+            return
+        self._logger.warning(
+            "%s: %s (new=%d, total: %s)",
+            reason.replace("_", " "),
+            self.examples[reason],
+            self._unlogged,
+            ", ".join(f"{key} {count}" for key, count in sorted(self.counts.items())),
+        )
+        self._unlogged = 0
+        self._logged_at = now
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,3 +247,381 @@ def _reversed(row: Row) -> Row:
     """Return the row of 1 - x' for the row of x'."""
     a, b, c = row
     return (-a, -b, 1 - c)
+
+
+LIGHT_FORCE = 0.5
+"""Force [N] of a finger that presses lightly: the mean of a tap on a touch screen."""
+
+LIGHT_MAJOR = 9.4
+"""Longer axis [mm] of its contact: the mean of index fingers on touch screens."""
+
+MIN_REPORTED, MAX_REPORTED = 0.4, 2.5
+"""Bounds of a reported load: contacts of 6 to 15 mm, forces of 0.13 to 2 N.
+
+Two standard deviations of the rig's default `uncertainty` of a load. What a panel reports beyond
+them tells more of the panel than of the finger.
+"""
+
+LANDING = 0.1
+"""Time [s] after which a finger that lands has its area of contact; until then none is reported."""
+
+MIN_CHANGE = 1.5
+"""Factor by which a reported load must differ from a contact's before that changes."""
+
+_BY_FORCE, _BY_SIZE = 2 / 3, 2.0  # exponents of the load
+
+
+@dataclass(frozen=True)
+class LightPress:
+    """Values of a panel's axes under a finger that presses lightly.
+
+    None for an axis that the panel does not have, or whose unit it does not state.
+    """
+
+    pressure: float | None = None
+    touch_major: float | None = None
+
+    def load(self, *, pressure: float, touch_major: float) -> float | None:
+        """Return the load of a contact with these values, not bounded; the force goes first.
+
+        None without a positive value of an axis.
+        """
+        if self.pressure is not None and pressure > 0:
+            return float((pressure / self.pressure) ** _BY_FORCE)
+        if self.touch_major is not None and touch_major > 0:
+            return float((touch_major / self.touch_major) ** _BY_SIZE)
+        return None
+
+
+def followed(known: float, reported: float) -> float:
+    """Return the load of a contact: the known one, unless the reported one differs enough.
+
+    Bounded.
+    """
+    if not reported > 0:  # NaN is not
+        return known
+    bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
+    change = max(bounded / known, known / bounded)
+    return bounded if change >= MIN_CHANGE else known
+
+
+OVER = 0.060
+"""Time [s] over which a velocity is found; of frames that are older nothing counts."""
+
+_LEAST_TIME, _LEAST_WAY = 0.020, 0.003  # s, m; of a velocity
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The way of a finger: places x, y [m] at times [s], the last one where it is."""
+
+    places: tuple[tuple[float, float, float], ...] = ()
+
+    def followed(self, time: float, x: float, y: float) -> "Motion":
+        """Return it with another place at a time [s]."""
+        since = time - OVER
+        return Motion((*[each for each in self.places if since < each[0] < time], (time, x, y)))
+
+    def velocity(self, now: float) -> tuple[float, float]:
+        """Return the velocity [m/s] at a time [s]; zero for a finger that rests."""
+        places = [each for each in self.places if each[0] > now - OVER]
+        if not places or places[-1][0] - places[0][0] < _LEAST_TIME:
+            return 0.0, 0.0
+        mean = [sum(values) / len(places) for values in zip(*places, strict=True)]
+        variance = sum((time - mean[0]) ** 2 for time, _, _ in places)
+        vx = sum((time - mean[0]) * (x - mean[1]) for time, x, _ in places) / variance
+        vy = sum((time - mean[0]) * (y - mean[2]) for time, _, y in places) / variance
+        is_moving = math.hypot(vx, vy) * (places[-1][0] - places[0][0]) >= _LEAST_WAY
+        return (vx, vy) if is_moving else (0.0, 0.0)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it moved when its last place was reported."""
+        return len(self.places) > 0 and any(self.velocity(self.places[-1][0]))
+
+
+AT_REST = Motion()
+"""Of a finger of which nothing is known."""
+
+
+def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) -> int | None:
+    """Return which contact to lift for one of a newcomer's source, by number; None for none.
+
+    sources: of all contacts in order of arrival; origins: by source. The newest contact of the
+    input, then the origin, then the source with most contacts, if it has at least two more than the
+    newcomer's.
+    """
+    groupings: tuple[Callable[[str], str], ...] = (_input_of, origins.__getitem__, str)
+    left: list[int] = [*range(len(sources))]
+    for depth, group_of in enumerate(groupings):
+        counts = Counter(group_of(sources[each]) for each in left)
+        own = group_of(newcomer)
+        if max(counts.values(), default=0) > counts[own] + 1:
+            for deeper in groupings[depth:]:
+                ((fullest, _),) = Counter(deeper(sources[each]) for each in left).most_common(1)
+                left = [each for each in left if deeper(sources[each]) == fullest]
+            return left[-1]
+        left = [each for each in left if group_of(sources[each]) == own]
+    return None
+
+
+def _input_of(source: str) -> str:
+    """Return the input of a source, the beginning of its name; without one its kind."""
+    return source.partition(":")[0]
+
+
+RIM = 0.0065
+"""How far beyond the plate's edge [m] a finger counts as on it: a fingertip's radius.
+
+Where cameras and frames report a finger on the edge depends on noise and calibration.
+"""
+
+# s; most sources repeat their frames at least every 100 ms, others state their own timeout. A
+# contact that is not confirmed must not be driven.
+CONTACT_TIMEOUT = 0.150
+
+# s; no sensor may stay silent for longer under a resting finger.
+MAX_CONTACT_TIMEOUT = 60.0
+
+# s; no finger leaves the plate so soon: its frames were held up and came together.
+MAX_GLIMPSE = 0.005
+
+# s; how long such a contact is kept, so that a click is decided, loaded and felt.
+TAP_TIME = 0.060
+
+
+class ContactKey(NamedTuple):
+    """Identifies a contact: its source and the id within that source."""
+
+    source: str
+    id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
+
+    load: relative to the rig's fingertip, bounded and in steps, 1 where nothing is
+    reported. motion: its way of late.
+    """
+
+    key: ContactKey
+    x: float
+    y: float
+    since: float
+    load: float = 1.0
+    motion: Motion = field(default=AT_REST, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Contacts that came down, moved, pressed harder or less and lifted, each as it is or was.
+
+    rejected: a reason for each touch that was not accepted.
+    """
+
+    down: tuple[Contact, ...] = ()
+    moved: tuple[Contact, ...] = ()
+    pressed: tuple[Contact, ...] = ()
+    up: tuple[Contact, ...] = ()
+    rejected: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether any contact changed."""
+        return bool(self.down or self.moved or self.pressed or self.up)
+
+
+_UNCHANGED = Change()
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A source with contacts: the time [s] of its last frame, and its origin.
+
+    expiry [s]: when its contacts are lifted unless another frame arrives.
+    """
+
+    received: float
+    timeout: float
+    expiry: float
+    origin: str
+
+
+class ContactTracker:
+    """The contacts on one plate. Deterministic: times are arguments.
+
+    x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch at most `RIM` outside
+    the plate (0..1) is at its edge. Rejects touches that are farther off, have non-finite
+    coordinates or repeat an id within a frame (the last one counts); a contact whose touch is
+    rejected is lifted. Where the maximum number of contacts
+    is reached, a contact of the input, origin or source with most is evicted if it has at least
+    two more than that of the touch; else the touch is rejected.
+    """
+
+    def __init__(self, plate: Plate) -> None:
+        self._plate = plate
+        self._contacts: dict[ContactKey, Contact] = {}
+        self._sources: dict[str, _Source] = {}
+        self._taps: dict[ContactKey, float] = {}  # s; when contacts end that are lifted already
+        self._newest = -math.inf  # s; time of the newest frame
+        self.contacts: tuple[Contact, ...] = ()
+        """All contacts in order of arrival; the newest is the last."""
+        self.next_expiry = math.inf
+        """When [s] the first contacts are lifted unless a frame of their source arrives."""
+        self.changed: dict[ContactKey | None, float] = {}
+        """When [s] contacts changed first that no set has answered; None: the first that lifted."""
+
+    def expiry_of(self, key: ContactKey) -> float:
+        """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
+        if key not in self._contacts:
+            return -math.inf
+        return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
+
+    def sources_of(self, prefix: str) -> list[str]:
+        """Return the sources with contacts whose names begin so."""
+        return [name for name in self._sources if name.startswith(prefix)]
+
+    def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
+        """Apply a frame, which replaces the previous one of its source.
+
+        keeps_taps: whether a contact is kept for a while whose lift comes together with it.
+        """
+        rejected: list[str] = []
+        touches: dict[ContactKey, Touch] = {}
+        if math.isfinite(frame.time):
+            touches = _valid_touches(frame, self._plate, rejected)
+        elif frame.touches:
+            rejected.append("no_time")
+        if keeps_taps:
+            self._keep_taps(frame)
+        gone = []
+        for key in self._contacts:
+            if key.source == frame.source and (key in touches) == (key in self._taps):
+                gone.append(key)
+        up = self._lift(gone) if gone else ()
+        self._sources[frame.source] = _source_of(frame)
+        down: list[Contact] = []
+        moved: list[Contact] = []
+        pressed: list[Contact] = []
+        for key, touch in touches.items():
+            known = self._contacts.get(key)
+            if known is None and len(self._contacts) >= MAX_CONTACTS:
+                origins = {name: each.origin for name, each in self._sources.items()}
+                evicted = to_evict([each.source for each in self._contacts], key.source, origins)
+                if evicted is None:
+                    rejected.append("too_many")
+                    continue
+                up += self._lift([[*self._contacts][evicted]])
+            contact = self._contacts[key] = self._contact(key, touch, known, frame.time)
+            if known is None:
+                down.append(contact)
+            elif (known.x, known.y) != (contact.x, contact.y):
+                moved.append(contact)
+            elif known.load != contact.load:
+                pressed.append(contact)
+        if up:
+            self._note_lifts(up, frame.time)
+        for contact in (*down, *moved, *pressed):
+            self.changed.setdefault(contact.key, frame.time)
+        self._note_next()
+        return Change(tuple(down), tuple(moved), tuple(pressed), up, tuple(rejected))
+
+    def expire(self, now: float) -> Change:
+        """Lift the contacts of all sources that have timed out at now [s]."""
+        if self._newest <= now < self.next_expiry:
+            return _UNCHANGED
+        # Frames dated in the future are treated as received now.
+        expired = [name for name, source in self._sources.items() if source.expiry <= now]
+        ended = [key for key, end in self._taps.items() if end <= now]
+        up: tuple[Contact, ...] = ()
+        if expired or ended:
+            up = self._lift(key for key in self._contacts if key.source in expired or key in ended)
+        for name, source in self._sources.items():
+            if source.received > now:
+                self._sources[name] = replace(source, received=now, expiry=now + source.timeout)
+        self._note_lifts(up, now)
+        self._note_next()
+        return Change(up=up) if up else _UNCHANGED
+
+    def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
+        """Note contacts as changed since times [s], whose answer has not been played after all."""
+        for key, at in answered.items():
+            waiting = key if key in self._contacts else None  # it has lifted meanwhile
+            self.changed[waiting] = min(at, self.changed.get(waiting, at))
+
+    def _contact(
+        self, key: ContactKey, touch: Touch, known: Contact | None, time: float
+    ) -> Contact:
+        """Return the contact of a touch, down since a time [s] unless it is known.
+
+        One whose panel stops reporting loads keeps its own.
+        """
+        since, load = (time, 1.0) if known is None else (known.since, known.load)
+        if touch.load is not None and time - since >= LANDING:
+            load = followed(load, touch.load)
+        x, y = touch.x * self._plate.length, (1 - touch.y) * self._plate.width
+        motion = AT_REST if known is None else known.motion
+        return Contact(key, x, y, since, load, motion.followed(time, x, y))
+
+    def _keep_taps(self, frame: TouchFrame) -> None:
+        """Keep contacts that have just come down and are not in a frame any more."""
+        ids = {touch.id for touch in frame.touches}
+        for key, contact in self._contacts.items():
+            is_lifted = key.source == frame.source and key.id not in ids
+            if is_lifted and frame.time - contact.since < MAX_GLIMPSE:
+                self._taps.setdefault(key, contact.since + TAP_TIME)
+
+    def _lift(self, keys: Iterable[ContactKey]) -> tuple[Contact, ...]:
+        """Remove contacts and return them."""
+        lifted = tuple(self._contacts.pop(key) for key in tuple(keys))
+        for contact in lifted:
+            self._taps.pop(contact.key, None)
+        return lifted
+
+    def _note_lifts(self, up: Iterable[Contact], time: float) -> None:
+        """Note that contacts have changed for the last time at a time [s]."""
+        for contact in up:
+            first = self.changed.pop(contact.key, time)
+            self.changed[None] = min(first, self.changed.get(None, time))
+
+    def _note_next(self) -> None:
+        """Forget sources without contacts, and note when the others expire."""
+        sources, ends = {}, [*self._taps.values()]
+        for key in self._contacts:
+            sources[key.source] = self._sources[key.source]
+        self._newest = -math.inf
+        for source in sources.values():
+            ends.append(source.expiry)
+            self._newest = max(self._newest, source.received)
+        self._sources, self.contacts = sources, tuple(self._contacts.values())
+        self.next_expiry = min(ends, default=math.inf)
+
+
+def _source_of(frame: TouchFrame) -> _Source:
+    timeout = frame.timeout
+    if timeout is None or not 0 < timeout <= MAX_CONTACT_TIMEOUT:  # NaN is not
+        timeout = CONTACT_TIMEOUT
+    origin = frame.source if frame.origin is None else frame.origin
+    return _Source(frame.time, timeout, frame.time + timeout, origin)
+
+
+def _valid_touches(frame: TouchFrame, plate: Plate, rejected: list[str]) -> dict[ContactKey, Touch]:
+    """Return the touches that can be contacts; add a reason for each of the others."""
+    last: dict[int, Touch] = {}
+    for touch in frame.touches:
+        last[touch.id] = touch
+    rejected += ["twice"] * (len(frame.touches) - len(last))
+    valid = {}
+    for touch in last.values():
+        if not (math.isfinite(touch.x) and math.isfinite(touch.y)):
+            rejected.append("not_finite")
+        elif 0 <= touch.x <= 1 and 0 <= touch.y <= 1:
+            valid[ContactKey(frame.source, touch.id)] = touch
+        else:
+            x, y = min(max(touch.x, 0.0), 1.0), min(max(touch.y, 0.0), 1.0)
+            beyond = math.hypot((touch.x - x) * plate.length, (touch.y - y) * plate.width)
+            if beyond > RIM:
+                rejected.append("off_plate")
+            else:
+                valid[ContactKey(frame.source, touch.id)] = replace(touch, x=x, y=y)
+    return valid

@@ -4,21 +4,117 @@ A bundle has the name of its sender (source), the session ids that are down (ali
 of those that changed (set) and a sequence number (fseq); see tuio.org, "TUIO 1.1 Protocol
 Specification". Numbers count by their value, whatever their type; what follows the arguments that
 are needed is ignored. A malformed message is counted, and the others of its bundle are read.
+
+Open Sound Control messages from untrusted datagrams: bundles, texts and numbers of any type.
+
+See the Open Sound Control 1.0 Specification (opensoundcontrol.stanford.edu/spec-1_0.html).
+
+Recorded TUIO streams: the datagrams of a sender with their times, in a text file.
+
+    # era-haptics TUIO capture 1
+    0.000000 2362756e646c6500...
+    0.016667 2362756e646c6500...
+
+Seconds from the start and the datagram in hexadecimal; further lines that start with # are
+comments. Malformed datagrams are kept as received.
 """
 
+import asyncio
 import math
 import re
+import struct
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TypeAlias
 
-from controller.sources.datagrams import Datagram, Peer
-from controller.sources.osc import Argument, OscError, osc_messages, read_message
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame
-from controller.sources.udp_source import UdpSource
+from controller.sources.touch import RejectCounter, Touch, TouchFrame
+from controller.sources.udp_source import MAX_DATAGRAM, Datagram, Peer, UdpSource
+from drivers.errors import LinkError, system_message
+from model.errors import InputError
 from registry import threads
+from registry.files import read_regular
+
+Argument: TypeAlias = str | int | float | None
+"""Argument of a message; None for a blob, and for true, false, nil and impulse."""
+
+_BUNDLE = b"#bundle\0"
+_BUNDLE_HEADER = len(_BUNDLE) + 8  # the time tag is ignored: touches are current
+_MAX_DEPTH = 8  # of bundles in bundles
+_ADDRESS = re.compile(rb"/[!-~]*")
+_RUNS = re.compile(rb"[sS]|b|[TFNI]+|[ifdhtcrm]+")
+_CODES = bytes.maketrans(b"htcrm", b"qQiII")  # of struct, which has those of i, f and d
+
+
+class OscError(ValueError):
+    """A message that cannot be read."""
+
+
+def osc_messages(datagram: bytes, *, limit: int) -> list[bytes]:
+    """Return the encoded messages of a datagram in order, for `read_message`; so many at most.
+
+    What is neither a message nor a bundle is among them; what follows an element whose size exceeds
+    its bundle is one such element.
+    """
+    found, ends = list[bytes](), list[int]()  # of the bundles that enclose an element
+    at, end, is_whole = 0, len(datagram), True
+    while len(found) < limit:
+        is_bundle = end - at >= _BUNDLE_HEADER and datagram.startswith(_BUNDLE, at)
+        if is_whole and is_bundle and len(ends) < _MAX_DEPTH:
+            ends.append(end)
+            at += _BUNDLE_HEADER
+        else:
+            found.append(datagram[at:end])
+            at = end
+        while ends and at == ends[-1]:
+            ends.pop()
+        if not ends:
+            break
+        size = int.from_bytes(datagram[at : at + 4], "big", signed=True)
+        is_whole = 0 < size <= ends[-1] - at - 4
+        at, end = (at + 4, at + 4 + size) if is_whole else (at, ends[-1])
+    return found
+
+
+# Most messages of a panel repeat: its name, the contacts that are alive, resting fingers.
+@lru_cache(maxsize=256)
+def read_message(message: bytes) -> tuple[str, tuple[Argument, ...]]:
+    """Return the address and the arguments of an encoded message; raises OscError.
+
+    Bytes of a text that are not UTF-8 are written as \\xNN.
+    """
+    address = message.partition(b"\0")[0]
+    at = len(address) // 4 * 4 + 4  # texts are padded by one to four zeros
+    tags = message[at:].partition(b"\0")[0]
+    runs = _RUNS.findall(tags)
+    if not (_ADDRESS.fullmatch(address) and tags.startswith(b",")):
+        raise OscError(f"element must be a message with argument types, got {message[:24]!r}")
+    if b"".join(runs) != tags.translate(None, b",[]"):
+        raise OscError(f"argument types must be letters of OSC 1.0, got {tags[:32]!r}")
+    arguments: list[Argument] = []
+    at += len(tags) // 4 * 4 + 4
+    try:
+        for run in runs:  # numbers that follow each other at once
+            if run in (b"s", b"S"):
+                end = message.index(b"\0", at)
+                arguments.append(message[at:end].decode(errors="backslashreplace"))
+                at += (end - at) // 4 * 4 + 4
+            elif run == b"b":
+                (size,) = struct.unpack_from(">I", message, at)
+                arguments.append(None)
+                at += 4 + (size + 3) // 4 * 4
+            elif run[0] in b"TFNI":
+                arguments += [None] * len(run)
+            else:
+                layout = ">" + run.translate(_CODES).decode()
+                arguments += struct.unpack_from(layout, message, at)
+                at += struct.calcsize(layout)
+    except (struct.error, ValueError) as error:
+        raise OscError(f"invalid message: {error}") from error
+    return address.decode(), tuple(arguments)
+
 
 ADDRESS = "/tuio/2Dcur"
 
@@ -331,3 +427,100 @@ class TuioSource(UdpSource):
     def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
         """Return those that the newest bundle of their sender does not supersede."""
         return without_superseded(waiting)
+
+
+HEADER = "# era-haptics TUIO capture 1"
+_LINE = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ((?:[0-9a-f]{2})+)", re.ASCII | re.IGNORECASE)
+MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter of an hour
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedDatagram:
+    """One datagram and when it was sent [s] from the start of the capture."""
+
+    time: float
+    payload: bytes
+
+
+def read_capture(path: Path | str) -> list[RecordedDatagram]:
+    """Read a capture; raises InputError with file and line."""
+    path = Path(path)
+    lines = _lines(path)
+    if lines[0] != HEADER:
+        raise InputError(f"{path}, line 1: must be {HEADER!r} for a TUIO capture")
+    datagrams: list[RecordedDatagram] = []
+    for number, line in enumerate(lines[1:], start=2):
+        if line.startswith("#") or not line.strip():
+            continue
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise InputError(
+                f"{path}, line {number}: must be seconds, a space and the datagram in "
+                f"hexadecimal, got {line[:60]!r}"
+            )
+        datagram = RecordedDatagram(float(match.group(1)), bytes.fromhex(match.group(2)))
+        if len(datagram.payload) > MAX_DATAGRAM:
+            raise InputError(
+                f"{path}, line {number}: datagram must have at most {MAX_DATAGRAM} bytes, got "
+                f"{len(datagram.payload)}"
+            )
+        if datagrams and datagram.time < datagrams[-1].time:
+            raise InputError(f"{path}, line {number}: times must not decrease")
+        datagrams.append(datagram)
+    if not datagrams:
+        raise InputError(f"{path}: capture must contain datagrams")
+    return datagrams
+
+
+def _lines(path: Path) -> list[str]:
+    """Read the lines of a capture; raises InputError."""
+    try:
+        content = read_regular(path, MAX_BYTES)
+        return content.decode("utf-8-sig").replace("\r\n", "\n").removesuffix("\n").split("\n")
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check the path, which is relative to the "
+            "working directory, and its permissions"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: must be a TUIO capture, got a binary file") from error
+
+
+async def replay_capture(datagrams: Sequence[RecordedDatagram], host: str, port: int) -> None:
+    """Send datagrams to a UDP port at their recorded pace, on the event loop's clock.
+
+    Raises LinkError if the port is closed.
+    """
+    loop = asyncio.get_running_loop()
+    sender = _ReplaySocket()
+    try:
+        transport, _ = await loop.create_datagram_endpoint(lambda: sender, remote_addr=(host, port))
+    except OSError as error:
+        raise _refusal(host, port, error) from error
+    try:
+        start = loop.time()
+        for datagram in datagrams:
+            await asyncio.sleep(max(0.0, start + datagram.time - loop.time()))
+            if sender.refused is not None:
+                raise _refusal(host, port, sender.refused) from sender.refused
+            transport.sendto(datagram.payload)
+    finally:
+        transport.close()
+
+
+def _refusal(host: str, port: int, problem: Exception) -> LinkError:
+    return LinkError(
+        f"cannot send to UDP {host}:{port} ({system_message(problem)}); check the address, and "
+        "start the controller first"
+    )
+
+
+class _ReplaySocket(asyncio.DatagramProtocol):
+    """The UDP end of a replay; keeps an error that the network reported."""
+
+    def __init__(self) -> None:
+        self.refused: Exception | None = None
+
+    def error_received(self, exc: Exception) -> None:
+        """Keep the error."""
+        self.refused = exc

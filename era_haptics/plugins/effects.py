@@ -3,7 +3,7 @@
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, Level, NoStimulus, Region
 from controller.effects.kinds import effect_kind
 from controller.play.intent import Pulse
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.fields import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME, Quantity
 
 __all__ = [

@@ -3,11 +3,18 @@
 `open_source`, `ContactTracker` and what it tells are for trying one, as contacts on a plate.
 """
 
-from controller.sources.contacts import Change, Contact, ContactKey, ContactTracker
-from controller.sources.datagrams import Datagram, Datagrams, listen
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame, TouchSource, open_source
-from controller.sources.udp_source import UdpSource
+from controller.sources.touch import (
+    Change,
+    Contact,
+    ContactKey,
+    ContactTracker,
+    RejectCounter,
+    Touch,
+    TouchFrame,
+    TouchSource,
+    open_source,
+)
+from controller.sources.udp_source import Datagram, Datagrams, UdpSource, listen
 from model.errors import InputError
 from registry.threads import now
 

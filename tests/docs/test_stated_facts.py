@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import model
-from controller.sources.contacts import CONTACT_TIMEOUT
+from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.by_hand.cli import amp
 from drivers.by_hand.reaching import check_links
 from drivers.errors import CommandError

@@ -12,7 +12,7 @@ from controller.content.formats import read_content
 from controller.effects.layout import load_layout
 from controller.effects.player import read_strengths
 from controller.gateway.settings import read_token
-from controller.sources.capture import read_capture
+from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
 from drivers.judge.watching import capture
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors

@@ -42,7 +42,7 @@ MEMBERS = """
 @pytest.fixture(autouse=True)
 def resting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fingers that stay until they lift: a busy machine may repeat their frames too late."""
-    monkeypatch.setattr("controller.sources.contacts.CONTACT_TIMEOUT", 60.0)
+    monkeypatch.setattr("controller.sources.touch.CONTACT_TIMEOUT", 60.0)
 
 
 async def started(

@@ -18,7 +18,7 @@ from controller.api.client import Client
 from controller.cli.main import run
 from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder
-from controller.sources.capture import read_capture
+from controller.sources.tuio import read_capture
 from gateway_bench import wait_for
 from installed_program import ERA
 from model.rig.rig_file import example_rig_path, load_rig

@@ -9,7 +9,7 @@ import pytest
 import model
 from controller.demo.demonstration import Scene, example_scenes, run_demo
 from controller.effects.layout import load_layout
-from controller.sources.capture import read_capture
+from controller.sources.tuio import read_capture
 from long_form import shortly
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table

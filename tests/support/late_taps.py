@@ -21,7 +21,7 @@ from dataclasses import replace
 
 from chain import Chain
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import DriverError
 from model.rig.rig import Channel
 from model.vibration import Tone

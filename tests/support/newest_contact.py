@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from controller.play.intent import NO_CONTACTS, HapticIntent, Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.finger import STRONG_DB_SL
 
 

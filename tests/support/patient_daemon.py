@@ -12,7 +12,7 @@ import pytest
 from controller.cli.main import main
 from controller.daemon.daemon import Daemon
 from controller.play.loop import Controller
-from controller.sources import contacts
+from controller.sources import touch
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.line import Line
@@ -37,6 +37,6 @@ if __name__ == "__main__":
     patch = pytest.MonkeyPatch()
     wait_long(patch)
     if sys.argv[1:2] == ["--resting"]:
-        patch.setattr(contacts, "CONTACT_TIMEOUT", CONTACT_TIMEOUT)
+        patch.setattr(touch, "CONTACT_TIMEOUT", CONTACT_TIMEOUT)
         del sys.argv[1]
     sys.exit(main())

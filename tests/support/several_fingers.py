@@ -21,7 +21,7 @@ from controller.play.joint_answers import answered, selection_of
 from controller.play.layer_contents import Content, Selection
 from controller.play.planner import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.playing.contents import Layer
 from model.answer.answer import Limits

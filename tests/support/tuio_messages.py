@@ -8,8 +8,8 @@ from typing import Any
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.capture import RecordedDatagram
 from controller.sources.touch import Touch, TouchFrame
+from controller.sources.tuio import RecordedDatagram
 from examples.make_touches import tuio_datagram, write_capture
 
 

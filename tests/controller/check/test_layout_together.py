@@ -18,7 +18,7 @@ from controller.effects.player import EffectPlayer
 from controller.play.intent import HapticIntent
 from controller.play.layer_contents import Prediction
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.fields import Rectangle
 from only import phased, wants
 from several_fingers import playable, table

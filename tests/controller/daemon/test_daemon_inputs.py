@@ -18,9 +18,15 @@ from controller.cli.shown import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.layouts import TouchInputs
 from controller.gateway.metrics import exposition
-from controller.sources.contacts import Change
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchCalibration, TouchFrame, TouchSource, turned
+from controller.sources.touch import (
+    Change,
+    RejectCounter,
+    Touch,
+    TouchCalibration,
+    TouchFrame,
+    TouchSource,
+    turned,
+)
 from daemon_bench import ready_daemon, until
 from daemon_process import Journal
 from examples.make_touches import tuio_datagram

@@ -26,7 +26,7 @@ from controller.demo.recorder import (
 )
 from controller.play.layer_contents import Prediction, not_served
 from controller.play.planner import Observers, PlayReport, SilenceReport
-from controller.sources.contacts import Change, Contact, ContactKey
+from controller.sources.touch import Change, Contact, ContactKey
 from daemon_bench import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger import detection_threshold

@@ -9,7 +9,7 @@ from controller.effects.effect import EffectStimulus, NoStimulus, Region
 from controller.effects.kinds import Click, Dial
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.fields import Circle, Polygon, Rectangle
 
 CENTRE = (0.2, 0.1)

@@ -19,7 +19,7 @@ from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimu
 from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Ramp, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.fields import Circle, Polygon, Rectangle
 
 

@@ -13,7 +13,7 @@ from controller.effects.kinds import Buzz, File
 from controller.effects.layout import SurfaceLayout, load_layout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import Target
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.config.document import ConfigError
 
 ONE, TWO = (Contact(ContactKey("panel", id), 0.1 * id, 0.1, 0.0) for id in (1, 2))

@@ -16,8 +16,7 @@ from controller.play.joint_answers import (
     selection_of,
     with_ways,
 )
-from controller.sources.contacts import Contact, ContactKey
-from controller.sources.motion import AT_REST, Motion
+from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table

@@ -13,7 +13,7 @@ import pytest
 
 from chain import Chain
 from controller.play.intent import HapticIntent, Target
-from controller.sources.contacts import Contact
+from controller.sources.touch import Contact
 from drivers.errors import CommandRefused
 from drivers.host.group import Group
 from long_form import shortly

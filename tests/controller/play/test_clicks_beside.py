@@ -13,7 +13,7 @@ from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.play.layer_contents import LayerContent, Prediction, Selection, sums_db
 from controller.play.planner import PlayReport
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, fingers_on, playable, table
 from virtual_loop import in_virtual_time
 

@@ -16,7 +16,7 @@ from controller.play.layer_contents import LayerContent
 from controller.play.layers import Layers, Sets
 from controller.play.planner import ENDED, PlayReport
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.protocol.sets import LayerSet
 from model.answer import answer

@@ -13,7 +13,7 @@ from controller.content.pattern import Pattern, Transient
 from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.sources.contacts import Contact
+from controller.sources.touch import Contact
 from model.answer.stimulus import Course
 from model.vibration import Tone
 from set_chain import FINGER, OTHER, set_running

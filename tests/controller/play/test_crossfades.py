@@ -17,7 +17,7 @@ from controller.play.intent import Target
 from controller.play.joint_answers import Crossfades
 from controller.play.layers import CROSSFADE
 from controller.play.planner import PlayReport
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Limits
 from model.config.fields import Rectangle
 from model.study.contrast_maps import random_contacts

@@ -9,7 +9,7 @@ from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.layer_contents import Selection
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from several_fingers import LEFT, RIGHT, chosen_for, playable, table
 
 CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]

@@ -13,7 +13,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.play.intent import Pulse, Target
 from controller.play.layer_contents import Content, LayerContent
 from controller.play.layers import Layers, Sets
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Placement

@@ -12,7 +12,7 @@ import pytest
 from controller.play.intent import HapticIntent, Pulse, Target
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Answer, Limits
 from model.answer.stimulus import Finger, Stimulus
 from model.errors import InputError

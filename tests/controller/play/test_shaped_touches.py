@@ -15,8 +15,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
 from controller.play.intent import HapticIntent, Target
 from controller.play.planner import ENDED
-from controller.sources.contacts import Change, Contact, ContactTracker
-from controller.sources.touch import Touch, TouchFrame
+from controller.sources.touch import Change, Contact, ContactTracker, Touch, TouchFrame
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Envelope
 from model.answer.answer import Layer

@@ -13,7 +13,7 @@ from chain import FarEnd
 from controller.effects.player import EffectPlayer
 from controller.play.layer_contents import leaks_db_sl
 from controller.play.routing import CountedClocks
-from controller.sources.contacts import Contact, ContactKey
+from controller.sources.touch import Contact, ContactKey
 from drivers.host.group import Group
 from drivers.protocol.definition import CLOCK_UNKNOWN
 from model.answer.answer_report import Timing

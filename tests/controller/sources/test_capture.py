@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.cli.main import run
-from controller.sources.capture import (
+from controller.sources.tuio import (
     HEADER,
     MAX_BYTES,
     RecordedDatagram,

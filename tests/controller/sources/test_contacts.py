@@ -9,8 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.contacts import CONTACT_TIMEOUT, ContactKey, ContactTracker
-from controller.sources.touch import Touch, TouchFrame, turned
+from controller.sources.touch import (
+    CONTACT_TIMEOUT,
+    ContactKey,
+    ContactTracker,
+    Touch,
+    TouchFrame,
+    turned,
+)
 from model.finger import MAX_CONTACTS
 from model.structure.plate import Material, Plate
 

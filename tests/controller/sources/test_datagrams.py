@@ -13,11 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.contacts import Change, ContactTracker
-from controller.sources.datagrams import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame
+from controller.sources.touch import Change, ContactTracker, RejectCounter, Touch, TouchFrame
 from controller.sources.tuio import TuioReader, without_superseded
+from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from examples.make_touches import tuio_datagram
 from model.structure.plate import Plate
 from paper_plate import make_paper_rig

@@ -18,11 +18,13 @@ from controller.sources.evdev import (
     PRESSED_KEYS,
     EvdevSource,
     InputDevice,
+    InputEvent,
+    SlotState,
+    as_slot_event,
     eviocgabs,
     eviocgmtslots,
     parse_events,
 )
-from controller.sources.slots import InputEvent, SlotState, as_slot_event
 from controller.sources.touch import TouchFrame, open_source
 from model.errors import InputError
 from virtual_loop import run_virtual

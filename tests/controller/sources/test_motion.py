@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.sources.motion import OVER, Motion
+from controller.sources.touch import OVER, Motion
 
 FRAME = 0.010  # s
 

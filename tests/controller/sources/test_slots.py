@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.sources.slots import PanelReport, SlotReader
+from controller.sources.evdev import PanelReport, SlotReader
 from model.errors import InputError
 
 Shown: TypeAlias = list[tuple[float, dict[int, tuple[float, float]]]]

@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pythonosc.osc_message_builder import OscMessageBuilder
 
-from controller.sources.reject_counter import RejectCounter
-from controller.sources.touch import Touch, TouchFrame
+from controller.sources.touch import RejectCounter, Touch, TouchFrame
 from controller.sources.tuio import TuioReader, TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError

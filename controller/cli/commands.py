@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from controller.api.summaries import SUMMARIES
-from controller.cli.daemon import (
+from controller.cli.daemon_cli import (
     DASHBOARD,
     DashboardCommand,
     arm,
@@ -21,7 +21,7 @@ from controller.cli.daemon import (
     watch,
 )
 from controller.cli.demo import demo
-from controller.cli.rig import rig_app
+from controller.cli.rig_cli import rig_app
 from drivers.by_hand import cli as by_hand
 from model.errors import InputError
 

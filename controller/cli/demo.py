@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from controller.cli.daemon import DASHBOARD
+from controller.cli.daemon_cli import DASHBOARD
 from model.commands.options import (
     ExactOption,
     JsonOption,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from controller.cli.daemon import Socket, connected
+from controller.cli.daemon_cli import Socket, connected
 from model.commands.options import JsonOption, print_report
 from model.config.fields import parse_point
 from model.errors import InputError

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from controller.api.link import Notification
 from controller.api.server import TOPICS
 from controller.cli.commands import app
+from controller.cli.daemon_cli import show_event
 from controller.cli.main import run
-from controller.cli.shown import show_event
 from controller.daemon.daemon import run_daemon
 from controller.process.log import LogThread
 from daemon_bench import write_daemon

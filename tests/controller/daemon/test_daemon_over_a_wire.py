@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.jsonrpc import ErrorCode, RpcError
-from controller.cli.shown import show_status
+from controller.cli.daemon_cli import show_status
 from controller.daemon.children import gateway_options
 from controller.effects.layout import default_effects
 from controller.gateway.settings import read_token

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import controller.cli.identify
+import controller.cli.rig_cli
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from model.calibration.responses import Responses, write_responses
@@ -95,7 +95,7 @@ def test_commands_say_so_and_write_no_rig(
 ) -> None:
     """By a file, and of what amplifiers would have measured."""
     here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
-    monkeypatch.setattr(controller.cli.identify, "measured_by_amplifiers", lambda *_, **__: here)
+    monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, turned, rig)
     typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)

@@ -1,8 +1,25 @@
-"""Plates, ERAs and exciters by the keys of a rig file."""
+"""Plates, ERAs and exciters by the keys of a rig file.
 
+Amplifiers of a rig for scripts: opened by the rig's URLs and limits.
+
+Calibration of a rig by responses measured on it.
+"""
+
+from pathlib import Path
 from typing import Any
 
+from controller.play.routing import route
+from drivers.by_hand.actions import BlockingAmplifier
+from drivers.playing.contents import Layer as AmplifierLayer
+from era_haptics.drive import Played, expect_rig, layers_of
+from model.calibration.calibrate import Calibration
+from model.calibration.calibrate import calibrate as fit
+from model.calibration.responses import read_measured, responses_of
+from model.diagnosis.verdict import check_consistency
+from model.errors import InputError, expect_path, shown
+from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
+from model.rig.rig import Rig
 from model.rig.rig_writing import checked_keys
 from model.rig.sections import PlateSection
 
@@ -37,3 +54,78 @@ class Exciter(dict[str, Any]):
     def __init__(self, **keys: Any) -> None:
         keys = {"kind": "exciter", **keys}
         super().__init__(checked_keys("era.Exciter", ExciterSection, keys))
+
+
+def open_amplifier(
+    rig: Rig, name: str | None = None, *, url: str | None = None
+) -> BlockingAmplifier:
+    """Make an amplifier of the rig, open within a `with` block and disarmed after it.
+
+    name: optional if the rig has only one; url: instead of the rig's. Commands beyond the rig's
+    limits are refused. Raises InputError for an unknown name; in the block CommandError for an
+    invalid URL, LinkError without a reply, CommandRefused.
+
+    Example:
+        >>> url = "sim://examples/paper_plate.yaml"
+        >>> with era.open_amplifier(rig, url=url) as amplifier:
+        ...     print(amplifier.capabilities["channels"], "channels")
+        4 channels
+    """
+    expect_rig(rig)
+    known = tuple(rig.amplifiers)
+    chosen = known if name is None else tuple(each for each in known if each == name)
+    if len(chosen) != 1:
+        raise InputError(f"name must be an amplifier of the rig, {', '.join(known)}, got {name!r}")
+    if url is not None and not isinstance(url, str):
+        raise InputError(f"url must be text such as 'sim://', got {shown(url)}")
+    (found,) = chosen
+    return BlockingAmplifier(url or rig.amplifiers[found], limits=rig.limits)
+
+
+def commands_for(rig: Rig, drive: Played) -> dict[str, tuple[AmplifierLayer, ...]]:
+    """Convert to layers by name of the amplifier, for its `play` and `apply`.
+
+    One for each layer of an answer, and for each of its side bands, with its ramp, onset and
+    ending; channels by the rig's wiring. Raises InputError for a drive that the rig cannot play.
+
+    Example:
+        >>> layers = era.commands_for(rig, only)["main"]
+        >>> [(tone.channel, round(tone.level, 3)) for tone in layers[0].tones]
+        [(0, 0.027), (1, 0.038), (2, 0.005), (3, 0.008)]
+    """
+    expect_rig(rig)
+    voices = [voice for layer in layers_of(drive, rig) for voice in layer.voices]
+    routed = [
+        route(
+            each.excitation,
+            rig,
+            ramp=each.ramp,
+            number=number,
+            onset=each.onset,
+            ending=each.ending,
+        )
+        for number, each in enumerate(voices)
+    ]
+    return {name: tuple([each[name] for each in routed]) for name in rig.amplifiers}
+
+
+def calibrate(
+    rig: Rig, measured: Path | str, *, all_scales: bool = False, progress: Progress = unseen
+) -> Calibration:
+    """Fit a rig to measured responses, a .csv, .uff or .unv file, as `era calibrate` does.
+
+    all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
+    the fits done and all. The result's `rig` has the fitted values and their uncertainty, its
+    `parameters` their standard errors; use it only if `is_good`. Raises InputError for responses
+    that are not what they claim, by their cause.
+
+    Example:
+        >>> fit = era.calibrate(rig, "examples/measured.csv")
+        >>> fit.is_good
+        True
+    """
+    expect_rig(rig)
+    check_progress(progress)
+    responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
+    screened = check_consistency(rig, responses)
+    return fit(rig, responses, screened, all_scales=all_scales, progress=progress)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import lru_cache
 
-from era_haptics.arguments import (
+from era_haptics.drive import (
     Fingers,
     Positions,
     as_fingers,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from era_haptics.arguments import as_points
-from era_haptics.drive import layers_of
+from era_haptics.drive import as_points, layers_of
 from model.answer.answer import Layer
 from model.rig.rig import Channel
 from paper_plate import make_paper_rig

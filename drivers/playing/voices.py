@@ -56,7 +56,7 @@ class Transition:
 
     Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
     lasts one step; a step of 0 changes at once. half [s], radius: by which its start and its first
-    amplitude may differ, see `drivers.playing.uncertain`.
+    amplitude may differ, see `era_haptics.lab.expected_output`.
     """
 
     start: float

@@ -16,8 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from era_haptics.lab.paper_figures import (
+    SWEEP,
+    PaperFigure,
+    pair_map,
+    paper_figures,
+    with_stiffness,
+)
 from model.fem import Mesh
-from model.figures.paper import SWEEP, PaperFigure, pair_map, paper_figures, with_stiffness
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig, diagonal_pair
 from model.rig.rig_file import load_rig

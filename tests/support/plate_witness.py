@@ -12,7 +12,6 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from drivers.judge.outputs import one_of
 from drivers.judge.watching.amplifier_session import AmplifierSession
 from drivers.judge.watching.capture import Direction
 from drivers.judge.watching.config import WitnessConfig
@@ -22,6 +21,7 @@ from drivers.judge.watching.watched_wire import RECOVERY
 from drivers.judge.watching.witness import Witness
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet, is_vibrating
+from era_haptics.lab.expected_output import one_of
 
 RULES = {
     "justified": "no vibration is commanded without a contact",

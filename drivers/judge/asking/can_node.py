@@ -17,7 +17,6 @@ from drivers.judge.asking.client import (
     require_in_time,
 )
 from drivers.judge.asking.subject import Subject
-from drivers.judge.states import FAULT, OFF, REACTING
 from drivers.protocol.definition import (
     FAULTS,
     MESSAGES,
@@ -28,6 +27,7 @@ from drivers.protocol.definition import (
     name_of,
 )
 from drivers.wires.can_frames import CANOPEN, cob_id
+from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads
 
 _OPERATIONAL, _PRE_OPERATIONAL = 5, 127

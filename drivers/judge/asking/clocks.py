@@ -7,8 +7,8 @@ from drivers.judge.asking.check import driving, reading
 from drivers.judge.asking.client import Untimed, Violation, expect, require
 from drivers.judge.asking.material import Rows, send
 from drivers.judge.asking.subject import RATE, Subject
-from drivers.judge.outputs import DRIFT
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, HIGH_TIME, QUANTITIES
+from era_haptics.lab.expected_output import DRIFT
 from registry import threads
 
 _PLACE = "protocol.md#the-clock"

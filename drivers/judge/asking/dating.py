@@ -5,8 +5,8 @@ by u - r to u - s. What is common to all these intervals is short.
 """
 
 from drivers.judge.asking.client import When
-from drivers.judge.outputs import DRIFT
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, QUANTITIES, SPAN, ahead
+from era_haptics.lab.expected_output import DRIFT
 
 _LONG = 5.0  # s; without a reading, after which it may have gone round
 _BESIDE = 0.0002  # s; by which levels may be older than the clock beside them

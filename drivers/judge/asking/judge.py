@@ -3,11 +3,11 @@
 from dataclasses import replace
 from functools import partial
 
-from drivers.judge.amplifier import ExpectedAmplifier
 from drivers.judge.asking.client import Violation, require_in_time
-from drivers.playing.uncertain import Interval
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, achieved_layer, achieved_problem
+from era_haptics.lab.expected_amplifier import ExpectedAmplifier
+from era_haptics.lab.expected_output import Interval
 
 
 class Judge(ExpectedAmplifier):

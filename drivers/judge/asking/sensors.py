@@ -16,9 +16,9 @@ from drivers.judge.asking.client import (
 )
 from drivers.judge.asking.material import layer, send
 from drivers.judge.asking.subject import Subject
-from drivers.judge.states import ROUNDED
 from drivers.protocol.definition import NO_CHANNEL, READING_STATES, ahead, sensor_reading
 from drivers.protocol.records import Record, Values
+from era_haptics.lab.expected_amplifier import ROUNDED
 
 _PLACE = "protocol.md#sensors"
 _WINDOW = 100  # ms

@@ -35,8 +35,6 @@ from drivers.judge.asking.material import (
     send,
     stage,
 )
-from drivers.judge.outputs import SAMPLE
-from drivers.judge.states import OFF
 from drivers.protocol.definition import (
     ENABLED,
     HIGH_STEPS,
@@ -52,6 +50,8 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.wires.wire import reply_words
+from era_haptics.lab.expected_amplifier import OFF
+from era_haptics.lab.expected_output import SAMPLE
 from registry import threads
 
 LEVEL = 0.2

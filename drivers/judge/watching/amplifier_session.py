@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from drivers.judge.outputs import silent
 from drivers.judge.watching.capture import ReportViolation
 from drivers.judge.watching.config import AmplifierConfig
 from drivers.judge.watching.watched_amplifier import WatchedAmplifier
@@ -18,6 +17,7 @@ from drivers.playing.playback import Playback
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_newer_token
+from era_haptics.lab.expected_output import silent
 
 _TOKENS_KEPT = 16  # of commits
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-from drivers.judge.amplifier import FEEDING as FEEDING
 from drivers.judge.watching.capture import Direction
 from drivers.protocol.definition import (
     ENABLED,
@@ -29,6 +28,7 @@ from drivers.protocol.definition import HELLO as HELLO_NUMBER
 from drivers.protocol.records import Record, Refusal, Values
 from drivers.protocol.sets import is_last
 from drivers.wires.serial_frames import NEUTRAL, FrameReader, unpack_identity, unpack_words
+from era_haptics.lab.expected_amplifier import FEEDING as FEEDING
 
 HELLO = "Hello"
 A_READ = "a read"

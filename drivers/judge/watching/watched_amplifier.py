@@ -6,8 +6,6 @@ A request without a reply may have been carried out: the next status says so.
 import math
 from functools import partial
 
-from drivers.judge.amplifier import ExpectedAmplifier
-from drivers.judge.states import OFF
 from drivers.judge.watching.capture import ReportViolation
 from drivers.judge.watching.decoded import (
     CHANGING,
@@ -16,9 +14,10 @@ from drivers.judge.watching.decoded import (
     Request,
     is_carried_out,
 )
-from drivers.playing.uncertain import Interval
 from drivers.protocol.definition import REACTION, REFUSALS, STATUS, name_of
 from drivers.protocol.records import Values
+from era_haptics.lab.expected_amplifier import OFF, ExpectedAmplifier
+from era_haptics.lab.expected_output import Interval
 
 _LEFT = 0.011  # s; tolerance of the reported time left of the watchdog, as that of a host
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from controller.report.collect import MAX_DUMPS, collect, shown, versions
+from era_haptics.lab.report import MAX_DUMPS, collect, shown, versions
 from model.rig.rig_file import example_rig_path
 
 HOME = Path("/home/user")
@@ -102,7 +102,7 @@ def test_versions_list_what_requirements_name(monkeypatch: pytest.MonkeyPatch) -
         *("name [fred,bar] @ http://foo.com ; python_version=='2.7'", "name;os_name=='a'"),
         "numpy >=2 ; extra == 'x'",
     ]
-    monkeypatch.setattr("controller.report.collect.requires", lambda _: lines)
+    monkeypatch.setattr("era_haptics.lab.report.requires", lambda _: lines)
     packages = versions()["packages"]
     assert packages.pop("numpy")[0].isdigit()
     assert packages == dict.fromkeys(["A", "A.B-C_D", "aa", "name"], "not installed")

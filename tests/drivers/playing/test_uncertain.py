@@ -4,10 +4,9 @@ import random
 
 import pytest
 
-from drivers.judge.outputs import ExpectedOutputs
 from drivers.playing.playback import Playback
-from drivers.playing.uncertain import UncertainPlayback
 from drivers.protocol.sets import Command, Envelope, LayerSet
+from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
 
 CHANNELS, LAYERS = 2, 3
 FREQUENCIES = (400, 2200)  # 20 and 110 Hz

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model.commands.figure_cli import figure_app
+from era_haptics.lab.paper_figures import figure_app
 from model.rig.rig_file import example_rig_path
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")

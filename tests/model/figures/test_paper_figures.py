@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tables import claims, stiffness_study, tables
 
+from era_haptics.lab.paper_figures import SWEEP, PaperFigure, equal_area_points, paper_figures
 from long_form import shortly
 from model.errors import InputError
 from model.figures import (
@@ -13,7 +14,6 @@ from model.figures import (
     levels_figure,
     weak_cells_figure,
 )
-from model.figures.paper import SWEEP, PaperFigure, equal_area_points, paper_figures
 from model.finger import Grid
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import FOUR_ERA_LAYOUTS, alike

@@ -1,7 +1,11 @@
-"""Collects a bug report into a file: versions, configuration, daemon status, fault dumps.
+"""Collect what a bug report needs in one file.
+
+Collects a bug report into a file: versions, configuration, daemon status, fault dumps.
 
 Of keys that this program does not know only the names remain. Free text, as in causes and names, is
 not searched: whoever sends a report looks at it before.
+
+`era report`: what a bug report needs, in one file.
 """
 
 import json
@@ -15,8 +19,9 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from pydantic.json_schema import models_json_schema
 
 from controller.api.client import Client
@@ -235,3 +240,33 @@ def _properties(schema: dict[str, Any] | list[Any]) -> Iterator[str]:
     for each in schema.values() if isinstance(schema, dict) else schema:
         if isinstance(each, dict | list):
             yield from _properties(each)
+
+
+def report(
+    configs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
+        "era-report.zip"
+    ),
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
+    ] = None,
+) -> None:
+    """Collect versions, files and daemon state for a bug report.
+
+    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
+    """
+
+    for path in configs or ():
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check its name and folder")
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
+    collected = collect(configs or [], socket=socket, home=home)
+    write_zip(output, collected)
+    for name, text in collected.files.items():
+        print(f"  {name}: {len(text)} characters")
+    for what in collected.missing:
+        print(f"  skipped: {what}")
+    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")

@@ -1,1 +1,0 @@
-"""Collect what a bug report needs in one file."""

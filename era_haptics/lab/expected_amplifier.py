@@ -1,0 +1,647 @@
+"""An amplifier as it must be after what it was sent: sessions, tokens, sets and what plays.
+
+What it was sent was carried out at some time between the request and its reply, and what it shows
+was true at some time between, so both are compared with all of that interval. Nothing is known at
+first: the first status says how it is.
+
+The set under way to an amplifier: its parts as they were sent, and what is said of them.
+
+The states of an amplifier as they must be: latch, watchdog, faults, high voltage.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import TypeAlias
+
+from drivers.playing.playback import Playback
+from drivers.protocol.definition import (
+    ENABLED,
+    FAULTS,
+    LATCHED,
+    MESSAGES,
+    NO_CHANNEL,
+    QUANTITIES,
+    STAGED_LIFE,
+    STATES,
+    has_flag,
+    name_of,
+)
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import (
+    FLAGS,
+    TONE,
+    Assembly,
+    LayerSet,
+    Problem,
+    achieved_problem,
+    is_newer_token,
+    token_after,
+    unpack_layers,
+)
+from era_haptics.lab.expected_output import (
+    DRIFT,
+    ExpectedClock,
+    ExpectedOutputs,
+    Interval,
+    Report,
+    Unclear,
+    one_of,
+)
+
+
+class ExpectedSet:
+    """The newest set to one amplifier; times [s]. is_exact: it plays to the word, as is said.
+
+    staged: token of the set that is staged, 0 for none.
+    """
+
+    def __init__(self) -> None:
+        self.is_exact = True
+        self._whole: tuple[int, tuple[LayerSet, ...]] = (0, ())  # token, and layers
+        self._replaced = 0  # token of a set of which it is known what really plays
+        self.drop()
+
+    def drop(self) -> None:
+        """Discard what is collected or staged."""
+        self._parts = Assembly()  # that are kept
+        self.staged = 0
+        self._began: Interval = (-math.inf, -math.inf)  # when the first part came
+        self._is_unclear = False  # whether a part came before the set expired, or after
+
+    def keep(self, part: Values, when: Interval) -> bool:
+        """Note a part but the last that comes between two times; returns whether it is kept."""
+        token = part["token"]
+        self._expire(when)
+        if token != self._parts.token:
+            if not is_newer_token(token, self._parts.token):
+                return False
+            self.drop()
+            self._began = when
+        return not self.staged and self._parts.keep(part, when[1])
+
+    def sent(self, last: Values) -> str:
+        """Note the last part of a set that is sent; returns what is wrong with it, or ""."""
+        stream = self._parts.whole(last)
+        try:
+            if not isinstance(stream, int):
+                self._whole = last["token"], unpack_layers(stream)
+        except Refusal as refusal:
+            return str(refusal)
+        return ""
+
+    def whole(self, token: int) -> tuple[LayerSet, ...] | None:
+        """Return the layers of a set, all parts of which were sent."""
+        return self._whole[1] if token == self._whole[0] else None
+
+    def replace(self, token: int, layers: tuple[LayerSet, ...]) -> None:
+        """Note what an amplifier really plays of a set."""
+        self._whole, self.is_exact, self._replaced = (token, layers), True, token
+
+    def staged_until(self, token: object) -> Interval:
+        """Return until when a set is kept, at the least and at the most, if it is staged."""
+        if not self.staged or token != self.staged:
+            return -math.inf, -math.inf
+        return self._began[0] + STAGED_LIFE, self._began[1] + STAGED_LIFE
+
+    def taken(self, last: Values, reply: Values, when: Interval) -> Sequence[int] | None:
+        """Note the reply to the last part of a set, which came within an interval.
+
+        Returns what it must say: missing, staged and played; None where its set expired just then.
+        """
+        token = last["token"]
+        self._expire(when)
+        is_unclear, is_under_way = self._is_unclear, token == self._parts.token
+        stream = [] if is_under_way and self.staged else self._parts.whole(last)
+        if reply["staged"] or reply["played"]:
+            self.is_exact = bool(reply["exact"]) or token == self._replaced
+            if not is_under_way:
+                self.drop()
+                self._parts, self._began = Assembly(token, last["parts"], when[1]), when
+            self.staged = token if reply["staged"] else 0
+            self._began = self._began[0], (when[1] if is_unclear else self._began[1])
+        elif is_under_way:
+            self.staged = 0
+            self._parts.collected.pop(reply["missing"], None)
+        if is_unclear:
+            return None
+        if isinstance(stream, int):
+            return stream, 0, 0
+        return 0, 1 - last["now"], last["now"]
+
+    def refused(self, last: Values) -> None:
+        """Note that a last part was refused, with its set where all others are there."""
+        is_own = last["token"] == self._parts.token and not self.staged
+        is_one = last["index"] < last["parts"] == self._parts.count
+        if is_own and is_one and not isinstance(self._parts.whole(last), int):
+            self.drop()
+
+    def _expire(self, when: Interval) -> None:
+        """Drop what has expired by an interval."""
+        lived = when[0] - self._began[1], when[1] - self._began[0]
+        if lived[0] > STAGED_LIFE:
+            self.drop()
+        self._is_unclear |= lived[0] <= STAGED_LIFE < lived[1]
+
+
+ROUNDED = 0.002  # s; of times in milliseconds
+_TRIP, FADE, _SETTLING = 0.005, 0.005, 0.01  # s; until a trip, of a fault, until a state shows
+OFF, STOPPED = STATES["SWITCH_ON_DISABLED"], STATES["QUICK_STOP_ACTIVE"]
+REACTING, FAULT = STATES["FAULT_REACTION_ACTIVE"], STATES["FAULT"]
+SWITCHED_ON, _READY = STATES["SWITCHED_ON"], STATES["READY_TO_SWITCH_ON"]
+DISARMED = STATES["NOT_READY"], OFF, _READY
+_FALLING = {SWITCHED_ON: OFF, REACTING: FAULT}
+"""States until all is silent, and then."""
+_NEVER: Interval = (-math.inf, math.inf)
+
+
+class ExpectedStates:
+    """The states of one amplifier; state and latch are None while unknown; times [s].
+
+    report: takes what is wrong, always: what nothing excuses, unclear: why that is not known.
+    may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
+    of the watchdog. fed: when that was fed last, silent: when all that fades is silent. is_shown:
+    it has shown its state itself. last_status: since when nothing was seen. can: its capabilities.
+    """
+
+    def __init__(
+        self,
+        report: Report,
+        always: Report,
+        *,
+        unclear: Unclear | None = None,
+        may_fail: bool = True,
+        slack: float = 0.0,
+        left_slack: float = ROUNDED,
+    ) -> None:
+        self.can: Values = {}
+        self.report, self._always, self._unclear = report, always, unclear
+        self._may_fail, self.slack, self._left_slack = may_fail, slack, left_slack
+        self.forget()
+        self.last_status = -math.inf
+
+    def _expect(self, rule: str, time: float, what: str, must: object, seen: object) -> None:
+        """Report what is not as it must be."""
+        if must != seen:
+            self.report(rule, time, what, must=must, seen=seen)
+
+    def forget(self, cause: str = "what was not heard") -> None:
+        """Treat all as unknown until the next status."""
+        self.state: int | None = None
+        self.fault = FAULTS["NONE"]
+        self.latch: int | None = None
+        self.watchdog, self.fed, self.silent = math.inf, _NEVER, _NEVER
+        self.is_shown = True
+        self._faults: deque[tuple[int, Interval]] = deque(maxlen=2)  # the newest first, and when
+        self._settle(cause)
+        self.outputs.forget()
+
+    def _settle(self, cause: str, when: Interval = _NEVER) -> None:
+        """Treat all channels as silent from some time between two on."""
+        self.outputs = ExpectedOutputs(
+            self.can,
+            report=self.report,
+            unclear=self._unclear,
+            slack=self.slack,
+            cause=cause,
+            began=when,
+        )
+
+    def identified(self, capabilities: Values) -> None:
+        """Note its capabilities."""
+        if capabilities != self.can:
+            self.can = capabilities
+            self._settle("what was not heard")
+            self.outputs.forget()
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether it is armed, as far as is known."""
+        return self.state == ENABLED
+
+    @property
+    def is_in_fault(self) -> bool:
+        """Whether it is in a fault, or reacting to one."""
+        return self.state in (REACTING, FAULT)
+
+    @property
+    def expiry(self) -> Interval:
+        """When the watchdog trips if it is not fed, at the earliest and at the latest."""
+        if self.watchdog == math.inf:  # not known
+            return _NEVER
+        early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
+        return self.fed[0] + early - ROUNDED, self.fed[1] + late
+
+    # What it does
+
+    def _trip(self, fault: int, since: Interval, cause: str) -> None:
+        self.fault = fault
+        self._latch_again()
+        self._faults.appendleft((fault, since))
+        is_whole = fault == FAULTS["WATCHDOG"] and not self._may_fail
+        self._fall_silent(REACTING, since, FADE, cause, has_floor=is_whole)
+
+    def _latch_again(self) -> None:
+        self.latch = None if self.latch is None else token_after(self.latch)
+
+    def _fall_silent(
+        self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
+    ) -> None:
+        self.state = state
+        self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
+
+    def _clear(self, latch: int, state: int, when: Interval) -> None:
+        """Leave a stop or a fault, once all is silent, where its cause is gone."""
+        is_gone = self.fault in (FAULTS["NONE"], FAULTS["WATCHDOG"])
+        is_off = state in DISARMED and when[1] >= self.silent[0] - ROUNDED
+        if is_off and self.latch is not None:
+            self._expect("latched", when[1], "latch of Clear", self.latch, latch)
+        if is_off or (is_gone and self._is_silent(when)):
+            self.state, self.fault = OFF, FAULTS["NONE"]
+            self.outputs.cause = "Clear"
+
+    # What it shows
+
+    def note_state(self, shown: Values, when: Interval) -> bool:
+        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
+        now, fault, latch, end = shown["state"], shown["fault"], shown["latch"], when[1]
+        if self.state is None:
+            self._adopt(shown, when)
+        before = self.state
+        if now in (REACTING, FAULT) and before in (ENABLED, SWITCHED_ON, STOPPED):
+            self._tripped(fault, when)
+        known = self._states(when)
+        if now not in known:
+            what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
+            must = one_of(map(self._name_of, known))
+            self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
+            return False
+        if fault and fault != self.fault and self._may_fail and not self.is_shown:
+            self.fault = fault  # which came before the watchdog, of which nothing was seen
+            self._faults[0] = fault, (self.last_status, end)
+        rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
+        self._expect(rule, end, f"fault after {cause}", self.fault, fault)
+        if self.latch is not None:
+            self._expect("latched", end, f"latch after {cause}", self.latch, latch)
+        self.state, self.fault, self.latch, self.is_shown = now, fault, latch, True
+        return True
+
+    def _is_silent(self, when: Interval) -> bool:
+        """Whether it must have been silent, and its state show so, between two times."""
+        return when[0] > self.silent[1] + _SETTLING + ROUNDED + self.slack
+
+    def _states(self, when: Interval) -> list[int]:
+        """Return the states in which it may be between two times."""
+        here = self.state or 0
+        if here not in _FALLING:
+            return [0, OFF] if here == STATES["NOT_READY"] else [here]
+        states = [] if self._is_silent(when) else [here]
+        if when[1] > self.silent[0] - ROUNDED - self.slack:
+            states.append(_FALLING[here])
+        return states
+
+    def _rule_against(self, now: int) -> str:
+        """Which rule a state breaks."""
+        if not self.is_shown:
+            return "watchdog" if now == ENABLED else "latched"
+        if now == ENABLED:
+            return "armed"
+        return "latched" if self.state in LATCHED else "state"
+
+    def _tripped(self, fault: int, when: Interval) -> None:
+        """Check a transition into a fault: the watchdog not before its time."""
+        since = min(self.last_status, when[1]), when[1]
+        if fault == FAULTS["WATCHDOG"]:
+            early, late = self.expiry
+            enabled_until = when[1] if self.is_enabled else self.outputs.began[1]
+            if enabled_until < early - self.slack:
+                what = f"time of the watchdog ({self.outputs.cause})"
+                must = f"from {early:.4f} to {late:.4f} s"
+                self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")
+            since = self._expired_by(when[1])
+        elif fault == FAULTS["NONE"] or not self._may_fail:
+            must, seen = "WATCHDOG" if fault else "one", name_of(FAULTS, fault)
+            self.report("state", when[1], "fault of a fault reaction", must=must, seen=seen)
+        self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
+
+    def _expired_by(self, time: float) -> Interval:
+        """Return between which times the watchdog tripped that has tripped by a time."""
+        early, late = self.expiry
+        first = min(max(early, self.last_status), time)
+        return first, max(min(late, time), first)
+
+    def _adopt(self, shown: Values, when: Interval) -> None:
+        """Go on with a status as it is."""
+        state = shown["state"]
+        if state != self.state:
+            self.state, self.silent = state, (-math.inf, math.inf)
+            if state in (*DISARMED, FAULT):
+                self._settle(self._name_of(state), when)
+                self.silent = -math.inf, when[1]
+            elif state == ENABLED:
+                self.fed = -math.inf, when[1]
+                self.outputs.forget()
+            if self.is_in_fault:
+                self._faults.appendleft((shown["fault"], (-math.inf, when[1])))
+        self.fault, self.latch = shown["fault"], shown["latch"]
+        self.is_shown, self.last_status = True, when[0]
+
+    def _name_of(self, state: int | None) -> str:
+        return "unknown" if state is None else name_of(STATES, state)
+
+    def _check_voltage(self, shown: Values, when: Interval) -> None:
+        """Check high voltage, and the interlock of one that has it."""
+        is_fading = when[1] < self.silent[0] - ROUNDED - self.slack and any(shown["levels"])
+        must_be = self.state in (ENABLED, SWITCHED_ON) or (self.state == STOPPED and is_fading)
+        where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
+        if must_be:
+            is_open = has_flag(shown, "interlock_open")
+            self._expect("high_voltage", end, f"interlock_open {where}", False, is_open)
+        if must_be or self._is_silent(when):
+            is_on = has_flag(shown, "high_voltage")
+            self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
+
+    def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
+        """Check a list of faults: the newest first, those that were seen, of their ages."""
+        ages = [each["age"] for each in listed]
+        self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
+        unfed = {each["channel"] for each in listed if each["fault"] == FAULTS["WATCHDOG"]}
+        self._expect("faults", when[1], "channels of watchdog faults", set(), unfed - {NO_CHANNEL})
+        faults = [(each["fault"], each["age"] / 1000) for each in listed]
+        left = iter(faults)
+        for fault, since in self._faults:
+            drift = DRIFT * (when[1] - since[0])
+            slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
+            low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
+            if not any(each == fault and low <= age <= high for each, age in left):
+                must = f"{name_of(FAULTS, fault)} of {low:.3f} to {high:.3f} s ago, in its turn"
+                self.report("faults", when[1], "listed faults", must=must, seen=faults)
+                return
+
+
+_WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
+FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
+"""Requests that feed the watchdog unless they are refused."""
+_ONLY_IN = {
+    **dict.fromkeys(("Set", "Commit", "Silence"), (ENABLED,)),
+    "SetAddress": DISARMED,
+    "Arm": (*DISARMED, SWITCHED_ON, ENABLED),
+}
+"""States in which alone a request is accepted."""
+_NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
+"""Refusals of a part by what it does not hold."""
+_Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
+"""A committed set: its moment, token and layers, and whether it plays to the word."""
+
+
+class ExpectedAmplifier(ExpectedStates):
+    """One amplifier; token and session are None while unknown; times [s]."""
+
+    def forget(self, cause: str = "what was not heard") -> None:
+        """Treat all as unknown until the next status."""
+        self.token: int | None = None
+        self.session: int | None = None
+        self.sets = ExpectedSet()
+        self.clock = ExpectedClock(self.report, self.slack)
+        self._waiting: _Waiting | None = None
+        self._started = -math.inf  # by when a set that has waited has surely started
+        super().forget(cause)
+
+    @property
+    def to_play(self) -> Playback:
+        """What it plays, with the set that waits, from its moment on."""
+        if self._waiting is None:
+            return self.outputs.playback
+        when, token, layers, _ = self._waiting
+        playback = self.outputs.playback.copied()
+        playback.commit(layers, token, sum(when) / 2)
+        return playback
+
+    # What it does
+
+    def advance(self, time: float) -> None:
+        """Apply what must have happened without a request until now."""
+        if self.is_enabled and time > self.expiry[1] + ROUNDED + self.slack:
+            self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
+            self.is_shown = False
+        if self._waiting is not None and time > self._waiting[0][1] + self.slack:
+            self._start_waiting()
+
+    def _fall_silent(
+        self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
+    ) -> None:
+        self.sets.drop()
+        if self.may_start(when):  # so that what falls silent is unknown
+            self.outputs.forget()
+        self._waiting = None
+        super()._fall_silent(state, when, ramp, cause, has_floor=has_floor)
+
+    def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
+        """Apply a request that was carried out between two times, and compare its reply."""
+        self.advance(when[0])
+        self._check_allowed(name, values, when[1])
+        is_late = reply.get("state") in (REACTING, FAULT)  # it may have expired before
+        if name in FEEDING and self.state in (None, ENABLED) and not is_late:
+            self.fed = when
+        match name:
+            case "Set":
+                self._take(values, reply, when)
+            case "GetAchieved":
+                self._check_achieved(values["layer"], reply, when)
+            case "GetFaults":
+                self._check_faults(reply["faults"], when)
+            case _:
+                self.carry_out(name, values, reply, when)
+        if "levels" in reply:
+            self.check(reply, when)
+
+    def _check_allowed(self, name: str, values: Values, time: float) -> None:
+        """Only the session that is held plays and feeds; nothing plays unless armed."""
+        session, token = values.get("session"), values.get("token", 0)
+        if name in FEEDING and self.is_enabled and self.session not in (None, session):
+            self.report("session", time, f"session of {name}", must=self.session, seen=session)
+        if self.token and token not in (0, self.token) and not is_newer_token(token, self.token):
+            must = f"newer than {self.token}"
+            self._always("token", time, f"token of {name}", must=must, seen=token)
+        if self.state not in (None, *_ONLY_IN.get(name, (self.state,))):
+            rule = "latched" if name == "Arm" else "state" if name == "SetAddress" else "enabled"
+            rule = rule if self.is_shown else "watchdog"
+            what = f"answer to {name} in {self._name_of(self.state)}"
+            self.report(rule, time, what, must="WRONG_STATE", seen="carried out")
+
+    def carry_out(self, name: str, values: Values, shown: Values, when: Interval) -> None:
+        """Apply a request carried out between two times, as its reply or a later status shows."""
+        ramp = min(values.get("ramp", 0), self.can.get("ramp_max", math.inf)) / 1000
+        cause = f"{name} {values}"
+        has_expired = self.is_enabled and shown.get("fault") == FAULTS["WATCHDOG"]
+        if name in ("Stop", "Disarm") and has_expired and when[1] >= self.expiry[0]:
+            self._trip(FAULTS["WATCHDOG"], self._expired_by(when[1]), "the watchdog")  # first
+        match name:
+            case "Arm":
+                if not self.is_enabled or values["session"] != self.session:
+                    self._fall_silent(ENABLED, when, FADE, cause, has_floor=False)
+                    self.token = 0
+                    self.clock.shifted()
+                self.fault, self.session, self.is_shown = FAULTS["NONE"], values["session"], True
+                self.watchdog, self.fed = values["watchdog"] / 1000, when
+            case "Silence":
+                self._fall_silent(ENABLED, when, ramp, cause)
+            case "Disarm" if self.state is not None:
+                state = SWITCHED_ON if self.is_enabled else self.state
+                self._fall_silent(state, when, ramp, cause)
+            case "Stop" if self.state is not None:
+                self._latch_again()
+                self._fall_silent(self.state if self.is_in_fault else STOPPED, when, ramp, cause)
+            case "Clear" if self.state in LATCHED:
+                self._clear(values["latch"], shown["state"], when)
+            case "Commit":
+                self._commit(values, when)
+            case "Set" if values["now"]:
+                self._play(values["token"], when)
+            case "Mark":
+                self.clock.mark(when)
+
+    # Sets
+
+    def _take(self, part: Values, reply: Values, when: Interval) -> None:
+        """Compare the reply to a part of a set, and play a set that is played at once."""
+        token, end = part["token"], when[1]
+        self._expect("credit", end, "token of a reply to Set", token, reply["token"])
+        is_fine = all(self.can.get(f"{each}_step", 1) <= 1 for each in TONE)
+        if not (reply["staged"] or reply["played"]):
+            self._expect("plays", end, f"exact of set {token}, not whole", 0, reply["exact"])
+        elif is_fine and not self.outputs.may_derate:
+            self._expect("plays", end, f"exact of set {token}", 1, reply["exact"])
+        if token != reply["token"]:
+            return
+        known = (0, 0, 1) if token == self.token else self.sets.taken(part, reply, when)
+        if known is None and self._unclear is not None:
+            self._unclear("a part came as its set expired")
+        elif known is not None:
+            what = f"missing, staged, played after part {part['index']} of set {token}"
+            seen = reply["missing"], reply["staged"], reply["played"]
+            self._expect("commit", end, what, known, seen)
+        if reply["played"]:
+            self._play(token, when)
+
+    def part_came(self, part: Values, when: Interval) -> None:
+        """Apply a part of a set but the last, which is kept or dropped without a word."""
+        self.advance(when[0])
+        is_held = self.state in (None, ENABLED) and self.session in (None, part["session"])
+        is_newer = is_newer_token(part["token"], self.token or 0)
+        if is_held and is_newer and self.sets.keep(part, when):
+            self.fed = when
+
+    def part_refused(self, part: Values, code: str) -> None:
+        """Apply a refusal of the last part of a set, by its code."""
+        if code not in _NOT_LOOKED_AT:
+            self.sets.refused(part)
+
+    def _commit(self, commit: Values, when: Interval) -> None:
+        token = commit["token"]
+        if token == self.token:
+            return
+        until = self.sets.staged_until(token)[1]
+        if self.token is not None and until < when[0] - self.slack:
+            seen = f"until {until:.4f} s" if until > -math.inf else "not staged"
+            what = f"set {token} that is committed"
+            self.report("token", when[1], what, must="staged", seen=seen)
+        self._play(token, when, self.clock.moment(commit["at"], when))
+
+    def _start_waiting(self, sooner: Interval = (math.inf, math.inf)) -> None:
+        """Start the set that waits at its moment, or sooner before another one."""
+        if self._waiting is not None:
+            (early, late), token, layers, is_exact = self._waiting
+            when, is_at_once = (min(early, sooner[0]), min(late, sooner[1])), sooner[0] < late
+            self._waiting, self._started = None, when[1]
+            self.outputs.play(layers, token, when, is_exact=is_exact, is_at_once=is_at_once)
+
+    def _play(self, token: int, when: Interval, moment: Interval | None = None) -> None:
+        """Play a set between two times or from a moment on, unless it is the one that plays."""
+        if token == self.token:
+            return
+        self._start_waiting(when)
+        layers, self.token = self.sets.whole(token), token
+        if layers is None:
+            self.outputs.forget()
+            return
+        if moment is None:
+            self.outputs.play(layers, token, when, is_exact=self.sets.is_exact)
+        else:
+            self._waiting = moment, token, layers, self.sets.is_exact
+        self.sets.drop()
+
+    # What it shows
+
+    def check(self, shown: Values, when: Interval) -> None:
+        """Compare a status that was true at some time between two."""
+        self.advance(when[0])
+        self.outputs.may_derate = shown["temperature"] >= _WARM
+        if not self.note_state(shown, when):
+            self._adopt(shown, when)
+            return
+        end, cause = when[1], self.outputs.cause
+        if self.token is not None:
+            self._expect("token", end, f"token after {cause}", self.token, shown["token"])
+        self.token = shown["token"]
+        left = shown["watchdog_left"] / 1000
+        slack = self._left_slack + self.slack
+        low = self.watchdog - (end - self.fed[0]) - slack if self.is_enabled else 0.0
+        high = self.watchdog - (when[0] - self.fed[1]) + slack if self.is_enabled else 0.0
+        is_unknown = self.is_enabled and self.watchdog == math.inf
+        if not (low <= left <= max(high, 0.0) or is_unknown):
+            must = f"{low:.6g} to {high:.6g}"
+            self.report("watchdog", end, f"watchdog_left after {cause}", must=must, seen=left)
+        self.clock.check(shown["clock"], when)
+        if not self.may_start(when):
+            self.outputs.check(shown, when)
+        self._check_voltage(shown, when)
+        self.last_status = when[0]
+
+    def may_start(self, when: Interval) -> bool:
+        """Whether a set that waits, or has waited, may start within an interval."""
+        if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
+            return True
+        return when[0] <= self._started + self.slack
+
+    def _adopt(self, shown: Values, when: Interval) -> None:
+        """Go on with a status as it is."""
+        super()._adopt(shown, when)
+        self.token = shown.get("token", self.token)
+
+    def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
+        """Compare what a layer plays with what it must."""
+        outputs = self.outputs
+        if self.may_start(when) or not (sure := outputs.sure(when)):
+            return
+        possible = outputs.tokens_of(number, sure)
+        problem: Problem | None = None
+        if reply["token"] not in possible:
+            problem = "token", "token", one_of(possible), reply["token"]
+        elif number in sure:
+            problem = achieved_problem(
+                outputs.playback.playing(number),
+                reply,
+                self.can,
+                is_exact=outputs.is_exact,
+                can_scale=outputs.may_derate or not outputs.is_exact,
+            )
+            lasting = outputs.lasting.get(number, {0}) if reply["commands"] else {0}
+            rows = reply, *reply["commands"]
+            flags = [name for row in rows for name in FLAGS if row.get(name)]
+            if problem is None and flags:
+                problem = "plays", "flags", [], flags
+            if problem is None and reply["valid_for"] not in lasting:
+                problem = "plays", "valid_for", sorted(lasting), reply["valid_for"]
+            if problem is None and reply["ramp"] and not reply["commands"]:
+                problem = "plays", "ramp of a silent layer", 0, reply["ramp"]
+        if problem is not None:
+            rule, what, must, seen = problem
+            report = self.report if reply["commands"] else self.report_silence
+            report(rule, when[1], f"{what} of achieved layer {number}", must=must, seen=seen)
+
+    def report_silence(
+        self, rule: str, time: float, what: str, *, must: object, seen: object
+    ) -> None:
+        """Take silence where there must be none, which a fault that is not shown would explain."""
+        self.report(rule, time, what, must=must, seen=seen)

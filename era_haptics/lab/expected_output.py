@@ -1,0 +1,564 @@
+"""What the channels and layers of an amplifier must show: levels, tokens, sums that are limited.
+
+A set begins at some time between its commit and the reply, or a little later; what plays then is
+asked of `era_haptics.lab.expected_output`.
+
+The clock of an amplifier as statuses and Marks show it, and the moments that commits name.
+
+What channels may play by sets whose commits are known only as intervals.
+
+The playback has each commit in the middle of its interval. Every transition has by how much sooner
+or later it may have begun, and a radius by which its first amplitude may differ. Times [s] are of
+any one clock; intervals are two times.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
+from typing import Protocol, TypeAlias
+
+from drivers.playing.playback import LAYERS_MAX, Playback, playback_of
+from drivers.playing.voices import Transition, Voice
+from drivers.protocol.definition import (
+    HIGH_STEPS,
+    MAX_AHEAD,
+    QUANTITIES,
+    ahead,
+    has_flag,
+    high_word,
+)
+from drivers.protocol.records import Values
+from drivers.protocol.sets import LayerSet
+
+Interval: TypeAlias = tuple[float, float]
+_PER_LEVEL = QUANTITIES["level"].per_unit
+_PER_RAMP, _PER_VALID_FOR = QUANTITIES["ramp"].per_unit, QUANTITIES["valid_for"].per_unit
+
+
+class UncertainPlayback:
+    """Bounds of what channels play; playback: with every commit in the middle of its interval.
+
+    half: by how much what a layer plays may end or start sooner or later by itself.
+    """
+
+    def __init__(self, playback: Playback) -> None:
+        self.playback = playback
+        self.half = [0.0] * LAYERS_MAX
+        # Channels of transitions that are gone, and until when [s] they may still play.
+        self._ghosts: list[tuple[int, Transition, float]] = []
+
+    @property
+    def lag(self) -> float:
+        """Longest time by which a transition under way may be earlier or later [s]."""
+        voices = chain.from_iterable(self.playback.all_voices)
+        return max(*self.half, *(voice.transition.half for voice in voices), 0.0)
+
+    def is_ambiguous(
+        self, when: Interval, layers: Sequence[LayerSet] | None = None, ramp: float = 0.0
+    ) -> bool:
+        """Whether something else may happen by itself just as what is to happen.
+
+        layers: of a set; None: all fall silent along a ramp [s].
+        """
+        if self.shortened_by(when, layers, ramp) > -math.inf:
+            return True
+        changed = dict.fromkeys(range(LAYERS_MAX), False)
+        if layers is not None:
+            changed = {one.layer: one.after for one in layers}
+        # Of all layers: what is due is taken to have happened before what is to happen, or after.
+        ends = [(due, self.half[layer]) for due, layer in self.playback.dues]
+        ends += [(self.playback.end_of(layer), self.half[layer]) for layer in changed]
+        by_then = self._by(when[0])
+        waiting = {one.layer for one in by_then.waiting}
+        for voice in chain.from_iterable(by_then.all_voices):
+            way = voice.transition
+            is_followed = voice.layer in waiting or changed.get(voice.layer, False)
+            is_due = not way.last or (is_followed and bool(way.knots))
+            if not voice.has_ended and voice.layer in changed and is_due:
+                ends.append((way.end, self._half_of(voice)))
+        return any(when[0] - half <= end <= when[1] + half for end, half in ends)
+
+    def shortened_by(
+        self, when: Interval, layers: Sequence[LayerSet] | None, ramp: float = 0.0
+    ) -> float:
+        """Return by when [s] what leads to silence has ended that a ramp may shorten, or not.
+
+        As its own end and that of the ramp are too close; minus infinity: there is none. layers,
+        ramp: see `is_ambiguous`.
+        """
+        left = dict.fromkeys(range(LAYERS_MAX), ramp)
+        if layers is not None:
+            left = {one.layer: self._ends_after(one) for one in layers}
+        latest = -math.inf
+        for voice in chain.from_iterable(self._by(when[0]).all_voices):
+            way, half, after = voice.transition, self._half_of(voice), left.get(voice.layer, 0.0)
+            goes_on = way.last or not way.step or (layers is not None and voice.has_ended)
+            if after and not goes_on and when[0] - half <= way.end - after <= when[1] + half:
+                latest = max(latest, way.end + half, when[1] + after)
+        return latest
+
+    def _by(self, time: float) -> Playback:
+        """Return what plays with all carried out that is due by a time."""
+        by_then = self.playback.copied()
+        while (due := by_then.next_due) <= time:
+            by_then.advance(due)
+        return by_then
+
+    def _half_of(self, voice: Voice) -> float:
+        """Return by how much what a voice plays may end sooner or later."""
+        return max(voice.transition.half, self.half[voice.layer])
+
+    def _ends_after(self, one: LayerSet) -> float:
+        """Return how long after a set a layer is silent that falls silent by it [s]."""
+        if not one.renew:
+            return one.ramp / _PER_RAMP
+        return self.playback.ramp_of(one.layer) + one.valid_for / _PER_VALID_FOR
+
+    def commit(self, layers: Sequence[LayerSet], token: int, when: Interval) -> None:
+        """Play a set from some time between two on."""
+        half = (when[1] - when[0]) / 2
+        self.advance(when[0])
+        self._pass_until(when[0] + half)
+        for one in layers:
+            known = self.half[one.layer]
+            onset_by = self.playback.onsets_end(one.layer, -math.inf) + known
+            # What waits, or will, starts as the onset ends, whenever that is renewed.
+            is_kept = one.after or (one.renew and onset_by > when[0])
+            self.half[one.layer] = max(half, known if is_kept else 0.0)
+        before = [*self.playback.all_voices]
+        self.playback.commit(layers, token, when[0] + half)
+        self._mark(before, when)
+
+    def silence(self, when: Interval, ramp: float) -> None:
+        """Fade all layers along a ramp [s], from some time between two on."""
+        middle = (when[0] + when[1]) / 2
+        self.advance(when[0])
+        self._pass_until(middle)
+        before = [*self.playback.all_voices]
+        self.playback.silence(middle, ramp)
+        self._mark(before, when)
+
+    def advance(self, time: float) -> None:
+        """End layers and start what waits, where that must have happened by a time."""
+        certain = time - self.lag
+        self._pass_until(certain)
+        self.playback.advance(certain)
+
+    def _pass_until(self, time: float) -> None:
+        """Carry out what is due by a time."""
+        while (due := self.playback.next_due) <= time:
+            half, before = max(self.half), [*self.playback.all_voices]
+            self.playback.advance(due)
+            self._mark(before, (due - half, due + half))
+
+    def unsure(self, start: float, end: float) -> set[int]:
+        """Return the layers that may end or start by themselves about between two times."""
+        self.advance(start)
+        return self.playback.unsure(end, self.half)
+
+    def _mark(self, before: Sequence[Sequence[Voice]], when: Interval) -> None:
+        """Note by how much every transition that is new may differ."""
+        half = (when[1] - when[0]) / 2
+        ghosts = [each for each in self._ghosts if each[2] > when[0]]
+        for channel, were in enumerate(before):
+            left = {(each.layer, each.frequency, each.began): each.transition for each in were}
+            known = {id(each.transition) for each in were}
+            for voice in self.playback.all_voices[channel]:
+                way = voice.transition
+                earlier = left.pop((voice.layer, voice.frequency, voice.began), None)
+                if id(way) not in known:
+                    way.half = half
+                    way.radius = 0.0 if earlier is None else radius_of(earlier, *when)
+            for way in left.values():
+                is_cut = way.last or way.end > (when[0] + when[1]) / 2
+                until = when[1] if is_cut else way.end + way.half
+                if until > when[0]:
+                    ghosts.append((channel, way, until))
+        self._ghosts = ghosts
+
+    def bounds(self, channel: int, start: float, end: float, *, is_exact: bool = False) -> Interval:
+        """Return the lowest and the largest level of a channel between two times.
+
+        What layers play that may end or start then may be anything up to its largest. is_exact:
+        tones of one frequency interfere; else they may add up as if they did not.
+        """
+        unsure = self.unsure(start, end)
+        lowest = highest = extra = 0.0
+        began = start - 3 * self.lag  # or later; by the clocks of layer, set and transition
+        for one in self.playback.waiting:
+            tones = [each for each in one.commands if each.channel == channel]
+            for tone in tones if one.layer in unsure else ():
+                extra += tone.peak / _PER_LEVEL
+        groups: dict[float, list[Transition]] = {}
+        for voice in self.playback.all_voices[channel]:
+            if voice.layer in unsure and not voice.has_ended:
+                extra += voice.peak(began) + voice.transition.radius
+                continue
+            groups.setdefault(voice.frequency, []).append(voice.transition)
+        for ways in groups.values():
+            amplitudes = [_reached(way, (start + end) / 2) for way in ways]
+            radius = sum(radius_of(way, start, end) for way in ways)
+            level, added = abs(sum(amplitudes)), sum(map(abs, amplitudes))
+            lowest += max(level - radius, 0.0)
+            highest += (level if is_exact else added) + radius
+        for at, way, until in self._ghosts:
+            if at == channel and until > start:
+                extra += abs(_reached(way, start - way.half)) + way.radius
+        return max(lowest - extra, 0.0), highest + extra
+
+
+def radius_of(way: Transition, start: float, end: float) -> float:
+    """Return by how much an amplitude may differ from that in the middle of an interval.
+
+    Its transition has begun by then.
+    """
+    center = _reached(way, (start + end) / 2)
+    since, until = max(start - way.half, way.start), max(end + way.half, way.start)
+    reach = max(abs(each - center) for each in way.points(since, until))
+    if not way.radius:
+        return reach
+    # The first amplitude counts the less the farther its transition has led.
+    left = Transition(way.start, way.step, way.radius, 0, way.end, (0j,) * len(way.knots))
+    return reach + abs(left.at(since))
+
+
+def _reached(way: Transition, time: float) -> complex:
+    """Return the amplitude at a time, or at the start of a transition that has begun sooner."""
+    return way.at(max(time, way.start))
+
+
+LATE, SAMPLE = 0.002, 0.0001  # s; by which a set may begin later: at once; at its moment
+DRIFT = 1e-3
+"""Of a time; of the amplifier's clock."""
+_TOLERANCE = 0.0015  # of full level: rounding, and the last step of a fade
+_MAX_STEPS = 4  # halves of a step of the level, beside one of each voice
+_MAX_ENDING = 3.3  # s; 32 knots, 0.1 s apart
+_PERIOD = 0.1  # s; in which a sum of tones has its peak
+_LASTING = 3.0  # s; what ends after it is not awaited
+_AMBIGUOUS = "a request came as a layer ended by itself, or its onset"
+_RAMP, _LEVEL = QUANTITIES["ramp"], QUANTITIES["level"]
+_LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maximum
+_ALL_LAYERS = {*range(_LAYERS)}
+
+
+class Report(Protocol):
+    """Takes a violation: rule, time [s], what must be what, and what was seen."""
+
+    def __call__(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
+        """Report it."""
+
+
+Unclear: TypeAlias = Callable[[str], None]
+"""Takes why it is unclear what plays: things came too close together."""
+
+
+def silent() -> Playback:
+    """Return a silent playback with all the channels and voices that there can be.
+
+    No fade is cut short in it, so that its levels are upper bounds.
+    """
+    return Playback(QUANTITIES["channel_count"].maximum, _VOICES)
+
+
+class ExpectedOutputs:
+    """The channels and layers of one amplifier, silent at first; times [s], intervals of two.
+
+    can: its capabilities, empty while unknown; slack [s]: of times. began: when what plays was
+    changed last, by its cause. is_exact: levels are those asked for, to the step; may_derate: or
+    lower, since it is warm. interferes: levels show how tones of one frequency interfere. lasting:
+    `valid_for` that a layer may show, of its set or what waits.
+    """
+
+    def __init__(
+        self,
+        can: Values,
+        *,
+        report: Report,
+        unclear: Unclear | None,
+        slack: float,
+        cause: str,
+        began: Interval,
+    ) -> None:
+        self.began = began
+        self.cause = cause
+        self.is_exact, self.may_derate, self.interferes = True, False, False
+        self._report, self._unclear, self._slack = report, unclear, slack
+        self.playback = playback_of(can) if can else silent()
+        """What plays, with each commit in the middle of its interval."""
+        self._plays = UncertainPlayback(self.playback)
+        self._half_step = can.get("level_step", 1) / 2 / _LEVEL.per_unit
+        self._has_floor = True  # or levels may be lower: of a fault, whose fade may be shorter
+        self._unknown = [-math.inf] * _LAYERS  # until when what a layer plays is unknown [s]
+        self.lasting: dict[int, set[int]] = {}
+        self._before: Sequence[float] = ()  # levels of channels before the last set
+        self._highest = 0.0  # of the sums of a channel since the last status, at most
+        self._unlimited_since = math.inf  # a sum is surely beyond full level, and not said to be
+
+    def forget(self) -> None:
+        """Treat what plays as unknown."""
+        self._unknown = [math.inf] * _LAYERS
+
+    # What happens
+
+    def _may_end(self, layer: int, start: float, end: float) -> bool:
+        """Whether a layer may end by itself between two times."""
+        half = self._plays.half[layer]
+        return start - half <= self.playback.end_of(layer) <= end + half
+
+    def _faded(self, one: LayerSet, time: float) -> float:
+        """Return when what a layer plays has faded, however it ends by a time, also by a set."""
+        ramp = max(_RAMP.from_wire(one.ramp), self.playback.ramp_of(one.layer))
+        ends = [
+            voice.ended(time, ramp).transition.end
+            for voices in self.playback.all_voices
+            for voice in voices
+            if voice.layer == one.layer and not voice.has_ended
+        ]
+        return max([time + ramp, *ends])
+
+    def play(
+        self,
+        layers: Sequence[LayerSet],
+        token: int,
+        when: Interval,
+        *,
+        is_exact: bool,
+        is_at_once: bool = True,
+    ) -> None:
+        """Play a set from some time between two on; is_exact: every command to the word.
+
+        is_at_once: it may begin a little later, unlike one for whose moment it has waited.
+        """
+        is_prompt = not (is_at_once or any(map(_is_timed, layers)))
+        start, end = when[0], when[1] + (SAMPLE if is_prompt else LATE)
+        if self._unclear is not None and self._plays.is_ambiguous((start, end), layers):
+            self._unclear(_AMBIGUOUS)
+        shortened_by = self._plays.shortened_by((start, end), layers)
+        channels = range(self.playback.channels)
+        self._before = [*map(self.playback.settled, channels)]
+        for one in layers:
+            number = one.layer
+            lasting = self.lasting.setdefault(number, set())
+            if not (one.renew or one.after):
+                lasting.clear()
+            if not one.renew:
+                lasting.add(one.valid_for)
+            if self._may_end(number, start, end):  # and then on other ways than by the set
+                goes_on = one.renew or any(each.keep_phase for each in one.commands)
+                self._unknown[number] = math.inf if goes_on else self._faded(one, end)
+            elif not one.renew and not one.after:
+                fade = end + _MAX_ENDING + _RAMP.from_wire(one.ramp)
+                self._unknown[number] = min(self._unknown[number], fade)
+            self._unknown[number] = max(self._unknown[number], shortened_by)
+        self._plays.commit(layers, token, (start, end))
+        self.began, self.cause = when, f"set {token} of layers {[one.layer for one in layers]}"
+        self._has_floor, self.is_exact = True, self.is_exact and is_exact
+        self._highest = max(self._highest, self._peak(start))
+
+    def silence(
+        self, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
+    ) -> Interval:
+        """Silence all along a ramp [s] from some time between two on; return when it is silent."""
+        start, end = when[0], when[1] + LATE
+        if self._plays.is_ambiguous((start, end), None, ramp):
+            self._unknown = [math.inf] * _LAYERS  # it fades, or falls silent by its ending
+            if self._unclear is not None:
+                self._unclear(_AMBIGUOUS)
+        self._plays.silence((start, end), ramp)
+        is_known = max(self._unknown) < start
+        self._unknown = [min(until, end + ramp) for until in self._unknown]
+        self.began, self.cause, self._has_floor = when, cause, has_floor
+        ends, lag = self.playback.ends_by, self._plays.lag
+        first = max(ends - lag, start) if has_floor and is_known else when[0]
+        return first, max(ends + lag, end if is_known else end + ramp)
+
+    # What is known
+
+    def _widened(self, when: Interval) -> Interval:
+        """Return an interval as the amplifier's clock may have it."""
+        since = self.began[0]
+        extra = self._slack + DRIFT * (when[1] - since)
+        return when[0] - extra, when[1] + extra
+
+    def sure(self, when: Interval) -> set[int]:
+        """Return the layers of which it is known what they play between two times.
+
+        No layer while what one of them plays is unknown.
+        """
+        start, end = self._widened(when)
+        is_known = max(self._unknown) < start
+        return _ALL_LAYERS - self._plays.unsure(start, end) if is_known else set()
+
+    def tokens_of(self, layer: int, sure: set[int]) -> set[int]:
+        """Return the tokens that a layer may show; sure: layers of which it is known."""
+        if layer in sure:
+            return {self.playback.tokens.get(layer, 0)}
+        return self.playback.next_tokens(layer)
+
+    def waits(self, when: Interval) -> bool:
+        """Whether a set surely waits for the end of an onset, whenever within an interval."""
+        return self.sure(when) == _ALL_LAYERS and bool(self.playback.waiting)
+
+    def settled_at(self, now: float) -> float:
+        """Return when all that plays lasts for long or is silent [s], as far as is known."""
+        playback, last = self.playback.copied(), now + _LASTING
+        while (due := playback.next_due) < last:
+            playback.advance(due)
+            now = due
+        ends = [voice.transition.end for voices in playback.all_voices for voice in voices]
+        return max([now, *ends])
+
+    # What is shown
+
+    def check(self, shown: Values, when: Interval) -> None:
+        """Compare a status that was true at some time between two; the next counts from there."""
+        tokens, start = shown["tokens"], self._widened(when)[0]
+        levels = [_LEVEL.from_wire(level) for level in shown["levels"]]
+        if sure := self.sure(when):
+            low = self.check_levels(levels, when, self._report)
+            for layer, token in enumerate(tokens):
+                possible = self.tokens_of(layer, sure)
+                if token not in possible:
+                    what = f"token of layer {layer}, {self._since(when)}"
+                    self._report("token", when[1], what, must=one_of(possible), seen=token)
+            is_limited = has_flag(shown, "limited")
+            is_beyond = low > 1 + _TOLERANCE + 2 * self._half_step
+            is_excused = is_limited or not is_beyond or not self.is_exact or self.may_derate
+            since = math.inf if is_excused else min(self._unlimited_since, when[1])
+            self._unlimited_since = since
+            must_be = start - since > _PERIOD
+            if must_be > is_limited or (is_limited and self._highest < 1 + self._half_step):
+                self._report("plays", when[1], "limited", must=must_be, seen=is_limited)
+        for layer, until in enumerate(self._unknown):
+            if until == math.inf and (layer >= len(tokens) or not tokens[layer]):
+                self._unknown[layer] = when[1] + _MAX_ENDING + _RAMP.high  # it may still fade
+        self._highest = self._peak(start)
+
+    def _peak(self, time: float) -> float:
+        """The largest sum of a channel from a time on, with endings; infinite if a set waits."""
+        if self.playback.waiting:
+            return math.inf
+        return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
+
+    def check_levels(
+        self, levels: Sequence[float], when: Interval, report_low: Report | None
+    ) -> float:
+        """Compare levels of channels; returns the largest level that one surely has.
+
+        report_low: takes levels that are too low, None where they may be.
+        """
+        can_be_low = self.may_derate or not self.is_exact or report_low is None
+        start, end = self._widened(when)
+        largest = 0.0
+        for channel, level in enumerate(levels[: self.playback.channels]):
+            low, high = self._plays.bounds(channel, start, end, is_exact=self.interferes)
+            largest = max(largest, low)
+            voices = len(self.playback.all_voices[channel])
+            slack = max((_MAX_STEPS + voices) * self._half_step, _TOLERANCE)
+            low, high = min(low, 1.0) * self._has_floor - slack, min(high, 1.0) + slack
+            is_low = level < low
+            if level > high or (is_low and not can_be_low):
+                report = report_low if is_low and report_low is not None else self._report
+                what = f"level of channel {channel}, {self._since(when)}"
+                must = f"{low:.6g} to {high:.6g}"
+                report(self._rule(channel, level, when), when[1], what, must=must, seen=level)
+        return largest
+
+    def _since(self, when: Interval) -> str:
+        low, high = 1e3 * (when[0] - self.began[1]), 1e3 * (when[1] - self.began[0])
+        return f"{low:.1f} to {high:.1f} ms after {self.cause}"
+
+    def _rule(self, channel: int, level: float, when: Interval) -> str:
+        """Which rule a wrong level breaks."""
+        if self.cause == "the watchdog":
+            return "watchdog"
+        if self.playback.settles_at > self._widened(when)[0] - self._plays.lag:
+            return "ramp"
+        if not self.cause.startswith("set"):
+            return "silent"
+        before = self._before[channel] if channel < len(self._before) else 0.0
+        return "commit" if abs(level - before) < _TOLERANCE else "plays"
+
+
+def _is_timed(one: LayerSet) -> bool:
+    """Whether something of a layer ends or starts later by itself, which may be late."""
+    is_shaped = any(each.onset is not None and each.onset.knots for each in one.commands)
+    return bool(one.valid_for or one.after or is_shaped)
+
+
+def one_of(known: Iterable[object]) -> str:
+    """Return what something must be: one of some values."""
+    return " or ".join(map(str, known))
+
+
+_DRIFT = DRIFT + QUANTITIES["rate"].high
+"""Of the clock, at any rate."""
+
+
+class ExpectedClock:
+    """The clock of one amplifier, unknown at first; report: takes what is wrong; slack [s]."""
+
+    def __init__(self, report: Report, slack: float) -> None:
+        self._report, self._slack = report, slack
+        self._read: tuple[int, Interval] | None = None  # the last one, and when
+        self._marked: Interval | None = None
+        self._is_unclear = False
+
+    @property
+    def present(self) -> int:
+        """The high word that was read last, which names no moment ahead."""
+        return 0 if self._read is None else high_word(self._read[0])
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether the next status shows the clock of a Mark."""
+        return self._marked is not None
+
+    def mark(self, when: Interval) -> None:
+        """Note a Mark that comes between two times."""
+        self._marked = when
+
+    def shifted(self) -> None:
+        """Note that it may go on from elsewhere."""
+        self._read = None
+
+    def unheard(self) -> None:
+        """Note that the next status may show another clock than what was heard says.
+
+        The present one, if a status before showed the Mark, or that of a Mark that came twice.
+        """
+        self._is_unclear = True
+
+    def check(self, shown: int, when: Interval) -> None:
+        """Note what a status shows, or compare it where it is the clock of a Mark."""
+        marked, self._marked = self._marked, None
+        is_unclear, self._is_unclear = self._is_unclear, False
+        if is_unclear:
+            return
+        if marked is None:
+            self._read = shown, when
+        elif self._read is not None:
+            clock, read = self._read
+            slack = self._slack + _DRIFT * (marked[1] - read[0])
+            low, high = marked[0] - read[1] - slack, marked[1] - read[0] + slack
+            passed = ahead(shown, clock)
+            if not low <= passed <= high:
+                what, must = "time from the clock read last to that of a Mark", f"{low} to {high} s"
+                self._report("clock", when[1], what, must=must, seen=passed)
+
+    def moment(self, at: int, when: Interval) -> Interval | None:
+        """Return when a set starts whose commit names a high word and comes between two times.
+
+        None where that is surely at once.
+        """
+        if self._read is None:
+            return when[0], when[1] + MAX_AHEAD
+        clock, read = self._read
+        left = ahead(at * HIGH_STEPS, clock)
+        drift = _DRIFT * max(when[1] - read[0], left)
+        early, late = read[0] + left - drift, read[1] + left + drift
+        if early > when[1] and late <= when[0] + MAX_AHEAD:
+            return early, late
+        if late <= when[0] or early > when[1] + MAX_AHEAD:
+            return None
+        return when[0], max(when[1], late)

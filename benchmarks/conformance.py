@@ -10,7 +10,7 @@ import argparse
 from typing import Any
 
 from benchmarks.setting import support
-from drivers.judge.asking.client import Late
+from era_haptics.lab.conformance.judge_client import Late
 
 judged_line: Any = support("judged_line")
 

@@ -6,7 +6,7 @@ from controller.cli.content import content_app
 from controller.cli.layout import layout_app
 from controller.cli.play import play
 from drivers.by_hand.cli import EXIT_STATUS as EXIT_STATUS
-from era_haptics.lab.conformance_cli import conformance
+from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.paper_figures import figure_app
 from era_haptics.lab.report import report
 from model.commands.design_cli import design_app

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import era_haptics
-from drivers.judge.asking import judge, of_kind
+from drivers.judge.asking import of_kind
+from era_haptics.lab.conformance import judge_client
 from sim.transport.far_end import make_terminal
 
 EXAMPLE = Path(era_haptics.__file__).parents[1] / "examples" / "modbus_server" / "modbus_server.py"
@@ -50,7 +51,7 @@ async def served(kind: str) -> AsyncIterator[str]:
 async def test_conformance_finds_what_the_server_cannot_do(kind: str, drives: bool) -> None:
     """Every check of the wire has a verdict, and those fail that the page names, no others."""
     async with served(kind) as url:
-        report = await judge(url, drives=drives)
+        report = await judge_client(url, drives=drives)
     checks = [(number, check) for number, check in of_kind(kind) if drives or not check.drives]
     assert [(each.number, each.check) for each in report.results] == checks
     failed = {each.check.name: each.reason for each in report.results if each.result == "failed"}

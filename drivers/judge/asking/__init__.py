@@ -24,11 +24,11 @@ from drivers.judge.asking import (
     staging,
     states,
 )
-from drivers.judge.asking.check import Check, CheckResult, Report, Result, run_checks
-from drivers.judge.asking.client import Client, Late, Violation
-from drivers.judge.asking.subject import LEVEL
 from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.known import address_of
+from era_haptics.lab.conformance.check import Check, CheckResult, Report, Result, run_checks
+from era_haptics.lab.conformance.judge_client import Client, Late, Violation
+from era_haptics.lab.conformance.subject import LEVEL
 from registry import threads
 
 __all__ = [

@@ -7,21 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import cast
 
 from drivers.errors import WireCounters
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import (
-    Answer,
-    Client,
-    Heard,
-    When,
-    altered,
-    expect_equal,
-    message_name,
-    read_as,
-    require,
-    require_in_time,
-)
-from drivers.judge.asking.material import layer
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import HELLO, IDENTITY, MESSAGES, NAK
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import (
@@ -37,6 +22,21 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect_equal,
+    layer,
+    message_name,
+    read_as,
+    require,
+    require_in_time,
+)
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _NMT: Mapping[str, int] = CANOPEN["nmt"]

@@ -6,17 +6,6 @@ import zlib
 from functools import partial
 
 from drivers.judge.asking.can_frames import UPLOAD, CanClient, can_client
-from drivers.judge.asking.check import driving, reading
-from drivers.judge.asking.client import (
-    Violation,
-    expect,
-    expect_equal,
-    expect_one_of,
-    expect_within,
-    require,
-    require_in_time,
-)
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import (
     FAULTS,
     MESSAGES,
@@ -27,6 +16,17 @@ from drivers.protocol.definition import (
     name_of,
 )
 from drivers.wires.can_frames import CANOPEN, cob_id
+from era_haptics.lab.conformance.check import driving, reading
+from era_haptics.lab.conformance.judge_client import (
+    Violation,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+    require,
+    require_in_time,
+)
+from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import FAULT, OFF, REACTING
 from registry import threads
 

@@ -3,11 +3,10 @@
 import asyncio
 from functools import partial
 
-from drivers.judge.asking.check import driving, reading
-from drivers.judge.asking.client import Untimed, Violation, expect, require
-from drivers.judge.asking.material import Rows, send
-from drivers.judge.asking.subject import RATE, Subject
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_STEPS, HIGH_TIME, QUANTITIES
+from era_haptics.lab.conformance.check import driving, reading
+from era_haptics.lab.conformance.judge_client import Rows, Untimed, Violation, expect, require, send
+from era_haptics.lab.conformance.subject import RATE, Subject
 from era_haptics.lab.expected_output import DRIFT
 from registry import threads
 

@@ -6,23 +6,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import cast
 
-from drivers.judge.asking.check import driving, reading
-from drivers.judge.asking.client import (
-    GATEWAY_TIMEOUT,
-    QUIET,
-    Answer,
-    Client,
-    Heard,
-    When,
-    altered,
-    expect,
-    expect_equal,
-    message_name,
-    read_as,
-    require_in_time,
-)
-from drivers.judge.asking.material import send, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, MESSAGES, NO_CHANNEL, REFUSALS
 from drivers.protocol.records import Values
 from drivers.wires.modbus_frames import (
@@ -46,6 +29,24 @@ from drivers.wires.modbus_frames import (
     unpack_identity,
     write_pdu,
 )
+from era_haptics.lab.conformance.check import driving, reading
+from era_haptics.lab.conformance.judge_client import (
+    GATEWAY_TIMEOUT,
+    QUIET,
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect,
+    expect_equal,
+    message_name,
+    read_as,
+    require_in_time,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 READ_HOLDING = 3

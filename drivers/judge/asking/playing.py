@@ -5,12 +5,21 @@ import math
 from dataclasses import replace
 from functools import partial
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_equal, require, require_in_time
-from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import HIGH_TIME, HIGH_WORDS, QUANTITIES, has_flag
 from drivers.protocol.sets import Command, Envelope
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    Row,
+    Rows,
+    expect_equal,
+    layer,
+    play,
+    require,
+    require_in_time,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 
 _PLACE, _SETS = "protocol.md#what-a-channel-plays", "protocol.md#sets"
 _SLOW = 400  # steps of frequency: 20 Hz, whose periods are long against an exchange

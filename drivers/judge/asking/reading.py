@@ -8,23 +8,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, cast
 
-from drivers.judge.asking.check import driving, greeted, reading
-from drivers.judge.asking.client import (
-    Armed,
-    Client,
-    Late,
-    Violation,
-    When,
-    expect,
-    expect_equal,
-    expect_one_of,
-    expect_within,
-    in_batches,
-    require,
-)
-from drivers.judge.asking.material import Rows, send, stage
 from drivers.judge.asking.serial_frames import SerialClient
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import (
     ENABLED,
     EVENT,
@@ -39,6 +23,24 @@ from drivers.protocol.definition import (
     name_of,
 )
 from drivers.protocol.records import Values
+from era_haptics.lab.conformance.check import driving, greeted, reading
+from era_haptics.lab.conformance.judge_client import (
+    Armed,
+    Client,
+    Late,
+    Rows,
+    Violation,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    expect_within,
+    in_batches,
+    require,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors

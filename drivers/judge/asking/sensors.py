@@ -5,19 +5,20 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from drivers.judge.asking.check import driving, reading
-from drivers.judge.asking.client import (
+from drivers.protocol.definition import NO_CHANNEL, READING_STATES, ahead, sensor_reading
+from drivers.protocol.records import Record, Values
+from era_haptics.lab.conformance.check import driving, reading
+from era_haptics.lab.conformance.judge_client import (
     Answer,
     expect,
     expect_equal,
     expect_one_of,
     expect_within,
+    layer,
     read_as,
+    send,
 )
-from drivers.judge.asking.material import layer, send
-from drivers.judge.asking.subject import Subject
-from drivers.protocol.definition import NO_CHANNEL, READING_STATES, ahead, sensor_reading
-from drivers.protocol.records import Record, Values
+from era_haptics.lab.conformance.subject import Subject
 from era_haptics.lab.expected_amplifier import ROUNDED
 
 _PLACE = "protocol.md#sensors"

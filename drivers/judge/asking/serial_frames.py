@@ -8,20 +8,6 @@ from typing import cast
 
 from cobs import cobs
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import (
-    Answer,
-    Client,
-    Heard,
-    When,
-    altered,
-    expect,
-    expect_equal,
-    message_name,
-    read_as,
-)
-from drivers.judge.asking.material import layer, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import (
     EVENT,
     EVENT_RECORD,
@@ -42,6 +28,21 @@ from drivers.wires.serial_frames import (
     unpack_identity,
     unpack_words,
 )
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    Answer,
+    Client,
+    Heard,
+    When,
+    altered,
+    expect,
+    expect_equal,
+    layer,
+    message_name,
+    read_as,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _SEQUENCES = 1 << 16

@@ -4,13 +4,21 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import require
-from drivers.judge.asking.material import Material, Rows, Send, layer, play, send, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import COMMAND, ENVELOPE, KNOT, LAYER, MESSAGES, STAGED_LIFE
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, pack_layers
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    Material,
+    Rows,
+    Send,
+    layer,
+    play,
+    require,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 
 _PLACE = "protocol.md#sets"
 _SHAPED = COMMAND.words + 2 * ENVELOPE.words  # of a command with two empty envelopes

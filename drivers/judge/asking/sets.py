@@ -5,13 +5,23 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_within, in_batches, require
-from drivers.judge.asking.material import FULL, Rows, Send, layer, play, send, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import COMMAND, ENVELOPE, LAYER, QUANTITIES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, pack_layers
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    FULL,
+    Rows,
+    Send,
+    expect_within,
+    in_batches,
+    layer,
+    play,
+    require,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 
 _PLACE = "protocol.md#sets"
 _SCANNED = 8

@@ -3,10 +3,6 @@
 import asyncio
 from functools import partial
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_equal
-from drivers.judge.asking.material import Rows, layer, play, send, stage
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import (
     COMMAND,
     HIGH_STEPS,
@@ -17,6 +13,9 @@ from drivers.protocol.definition import (
     QUANTITIES,
     ahead,
 )
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import Rows, expect_equal, layer, play, send, stage
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _PLACE = "protocol.md#sets"

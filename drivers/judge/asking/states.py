@@ -5,13 +5,20 @@ from dataclasses import replace
 from functools import partial
 from itertools import cycle
 
-from drivers.judge.asking.check import driving
-from drivers.judge.asking.client import expect_equal
-from drivers.judge.asking.material import Row, Rows, layer, play, send, stage
 from drivers.judge.asking.set_parts import long_set
-from drivers.judge.asking.subject import Subject
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, QUANTITIES
 from drivers.protocol.sets import token_after
+from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.judge_client import (
+    Row,
+    Rows,
+    expect_equal,
+    layer,
+    play,
+    send,
+    stage,
+)
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _STATES, _SESSIONS = "protocol.md#states", "protocol.md#sessions-and-the-watchdog"

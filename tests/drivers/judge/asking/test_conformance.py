@@ -18,12 +18,7 @@ from cobs import cobs
 
 import era_haptics
 from drivers.errors import CommandError
-from drivers.judge.asking import CHECKS, Result, judge, of_kind, states
-from drivers.judge.asking.check import Check, CheckResult, Report, in_words, run_checks
-from drivers.judge.asking.client import Late, Violation, When
-from drivers.judge.asking.judge import Judge
-from drivers.judge.asking.material import layer
-from drivers.judge.asking.subject import Subject
+from drivers.judge.asking import CHECKS, Result, of_kind, states
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
@@ -31,6 +26,10 @@ from drivers.trace import tracing
 from drivers.wires.can_frames import pack_frames, unpack_frames
 from drivers.wires.modbus_frames import framed
 from drivers.wires.serial_frames import FrameReader, encode_frame
+from era_haptics.lab.conformance import judge_client
+from era_haptics.lab.conformance.check import Check, CheckResult, Report, in_words, run_checks
+from era_haptics.lab.conformance.judge_client import Judge, Late, Violation, When, layer
+from era_haptics.lab.conformance.subject import Subject
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from long_form import shortly
 from model.rig.rig import Rig
@@ -478,7 +477,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     loop.add_reader(far, lambda: end.receive(os.read(far, 4096), threads.now()))
     url = f"serial://{os.ttyname(near)}"
     with tracing(tmp_path / "trace"):
-        report = await judge(url, drives=False)
+        report = await judge_client(url, drives=False)
     lines = (tmp_path / "trace").read_text().splitlines()
     assert {">", "<"} <= {word for line in lines for word in line.split()}
     loop.remove_reader(far)

@@ -9,23 +9,26 @@ from inspect import isawaitable
 from typing import Any, TypeAlias, cast
 
 from drivers.errors import CommandError
-from drivers.judge.asking.client import (
+from drivers.protocol.definition import MESSAGES, QUANTITIES, VERSION
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import FLAGS, Command, LayerSet, unpack_layers
+from era_haptics.lab.conformance.judge_client import (
+    FULL,
+    STATED,
     Armed,
+    Capabilities,
     Client,
     Finding,
     Late,
     Optional,
+    Rows,
     Untimed,
     Unusable,
     Violation,
     expect,
     read_as,
 )
-from drivers.judge.asking.material import FULL, STATED, Capabilities, Rows
-from drivers.judge.asking.subject import Subject
-from drivers.protocol.definition import MESSAGES, QUANTITIES, VERSION
-from drivers.protocol.records import Refusal, Values
-from drivers.protocol.sets import FLAGS, Command, LayerSet, unpack_layers
+from era_haptics.lab.conformance.subject import Subject
 from registry import threads
 
 _MAX_TIME = 180.0  # s; after which a run begins no other check

@@ -7,34 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from drivers.judge.asking.client import (
-    QUIET,
-    REPLY_TIMEOUT,
-    Answer,
-    Client,
-    Late,
-    When,
-    expect,
-    expect_equal,
-    expect_one_of,
-    read_as,
-    require,
-    require_in_time,
-)
-from drivers.judge.asking.dating import Dating
-from drivers.judge.asking.judge import Judge
-from drivers.judge.asking.material import (
-    FULL,
-    STATED,
-    Capabilities,
-    Material,
-    Rows,
-    Send,
-    layer,
-    play,
-    send,
-    stage,
-)
 from drivers.protocol.definition import (
     ENABLED,
     HIGH_STEPS,
@@ -50,6 +22,32 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet, is_last, pack_layers, parts
 from drivers.wires.wire import reply_words
+from era_haptics.lab.conformance.judge_client import (
+    FULL,
+    QUIET,
+    REPLY_TIMEOUT,
+    STATED,
+    Answer,
+    Capabilities,
+    Client,
+    Dating,
+    Judge,
+    Late,
+    Material,
+    Rows,
+    Send,
+    When,
+    expect,
+    expect_equal,
+    expect_one_of,
+    layer,
+    play,
+    read_as,
+    require,
+    require_in_time,
+    send,
+    stage,
+)
 from era_haptics.lab.expected_amplifier import OFF
 from era_haptics.lab.expected_output import SAMPLE
 from registry import threads

@@ -10,23 +10,16 @@ from contextlib import asynccontextmanager, suppress
 from functools import partial
 
 from drivers.errors import LinkError
-from drivers.judge.asking import (
-    can_frames,
-    can_node,
-    clocks,
-    modbus_frames,
-    playing,
-    reading,
-    sensors,
-    serial_frames,
-    set_parts,
-    sets,
-    staging,
-    states,
-)
 from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.known import address_of
 from era_haptics.lab.conformance.check import Check, CheckResult, Report, Result, run_checks
+from era_haptics.lab.conformance.checks import (
+    frame_checks,
+    playing_checks,
+    reading_checks,
+    set_checks,
+    state_checks,
+)
 from era_haptics.lab.conformance.judge_client import Client, Late, Violation
 from era_haptics.lab.conformance.subject import LEVEL
 from registry import threads
@@ -45,37 +38,92 @@ __all__ = [
 ]
 
 CHECKS: tuple[Check, ...] = (
-    *(reading.identity, reading.capabilities, reading.starts_disarmed, clocks.clock_goes_on),
-    *(reading.replies_in_time, reading.unknown_types, reading.reading_changes_nothing),
-    reading.hello_for_ever,
-    *(sensors.sensors, modbus_frames.areas, modbus_frames.pieces, can_node.objects),
-    *(reading.lengths, states.stop, states.stop_ramps, states.silence_never_later),
-    *(states.stop_ends_all, states.stops_are_numbered, states.clear_too_early),
-    *(states.silence, states.plays_nothing_disarmed, states.arming, states.watchdog_ranges),
-    *(states.arms_again, states.sessions, states.arming_ends_fades, reading.obeys_in_time),
-    *(states.watchdog, states.watchdog_unread, states.what_feeds),
-    *(states.what_does_not_feed, states.trips_amid_other_requests),
-    *(states.trips_amid_fades, states.fault_list),
-    *(sets.every_channel, sets.levels_of_every_frequency, sets.achieved, sets.steps_as_stated),
-    *(sets.all_or_nothing, sets.accepts_its_ranges, set_parts.parts_of_sets),
-    *(set_parts.parts_that_are_dropped, set_parts.parts_again, set_parts.refused_parts),
-    *(set_parts.empty_sets, set_parts.max_set, set_parts.sets_expire),
-    *(staging.stage_and_commit, staging.repeats_change_nothing, staging.tokens_wrap),
-    *(staging.newer_sets_replace, staging.committed_together, staging.starts_at_its_moment),
-    staging.what_waits_for_its_moment,
-    *(clocks.clock_readings, clocks.clock_shifts, clocks.clock_rate),
-    *(playing.layers_add, playing.layers_play_on, playing.valid_for, playing.renew, playing.after),
-    *(playing.after_the_last_onset, playing.what_waits_for_an_onset),
-    *(playing.ramps, playing.cross_fades, playing.kept_phase, playing.onsets, playing.endings),
-    *(playing.endings_amid, playing.extreme_envelopes, playing.phases, playing.voices),
-    playing.limited,
-    *(serial_frames.damaged_frames, serial_frames.doubled_frames, serial_frames.tolerated_frames),
-    serial_frames.discarded_frames,
-    *(modbus_frames.present_areas, modbus_frames.exceptions),
-    *(can_frames.numbers, can_node.network_management, can_node.heartbeats),
-    can_node.emergencies,
-    *(reading.events, reading.broadcasts, reading.mark, reading.addresses),
-    *(sensors.measured, sensors.readings),
+    *(
+        reading_checks.identity,
+        reading_checks.capabilities,
+        reading_checks.starts_disarmed,
+        playing_checks.clock_goes_on,
+    ),
+    *(
+        reading_checks.replies_in_time,
+        reading_checks.unknown_types,
+        reading_checks.reading_changes_nothing,
+    ),
+    reading_checks.hello_for_ever,
+    *(playing_checks.sensors, frame_checks.areas, frame_checks.pieces, reading_checks.objects),
+    *(
+        reading_checks.lengths,
+        state_checks.stop,
+        state_checks.stop_ramps,
+        state_checks.silence_never_later,
+    ),
+    *(state_checks.stop_ends_all, state_checks.stops_are_numbered, state_checks.clear_too_early),
+    *(
+        state_checks.silence,
+        state_checks.plays_nothing_disarmed,
+        state_checks.arming,
+        state_checks.watchdog_ranges,
+    ),
+    *(
+        state_checks.arms_again,
+        state_checks.sessions,
+        state_checks.arming_ends_fades,
+        reading_checks.obeys_in_time,
+    ),
+    *(state_checks.watchdog, state_checks.watchdog_unread, state_checks.what_feeds),
+    *(state_checks.what_does_not_feed, state_checks.trips_amid_other_requests),
+    *(state_checks.trips_amid_fades, state_checks.fault_list),
+    *(
+        set_checks.every_channel,
+        set_checks.levels_of_every_frequency,
+        set_checks.achieved,
+        set_checks.steps_as_stated,
+    ),
+    *(set_checks.all_or_nothing, set_checks.accepts_its_ranges, set_checks.parts_of_sets),
+    *(set_checks.parts_that_are_dropped, set_checks.parts_again, set_checks.refused_parts),
+    *(set_checks.empty_sets, set_checks.max_set, set_checks.sets_expire),
+    *(set_checks.stage_and_commit, set_checks.repeats_change_nothing, set_checks.tokens_wrap),
+    *(
+        set_checks.newer_sets_replace,
+        set_checks.committed_together,
+        set_checks.starts_at_its_moment,
+    ),
+    set_checks.what_waits_for_its_moment,
+    *(playing_checks.clock_readings, playing_checks.clock_shifts, playing_checks.clock_rate),
+    *(
+        playing_checks.layers_add,
+        playing_checks.layers_play_on,
+        playing_checks.valid_for,
+        playing_checks.renew,
+        playing_checks.after,
+    ),
+    *(playing_checks.after_the_last_onset, playing_checks.what_waits_for_an_onset),
+    *(
+        playing_checks.ramps,
+        playing_checks.cross_fades,
+        playing_checks.kept_phase,
+        playing_checks.onsets,
+        playing_checks.endings,
+    ),
+    *(
+        playing_checks.endings_amid,
+        playing_checks.extreme_envelopes,
+        playing_checks.phases,
+        playing_checks.voices,
+    ),
+    playing_checks.limited,
+    *(frame_checks.damaged_frames, frame_checks.doubled_frames, frame_checks.tolerated_frames),
+    frame_checks.discarded_frames,
+    *(frame_checks.present_areas, frame_checks.exceptions),
+    *(frame_checks.numbers, reading_checks.network_management, reading_checks.heartbeats),
+    reading_checks.emergencies,
+    *(
+        reading_checks.events,
+        reading_checks.broadcasts,
+        reading_checks.mark,
+        reading_checks.addresses,
+    ),
+    *(playing_checks.measured, playing_checks.readings),
 )
 """All checks, in their order of execution."""
 
@@ -87,10 +135,10 @@ def of_kind(kind: str) -> list[tuple[int, Check]]:
 
 
 CLIENTS: Mapping[str, Callable[[int], Client]] = {
-    "serial": serial_frames.SerialClient,
-    "CAN": can_frames.CanClient,
-    "Modbus RTU": partial(modbus_frames.ModbusClient, is_rtu=True),
-    "Modbus TCP": partial(modbus_frames.ModbusClient, is_rtu=False),
+    "serial": frame_checks.SerialClient,
+    "CAN": frame_checks.CanClient,
+    "Modbus RTU": partial(frame_checks.ModbusClient, is_rtu=True),
+    "Modbus TCP": partial(frame_checks.ModbusClient, is_rtu=False),
 }
 """Clients by the protocol that a wire's settings name."""
 

@@ -18,7 +18,7 @@ from cobs import cobs
 
 import era_haptics
 from drivers.errors import CommandError
-from drivers.judge.asking import CHECKS, Result, of_kind, states
+from drivers.judge.asking import CHECKS, Result, of_kind
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
@@ -28,6 +28,7 @@ from drivers.wires.modbus_frames import framed
 from drivers.wires.serial_frames import FrameReader, encode_frame
 from era_haptics.lab.conformance import judge_client
 from era_haptics.lab.conformance.check import Check, CheckResult, Report, in_words, run_checks
+from era_haptics.lab.conformance.checks import state_checks
 from era_haptics.lab.conformance.judge_client import Judge, Late, Violation, When, layer
 from era_haptics.lab.conformance.subject import Subject
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
@@ -507,7 +508,7 @@ def test_report_says_the_worst() -> None:
     for empty in ("", set[int](), b""):
         assert str(Violation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
-    good = CheckResult(states.stop, 2, Result.PASSED)
+    good = CheckResult(state_checks.stop, 2, Result.PASSED)
     assert Report("x", 0.2, (bad, good), 0).overall == "failed"
     assert Report("x", 0.2, (good,), 1).overall == "incomplete"
     report = Report("x", 0.2, (good,), 0)

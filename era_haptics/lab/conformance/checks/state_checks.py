@@ -5,10 +5,10 @@ from dataclasses import replace
 from functools import partial
 from itertools import cycle
 
-from drivers.judge.asking.set_parts import long_set
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, QUANTITIES
 from drivers.protocol.sets import token_after
 from era_haptics.lab.conformance.check import driving
+from era_haptics.lab.conformance.checks.set_checks import long_set
 from era_haptics.lab.conformance.judge_client import (
     Row,
     Rows,

@@ -11,9 +11,9 @@ import canopen
 import cantools
 import pytest
 
-from drivers.judge.asking import CHECKS
 from drivers.playing.playback import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
+from era_haptics.lab.conformance.contract import CHECKS
 from protocol_bytes import BYTES
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.can_amplifiers import ObjectServer

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import era_haptics
-from drivers.judge.asking import of_kind
 from era_haptics.lab.conformance import judge_client
+from era_haptics.lab.conformance.contract import of_kind
 from sim.transport.far_end import make_terminal
 
 EXAMPLE = Path(era_haptics.__file__).parents[1] / "examples" / "modbus_server" / "modbus_server.py"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.judge.asking import CHECKS, Result, of_kind
+from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
 from firmware_programs import build_firmware
 from judged_line import KINDS, judged, plain
 from moved_firmware import FirmwareEnd

@@ -7,9 +7,9 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
-from drivers.judge.asking import CHECKS, LEVEL, CheckResult, of_kind
-from drivers.judge.asking import CLIENTS as BY_PROTOCOL
 from era_haptics.lab.conformance.check import run_checks
+from era_haptics.lab.conformance.contract import CHECKS, LEVEL, CheckResult, of_kind
+from era_haptics.lab.conformance.contract import CLIENTS as BY_PROTOCOL
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from virtual_loop import run_virtual

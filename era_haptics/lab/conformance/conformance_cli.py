@@ -11,7 +11,7 @@ from drivers.by_hand.cli import EXIT_STATUS, Json, Trace, Url, run
 from drivers.errors import LinkError
 
 if TYPE_CHECKING:
-    from drivers.judge.asking import CheckResult
+    from era_haptics.lab.conformance.contract import CheckResult
 
 
 def conformance(
@@ -34,8 +34,8 @@ def conformance(
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
-    from drivers.judge.asking import LEVEL
     from era_haptics.lab.conformance import judge_client as judge
+    from era_haptics.lab.conformance.contract import LEVEL
 
     level = LEVEL if level is None else level
     show = (lambda result: None) if json_ else _show_result

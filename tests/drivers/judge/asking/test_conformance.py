@@ -18,7 +18,6 @@ from cobs import cobs
 
 import era_haptics
 from drivers.errors import CommandError
-from drivers.judge.asking import CHECKS, Result, of_kind
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers
@@ -29,6 +28,7 @@ from drivers.wires.serial_frames import FrameReader, encode_frame
 from era_haptics.lab.conformance import judge_client
 from era_haptics.lab.conformance.check import Check, CheckResult, Report, in_words, run_checks
 from era_haptics.lab.conformance.checks import state_checks
+from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
 from era_haptics.lab.conformance.judge_client import Judge, Late, Violation, When, layer
 from era_haptics.lab.conformance.subject import Subject
 from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied

@@ -14,7 +14,7 @@ from controller.effects.player import read_strengths
 from controller.gateway.settings import read_token
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
-from drivers.judge.watching import capture
+from era_haptics.lab.witness import capture
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.design.area import area_of
 from model.errors import InputError

@@ -21,9 +21,9 @@ from daemon_bench import READY, daemon_at, far_end, until_state
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
-from drivers.judge.watching.config import TimeLimits
 from drivers.opening import Lines
 from era_haptics.lab.conformance.contract import opened
+from era_haptics.lab.witness.capture import TimeLimits
 from long_form import in_turn, shortly
 from model.fem import Mesh
 from model.rig.rig import Rig

@@ -17,19 +17,19 @@ from typer.testing import CliRunner
 
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError
-from drivers.judge.watching.capture import read_capture
-from drivers.judge.watching.witness import Witness
 from drivers.opening import Lines
 from drivers.playing.contents import Layer, Tone
 from drivers.protocol.definition import STATES
 from era_haptics.lab.cli import app
+from era_haptics.lab.witness.capture import read_capture
+from era_haptics.lab.witness.witness import Witness
+from era_haptics.lab.witness.witness_cli import parse_endpoint, relays
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 from rig_on_wire import WIRES, far_side
 from sim.far_ends.wire_assignment import Wire
-from sim.witness_relay import parse_endpoint, relays
 from virtual_loop import in_virtual_time
 from witness_config import witness_config
 
@@ -251,7 +251,7 @@ def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPa
         os.kill(os.getpid(), signal.SIGTERM)
         yield ["serial:///dev/pts/9"]
 
-    monkeypatch.setattr("sim.witness_relay.relays", ended_at_once)
+    monkeypatch.setattr("era_haptics.lab.witness.witness_cli.relays", ended_at_once)
     result = CliRunner().invoke(app, ["witness", URL])
     assert isinstance(result.exception, InputError | CommandError)
     assert "nothing was checked" in str(result.exception)

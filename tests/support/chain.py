@@ -18,6 +18,7 @@ from controller.sources.touch import Touch, TouchFrame
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
+from era_haptics.lab.witness.witness_cli import parse_endpoint
 from memory_machine import MemoryMachine
 from model.rig.rig import Rig
 from newest_contact import BuzzNewestContact
@@ -30,7 +31,6 @@ from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections
-from sim.witness_relay import parse_endpoint
 from witness_config import LoopWitness
 
 Position = tuple[float, float]

@@ -17,7 +17,7 @@ from controller.daemon.messages import PlateView
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
 from controller.play.planner import PlayReport
-from drivers.judge.watching.capture import Violation
+from era_haptics.lab.witness.capture import Violation
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import hand_written as hand
-from drivers.judge.watching.config import (
+from era_haptics.lab.witness.capture import (
     AmplifierConfig,
     ChannelLimits,
     TimeLimits,

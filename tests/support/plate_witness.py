@@ -12,16 +12,18 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from drivers.judge.watching.amplifier_session import AmplifierSession
-from drivers.judge.watching.capture import Direction
-from drivers.judge.watching.config import WitnessConfig
-from drivers.judge.watching.decoded import A_READ, HELLO, Request
-from drivers.judge.watching.host_rules import CONFIRMED, IN_FLIGHT, SILENCING, HostRules
-from drivers.judge.watching.watched_wire import RECOVERY
-from drivers.judge.watching.witness import Witness
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import LayerSet, is_vibrating
 from era_haptics.lab.expected_output import one_of
+from era_haptics.lab.witness.capture import A_READ, HELLO, Direction, Request, WitnessConfig
+from era_haptics.lab.witness.host_rules import (
+    CONFIRMED,
+    IN_FLIGHT,
+    SILENCING,
+    AmplifierSession,
+    HostRules,
+)
+from era_haptics.lab.witness.witness import RECOVERY, Witness
 
 RULES = {
     "justified": "no vibration is commanded without a contact",

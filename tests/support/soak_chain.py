@@ -17,7 +17,7 @@ from controller.operation.operation_states import DaemonEvent, DaemonState, Trig
 from controller.play.planner import PlayReport
 from controller.sources.touch import Touch, TouchFrame
 from drivers.errors import DriverError
-from drivers.judge.watching.config import TimeLimits
+from era_haptics.lab.witness.capture import TimeLimits
 from plate_witness import PlateTimes
 from registry import threads
 from rig_on_wire import after_each

@@ -7,17 +7,17 @@ from functools import partial
 from typing import Any, get_args
 
 from controller.play.loop import Controller
-from drivers.judge.watching.config import (
+from era_haptics.lab.witness.capture import (
     AmplifierConfig,
     ChannelLimits,
     TimeLimits,
     WitnessConfig,
 )
+from era_haptics.lab.witness.witness_cli import parse_endpoint
 from plate_witness import OperatorCommand, PlateTimes, PlateWitness
 from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.faults import FaultWindow
-from sim.witness_relay import parse_endpoint
 from virtual_loop import VirtualLoop
 
 

@@ -17,7 +17,7 @@ import hand_written as hand
 from chain import Chain
 from controller.sources.touch import Touch, TouchFrame
 from drivers.host.amplifier import Amplifier
-from drivers.judge.watching.capture import Violation
+from era_haptics.lab.witness.capture import Violation
 from model.vibration import Excitation, Tone
 from plate_witness import OperatorCommand
 from registry import threads

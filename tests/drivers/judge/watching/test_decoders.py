@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 
-from drivers.judge.watching.capture import Direction
-from drivers.judge.watching.decoded import Message, Reply, Request
-from drivers.judge.watching.watched_wire import DECODERS
 from drivers.wires.modbus_frames import framed
+from era_haptics.lab.witness.capture import Direction, Message, Reply, Request
+from era_haptics.lab.witness.witness import DECODERS
 
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:

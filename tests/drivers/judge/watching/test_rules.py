@@ -10,8 +10,8 @@ import pytest
 import amplifier_violations
 import hand_written as hand
 import host_violations
-from drivers.judge.watching.capture import read_capture
-from drivers.judge.watching.witness import Witness
+from era_haptics.lab.witness.capture import read_capture
+from era_haptics.lab.witness.witness import Witness
 from hand_written_talk import HALF, Talk
 from plate_witness import RULES
 

@@ -12,7 +12,7 @@ from types import FrameType
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.wires.serial_line import SerialWire
 from registry import threads
 from registry.limits import GuardLimits

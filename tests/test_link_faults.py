@@ -17,7 +17,7 @@ import pytest
 
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.amplifier import Amplifier
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.playing.playback import Voice
+from drivers.playing import Voice
 from model.arrays import FloatArray
 from model.finger import detection_threshold
 from model.rig.rig import Rig

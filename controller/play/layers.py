@@ -32,7 +32,7 @@ from controller.play.routing import (
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer

@@ -37,8 +37,8 @@ import numpy as np
 from controller.play.intent import Pulse
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.playing.contents import Layer as ContentsLayer
-from drivers.playing.contents import Tone
+from drivers.playing import Layer as ContentsLayer
+from drivers.playing import Tone
 from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
 from model import vibration as physics

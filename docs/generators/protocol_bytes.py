@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts

@@ -45,8 +45,8 @@ from drivers.host.amplifier import (
 )
 from drivers.host.dialogue import Staged, Stopped
 from drivers.host.line import Priority
-from drivers.playing.contents import Layer, Tone
-from drivers.playing.contents import Layer as AmplifierLayer
+from drivers.playing import Layer, Tone
+from drivers.playing import Layer as AmplifierLayer
 from drivers.protocol.definition import (
     BOOT_TIME,
     COMMAND,

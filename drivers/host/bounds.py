@@ -1,7 +1,7 @@
 """What a set may lead to at the worst: level, power and rise of a channel over all its layers.
 
 A set plays from an unknown moment in the next tenth of a second: the voices are those of
-`drivers.playing.voices` after a commit that is that uncertain. Along a straight line in the complex
+`drivers.playing` after a commit that is that uncertain. Along a straight line in the complex
 plane a magnitude is a convex function of the way, so that sums are largest where each transition
 is at one of its points.
 
@@ -22,9 +22,18 @@ from operator import index
 from typing import NamedTuple, TypeAlias
 
 from drivers.errors import CommandError, CommandRefused
-from drivers.playing.contents import Layer, Tone
-from drivers.playing.playback import Playback
-from drivers.playing.voices import SAME, Transition, Voice, along, peak_of, steepest, voices_after
+from drivers.playing import (
+    SAME,
+    Layer,
+    Playback,
+    Tone,
+    Transition,
+    Voice,
+    along,
+    peak_of,
+    steepest,
+    voices_after,
+)
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.records import Values, WireQuantity
 from drivers.protocol.sets import Command, LayerSet

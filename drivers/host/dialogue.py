@@ -43,7 +43,7 @@ from drivers.host.line import (
     disarmed,
     driven_by_another,
 )
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from drivers.protocol.definition import (
     AHEAD_MAX,
     ATTEMPTS,

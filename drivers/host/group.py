@@ -30,7 +30,7 @@ from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Ampli
 from drivers.host.dialogue import IsPreempted, Stopped, word_passed_by_all
 from drivers.host.joint_sets import Clocks, JointSets, Members, Played, is_lost, outcomes
 from drivers.host.line import GRACE, Line, Make, Priority
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from drivers.protocol.definition import ENABLED, HEARTBEAT, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after

@@ -34,7 +34,7 @@ from drivers.host.clock import HeldClock
 from drivers.host.dialogue import IsPreempted, Staged, Stopped, word_passed_by_all, words_of
 from drivers.host.ledger import is_silence
 from drivers.host.line import GRACE, Line, Priority
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from drivers.protocol.definition import (
     HEARTBEAT,
     LATCHED,

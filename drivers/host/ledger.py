@@ -23,8 +23,7 @@ from drivers.host.bounds import (
     refused,
     wire_limits,
 )
-from drivers.playing.contents import Layer
-from drivers.playing.playback import Playback
+from drivers.playing import Layer, Playback
 from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from drivers.playing.playback import Playback
+from drivers.playing import Playback
 from drivers.protocol.definition import (
     ENABLED,
     FAULTS,

@@ -17,8 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from typing import Protocol, TypeAlias
 
-from drivers.playing.playback import LAYERS_MAX, Playback, playback_of
-from drivers.playing.voices import Transition, Voice
+from drivers.playing import LAYERS_MAX, Playback, Transition, Voice, playback_of
 from drivers.protocol.definition import (
     HIGH_STEPS,
     MAX_AHEAD,

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.playing.playback import Voice
+from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from drivers.protocol.records import Refusal, Values
 from sim.amplifier.simulated_amplifier import Amplifier

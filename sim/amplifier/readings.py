@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from drivers.playing.playback import Playback
+from drivers.playing import Playback
 from drivers.protocol.definition import (
     CLOCK_TURN,
     FAULTS,

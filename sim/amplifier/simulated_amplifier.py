@@ -2,7 +2,7 @@
 
 Requests and replies are the values of their records (`drivers.protocol.definition`), integers of the
 wire. Events happen at their own time: a watchdog that expired between two calls expired when it was
-due, and what plays is a description in time (`drivers.playing.playback`), not samples.
+due, and what plays is a description in time (`drivers.playing`), not samples.
 
 Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
 where the sum of layers is limited.
@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
-from drivers.playing.playback import Voice, playback_of
+from drivers.playing import Voice, playback_of
 from drivers.protocol.definition import (
     AHEAD_MAX,
     FAULTS,

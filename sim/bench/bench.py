@@ -28,7 +28,7 @@ from typing import Protocol, TypeAlias, final
 
 import numpy as np
 
-from drivers.playing.playback import Voice
+from drivers.playing import Voice
 from drivers.protocol.definition import (
     CLOCK_TURN,
     MAX_WORDS,

@@ -20,7 +20,7 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.playing.playback import Voice
+from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_TURN
 from model.answer.answer import Layer
 from model.answer.stimulus import Finger

@@ -11,7 +11,7 @@ import canopen
 import cantools
 import pytest
 
-from drivers.playing.playback import Playback
+from drivers.playing import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.contract import CHECKS
 from protocol_bytes import BYTES

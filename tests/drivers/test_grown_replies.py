@@ -6,7 +6,7 @@ import hand_written as hand
 from amplifier_eds import eds_text
 from drivers.by_hand.reaching import status_rows
 from drivers.errors import CommandError
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from firmware_records import records_header

@@ -19,7 +19,7 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import FAULTS, STATES
 from model.arrays import FloatArray
 from registry import threads

@@ -13,7 +13,7 @@ from drivers import opening
 from drivers.errors import CommandError, LinkError
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

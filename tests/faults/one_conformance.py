@@ -2,7 +2,7 @@
 
 Run by the judge of planted faults only: the suite has all checks in turn in
 `tests/drivers/judge/asking`. Faults of a simulated amplifier are found on it; those of
-`drivers.playing.playback`, which conformance asks what must be played, on the firmware, which does
+`drivers.playing`, which conformance asks what must be played, on the firmware, which does
 not.
 """
 

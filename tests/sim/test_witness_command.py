@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import STATES
 from era_haptics.lab.cli import app
 from era_haptics.lab.witness.capture import read_capture

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from sim.bench.bench import Bench

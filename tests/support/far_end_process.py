@@ -14,7 +14,7 @@ from typing import Any
 
 from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from model.rig.rig_file import example_rig_path
 from registry.limits import GuardLimits
 

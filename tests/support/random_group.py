@@ -12,7 +12,7 @@ from chain import Chain
 from drivers.errors import CommandRefused, LinkError, Preempted
 from drivers.host.group import Group
 from drivers.host.line import Priority
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import STATES
 from drivers.protocol.sets import Envelope
 from registry import threads

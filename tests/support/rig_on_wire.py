@@ -11,7 +11,7 @@ from drivers.errors import LinkDegraded, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.records import Values
 from memory_machine import MemoryMachine, live_in_memory
 from model.rig.rig import Channel, Rig

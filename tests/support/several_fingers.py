@@ -23,7 +23,7 @@ from controller.play.planner import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray

@@ -12,7 +12,7 @@ import sys
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import QUANTITIES
 from registry.limits import GuardLimits
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.ports import NETWORK_DELAY
 from drivers.protocol.definition import BY_NUMBER, HELLO
 from drivers.wires.can_bus import CanWire

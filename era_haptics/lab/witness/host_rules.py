@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 
-from drivers.playing.playback import Playback
+from drivers.playing import Playback
 from drivers.protocol.definition import LATCHED, QUANTITIES, REACTION, REFUSALS, STATUS, name_of
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_newer_token, is_vibrating

@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
+from drivers import playing as contents
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
-from drivers.playing import contents
 from model.answer.answer import Layer
 from model.calibration.responses import read_sensors
 from model.processes import Progress

@@ -31,7 +31,7 @@ from controller.learning.estimator_process import (
 from controller.learning.learning import Learning
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.identification.forward import Sensor

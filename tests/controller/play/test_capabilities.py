@@ -18,8 +18,8 @@ from controller.play.routing import (
     tones_by_era,
 )
 from drivers.host.ledger import Ledger
-from drivers.playing.contents import Layer
-from drivers.playing.contents import Tone as Played
+from drivers.playing import Layer
+from drivers.playing import Tone as Played
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.errors import InputError

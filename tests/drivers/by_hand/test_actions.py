@@ -10,7 +10,7 @@ from drivers.by_hand import actions
 from drivers.by_hand.reaching import identify_all
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import FEATURES
 from drivers.trace import tracing
 from drivers.urls import with_address

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.by_hand.cli import app as amp_app
 from drivers.errors import CommandError, CommandRefused, LinkError
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import READINGS, STATUS_FLAGS
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.contract import Report

@@ -12,7 +12,7 @@ from drivers.errors import LinkDegraded, Preempted
 from drivers.host.clock import HeldClock
 from drivers.host.group import Group
 from drivers.host.joint_sets import Clocks
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO
 from drivers.wires.serial_line import SerialWire
 from sim.amplifier.readings import AmplifierClock, Crystal

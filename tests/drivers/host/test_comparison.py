@@ -6,7 +6,7 @@ import pytest
 
 from drivers.errors import CommandRefused
 from drivers.host.amplifier import read_measured
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
 from sim.amplifier.readings import capabilities

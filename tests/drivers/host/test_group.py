@@ -17,7 +17,7 @@ from drivers.errors import (
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.host.line import Priority
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier as Host
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import MESSAGES
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire

@@ -15,7 +15,7 @@ from drivers.errors import (
     Overtaken,
     Preempted,
 )
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
 from drivers.protocol.sets import LayerSet
 from drivers.wires.can_bus import CanWire

@@ -11,8 +11,7 @@ import pytest
 
 from drivers.errors import CommandError, CommandRefused
 from drivers.host.ledger import Ledger
-from drivers.playing.contents import Layer, Tone
-from drivers.playing.playback import Playback
+from drivers.playing import Layer, Playback, Tone
 from drivers.protocol.sets import Envelope
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.group import Group
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import CLOCK_UNKNOWN, HIGH_TIME, MESSAGES, SPAN
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import CommandRefused, LinkTimeout
 from drivers.host.group import Group
 from drivers.host.line import Job, Priority
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import word_passed
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames

@@ -8,7 +8,7 @@ import pytest
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from drivers.protocol.sets import Envelope
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire

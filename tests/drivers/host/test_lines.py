@@ -16,7 +16,7 @@ import pytest
 from courses import Taken, courses, follow
 from drivers.host.dialogue import Stopped
 from drivers.host.group import Group
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.protocol.definition import STATES
 from drivers.protocol.records import Values
 from words_line import KINDS, MemoryLine, group_of, losing

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import DriverError, LinkTimeout
 from drivers.host.group import Group
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words

@@ -10,7 +10,7 @@ from drivers.errors import CommandError, LinkError, LinkTimeout
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing.contents import Layer, Tone
+from drivers.playing import Layer, Tone
 from drivers.ports import PORT_OPENER, Port
 from drivers.wires.can_frames import unpack_frames
 from registry.limits import GuardLimits

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.playing.playback import Playback, Voice
+from drivers.playing import Playback, Voice
 from drivers.protocol.sets import Command, Envelope, LayerSet
 
 RAMP = 20  # ms

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from drivers.playing.playback import Playback
+from drivers.playing import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
 

@@ -11,7 +11,7 @@ import pytest
 
 from bench_driving import arm, keep_alive, play
 from benchmarks.direct_plate import direct_acceleration
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bench_driving import SESSION, keep_alive, play
-from drivers.playing.contents import Tone
-from drivers.playing.voices import Transition, Voice
+from drivers.playing import Tone, Transition, Voice
 from model.rig.rig import Channel, Rig
 from plate_in_time import lock_in
 from sim.amplifier.readings import AmplifierClock, Crystal

@@ -14,7 +14,7 @@ import pytest
 
 from bench_driving import play
 from drivers.errors import LinkError
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.bench.bench import Bench

@@ -18,7 +18,7 @@ from desk_card import DeskCard
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
-from drivers.playing.contents import Layer
+from drivers.playing import Layer
 from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import read_sensors
 from model.cli import app

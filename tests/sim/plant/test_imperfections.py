@@ -13,9 +13,7 @@ from numpy.testing import assert_allclose
 from bench_driving import arm, keep_alive, play
 from driven_bases import FINGERTIP
 from driven_bases import motion_of as sampled
-from drivers.playing.contents import Tone
-from drivers.playing.playback import Playback, Voice
-from drivers.playing.voices import Transition
+from drivers.playing import Playback, Tone, Transition, Voice
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from model.arrays import FloatArray
 from model.errors import InputError

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from bench_driving import play
 from controller.cli.main import run
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from drivers.protocol.definition import QUANTITIES, STATES
 from far_end_process import SESSION, far_end_process, playing
 from model.rig.rig import Rig

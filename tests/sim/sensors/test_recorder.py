@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench_driving import play
-from drivers.playing.contents import Tone
+from drivers.playing import Tone
 from full_disk import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig

@@ -1,1 +1,0 @@
-"""What channels are to play, and what they play at a time."""

@@ -11,6 +11,10 @@ from drivers.errors import CommandRefused as CommandRefused
 from drivers.errors import DriverError as DriverError
 from drivers.errors import LinkError as LinkError
 from era_haptics.drive import Drive as Drive
+from era_haptics.lab.design.design_run import Assessment as Assessment
+from era_haptics.lab.design.design_run import Design as Design
+from era_haptics.lab.design.design_run import RankedLayout as RankedLayout
+from era_haptics.lab.design.design_run import design as design
 from era_haptics.plates import SolvedPlate as SolvedPlate
 from era_haptics.plates import draw_answer as draw_answer
 from era_haptics.plates import draw_contents as draw_contents
@@ -36,10 +40,6 @@ from model.answer.stimulus import Course as Course
 from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
 from model.calibration.calibrate import Calibration as Calibration
-from model.design.request import design as design
-from model.design.run import Assessment as Assessment
-from model.design.run import Design as Design
-from model.design.run import RankedLayout as RankedLayout
 from model.errors import InputError as InputError
 from model.finger import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes

@@ -7,10 +7,10 @@ from controller.cli.layout import layout_app
 from controller.cli.play import play
 from drivers.by_hand.cli import EXIT_STATUS as EXIT_STATUS
 from era_haptics.lab.conformance.conformance_cli import conformance
+from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.paper_figures import figure_app
 from era_haptics.lab.report import report
 from era_haptics.lab.witness.witness_cli import witness
-from model.commands.design_cli import design_app
 from sim.desk.impedance_cli import MeasureCommand
 from sim.desk.measure_cli import measure
 from sim.desk.outputs_cli import outputs

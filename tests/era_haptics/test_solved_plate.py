@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from model.design import problem
+from era_haptics.lab.design import problem
 from model.structure.attachments import PointLoad
 from model.vibration import plate_map
 from paper_plate import make_paper_rig

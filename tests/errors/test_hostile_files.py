@@ -14,9 +14,9 @@ from controller.effects.player import read_strengths
 from controller.gateway.settings import read_token
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
+from era_haptics.lab.design.problem import area_of
 from era_haptics.lab.witness import capture
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
-from model.design.area import area_of
 from model.errors import InputError
 from model.identification.learned_plate import load_learned
 from model.rig.rig_file import example_rig_path, load_rig

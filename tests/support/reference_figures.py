@@ -10,15 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
+from era_haptics.lab.design.score import LayoutSearch
 from model.answer.answer_report import Timing
 from model.answer.answer_report import measures as measures_of
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.caching import NUMERICS_VERSION
-from model.design.area import area_of
-from model.design.contacts import anywhere
-from model.design.problem import DesignProblem, layouts_of
-from model.design.search import LayoutSearch
 from model.drive_modes import DRIVE_MODES
 from model.table.table_file import solve_table
 from model.vibration import natural_modes

@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from era_haptics.lab.cli import app as lab_app
+from era_haptics.lab.design import problem, score
 from model.cli import app
 from model.config.document import read_document
-from model.design import problem, search
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
 
@@ -27,7 +27,7 @@ def small(monkeypatch):
     monkeypatch.setitem(problem.CANDIDATES, True, 12)
     monkeypatch.setattr(problem, "SEARCH_FINGERS", 6)
     monkeypatch.setattr(problem, "SEARCH_FREQUENCIES", 3)
-    monkeypatch.setattr(search, "FINEST_STEP", 0.02)
+    monkeypatch.setattr(score, "FINEST_STEP", 0.02)
     monkeypatch.setattr(problem, "JUDGED_SETS", 3)
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imsave
 
-from model.design.area import area_of
-from model.design.contacts import contact_rule
+from era_haptics.lab.design.problem import area_of, contact_rule
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
 

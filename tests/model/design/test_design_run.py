@@ -7,13 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from era_haptics.lab.design.design_run import Design, Runner, judge, layout_keys, rank_layouts
+from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
 from exciter_rig import exciter_rig_text
 from model.config.document import parse_document
-from model.design.area import area_of
-from model.design.contacts import anywhere
-from model.design.layout_keys import layout_keys
-from model.design.problem import DesignProblem, layouts_of
-from model.design.run import Design, Runner, judge, rank_layouts
 from model.processes import on_cluster, on_processes
 from model.rig.rig_file import parse_rig
 from paper_plate import make_paper_rig
@@ -22,7 +19,7 @@ from paper_plate import make_paper_rig
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few layouts together."""
-    monkeypatch.setattr("model.design.run.CHUNK", 4)
+    monkeypatch.setattr("era_haptics.lab.design.design_run.CHUNK", 4)
 
 
 def ranked(runner: Runner, *, seed: int = 0) -> Design:

@@ -8,14 +8,21 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from era_haptics.lab.design import problem as problem_module
+from era_haptics.lab.design.design_run import judge
+from era_haptics.lab.design.problem import (
+    Area,
+    ContactRule,
+    DesignProblem,
+    anywhere,
+    area_of,
+    candidates_of,
+    everywhere,
+    layouts_of,
+    shortfall,
+)
+from era_haptics.lab.design.score import LayoutSearch, Scorer
 from model.arrays import ComplexArray, FloatArray
-from model.design import problem as problem_module
-from model.design.area import Area, area_of, candidates_of, everywhere
-from model.design.contacts import ContactRule, anywhere
-from model.design.problem import DesignProblem, layouts_of, shortfall
-from model.design.run import judge
-from model.design.score import Scorer
-from model.design.search import LayoutSearch
 from model.errors import InputError
 from model.finger import FIVE_POINTS, fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate

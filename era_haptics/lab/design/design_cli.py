@@ -86,9 +86,9 @@ def design(
     as_json: JsonOption = False,
 ) -> None:
     """Find or rank places of ERAs for the best promised contrast."""
+    from era_haptics.lab.design.design_run import design as find
+    from era_haptics.lab.design.design_run import summary, write_design
     from model.config.document import read_document
-    from model.design.outcome import summary, write_design
-    from model.design.request import design as find
     from model.rig.rig_file import rig_of
 
     document = read_document(rig_file)

@@ -1,0 +1,672 @@
+"""Where ERAs may stand: along the edge, anywhere, in polygons, on the white of a picture.
+
+Contact sets for which a plate is designed: fingers with contents, and some quiet ones.
+
+What is sought: a number of ERAs, where they may stand, and the contacts they serve.
+
+A layout supports the plate by its lowest rigid-body mode, and with weight on every ERA. Layouts to
+be ranked are those of a file, or the rig's own, those with a name, and random ones.
+"""
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, Strict
+
+from model.arrays import FloatArray, IntArray, best_of, least_gap
+from model.config.document import read_bytes, read_document
+from model.config.fields import (
+    LENGTH,
+    Point,
+    PointSection,
+    Polygon,
+    PolygonSection,
+    Quantity,
+    Rectangle,
+    Section,
+    Shape,
+    ShapedSection,
+    Validation,
+    box_of,
+)
+from model.errors import InputError
+from model.finger import MAX_CONTACTS, MAX_CONTENTS
+from model.rig.actuator_keys import Identifier
+from model.rig.rig import Rig, named_layouts
+from model.structure.attachments import rigid_body_frequencies, static_loads
+from model.structure.exciter import Actuator
+from model.structure.plate import Plate
+from model.table.table import default_drive_frequencies
+
+EDGE, ANYWHERE = "edge", "anywhere"
+"""Names of the areas that need no file."""
+
+PICTURES = (".png", ".jpg", ".jpeg")
+
+PROPORTION_TOLERANCE = 0.02
+"""By how much the height of a picture may differ from the plate's proportions, relative."""
+
+_PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
+_MAX_BYTES = 16 << 20
+_ON_EDGE = 1e-9  # m
+_MAX_CANDIDATES = 2000
+
+
+@dataclass(frozen=True)
+class Area:
+    """A part of a plate of a length and a width [m], where a function of points (n, 2) is true.
+
+    text: what identifies it: its name, or the content of its file.
+    """
+
+    text: str
+    length: float
+    width: float
+    contains: Callable[[FloatArray], NDArray[np.bool_]]
+
+    def candidates(self, spacing: float) -> FloatArray:
+        """Places on a raster over the plate, edges included."""
+        x, y = (
+            np.linspace(0, side, max(1, round(side / spacing)) + 1)
+            for side in (self.length, self.width)
+        )
+        places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        return places[self.contains(places)]
+
+    def moved(self, place: FloatArray, step: float) -> FloatArray:
+        """A step along x and y, to and fro, no further than the plate's edges."""
+        steps = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        places = np.clip(place + steps, 0, [self.length, self.width])
+        is_other = (np.abs(places - place) > _ON_EDGE).any(axis=1)
+        return places[is_other & self.contains(places)]
+
+
+def area_of(where: str, plate: Plate) -> Area:
+    """The area of a name, a picture or a file of polygons.
+
+    Raises InputError for a picture that cannot be read or has other proportions than the plate, and
+    for another kind of file.
+    """
+    length, width = plate.length, plate.width
+    if where in (EDGE, ANYWHERE):
+        contains = everywhere if where == ANYWHERE else partial(_on_edge, length, width)
+        return Area(where, length, width, contains)
+    path = Path(where)
+    if path.suffix.lower() in PICTURES:
+        content = read_bytes(path, _MAX_BYTES, is_for="draw it smaller", give="a picture")
+        contains = partial(_is_white, _white(path, content, plate), length, width)
+        return Area(content.hex(), length, width, contains)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(
+            f"where must be {EDGE}, {ANYWHERE}, a picture ({', '.join(PICTURES)}) or a .yaml "
+            f"file of polygons, got {where!r}"
+        )
+    document = read_document(path, if_empty="it must have polygons, each a name with its corners")
+    polygons = Validation(document, _PolygonsSection).finish().polygons
+    shapes = [Polygon(tuple(each)) for each in polygons.values()]
+    return Area(document.text, length, width, partial(_in_any, shapes))
+
+
+def everywhere(points: FloatArray) -> NDArray[np.bool_]:
+    """True for every point (n, 2), (n,)."""
+    return np.ones(len(points), dtype=bool)
+
+
+def candidates_of(area: Area, *, count: int) -> tuple[FloatArray, float]:
+    """About a count of candidate places, (c, 2) [m], and how far apart they are [m].
+
+    Raises InputError for an area without any.
+    """
+    size = area.length * area.width
+    spacing = math.sqrt(size / count)
+    if area.text == EDGE:
+        spacing = 2 * (area.length + area.width) / count
+    for _ in range(6):  # of a small area the raster is finer
+        places = area.candidates(spacing)
+        if len(places) >= count / 2:
+            return places, spacing
+        if size / spacing**2 > _MAX_CANDIDATES * 4:
+            break
+        spacing *= 0.7
+    if len(places) == 0:
+        raise InputError(
+            "where must leave room for ERAs on the plate, got none; check that it is in metres, "
+            "from the plate's corner, and white where ERAs may stand"
+        )
+    return places, spacing
+
+
+def _on_edge(length: float, width: float, points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are on the edge of a plate."""
+    gaps = np.minimum(np.abs(points), np.abs([length, width] - points))
+    return np.asarray((gaps <= _ON_EDGE).any(axis=1))
+
+
+def _in_any(polygons: Sequence[Polygon], points: FloatArray) -> NDArray[np.bool_]:
+    """Whether points (n, 2) are in any of some polygons, their edges included."""
+    found = [any(each.contains(x, y) for each in polygons) for x, y in points.tolist()]
+    return np.array(found, dtype=bool)
+
+
+def _is_white(
+    white: NDArray[np.bool_], length: float, width: float, points: FloatArray
+) -> NDArray[np.bool_]:
+    """Whether points are in the white: rows from the top, y = width, down; columns from x = 0."""
+    rows, columns = white.shape
+    column = np.minimum((points[:, 0] / length * columns).astype(int), columns - 1)
+    row = np.minimum(((1 - points[:, 1] / width) * rows).astype(int), rows - 1)
+    return np.asarray(white[row, column])
+
+
+class _PolygonsSection(Section):
+    """Polygons in which ERAs may stand, by name."""
+
+    polygons: Annotated[dict[Identifier, PolygonSection], Field(min_length=1, max_length=256)]
+
+
+def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
+    """Pixels brighter than half, (rows, columns), of a picture with the plate's proportions.
+
+    To PROPORTION_TOLERANCE, or half a pixel.
+    """
+    from matplotlib.image import imread
+
+    try:
+        with warnings.catch_warnings(action="error"):  # of one that takes more memory than it may
+            pixels = np.asarray(imread(io.BytesIO(content), path.suffix[1:].lower()), dtype=float)
+    except Exception as error:  # of a damaged file anything
+        raise InputError(
+            f"{path}: cannot be read as a picture; save it as PNG or JPEG, of {_PICTURE_SIDE} "
+            "pixels a side or less"
+        ) from error
+    rows, columns = pixels.shape[:2]
+    expected = columns * plate.width / plate.length
+    if abs(rows - expected) > max(PROPORTION_TOLERANCE * expected, 0.5):
+        scale = _PICTURE_SIDE / max(plate.length, plate.width)
+        across, up = (max(1, round(side * scale)) for side in (plate.length, plate.width))
+        raise InputError(
+            f"{path}: must have the proportions of the plate of {plate.length:g} m by "
+            f"{plate.width:g} m, got {columns} by {rows} pixels; draw the whole plate, without a "
+            f"margin, for example on {across} by {up} pixels"
+        )
+    grey = pixels if pixels.ndim == 2 else pixels[..., :3].mean(axis=-1)
+    return np.asarray(grey > (127.5 if grey.max() > 1 else 0.5))
+
+
+DEFAULT_APART = 0.05
+"""Distance [m] between the fingers of a set."""
+
+DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
+"""Fewest and most quiet fingers beside one content, and beside several."""
+
+MIN_FINGERS = 2
+"""Fingers of a set."""
+
+_MAX_TRIES = 20_000
+_DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
+
+Draw = Callable[[np.random.Generator, int], FloatArray]
+"""Draws places [m] (n, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRule:
+    """Distribution of contact sets: anywhere, in regions, or those given.
+
+    quiet: fewest and most quiet fingers; apart [m]: between fingers; draw: of places; given: sets
+    of contacts (fingers, 2) [m], which replace all that; contents: how
+    many fingers of a set, its first ones, feel a content of their own.
+    """
+
+    quiet: tuple[int, int]
+    apart: float
+    draw: Draw
+    given: tuple[FloatArray, ...] = ()
+    contents: int = 1
+
+    def sets(self, count: int, *, seed: int) -> list[FloatArray]:
+        """Draw about a count of sets, as many for each number of quiet fingers.
+
+        Those given are taken in turn. Raises InputError where fingers find no room.
+        """
+        rng = np.random.default_rng(seed)
+        if self.given:
+            order = rng.permutation(len(self.given))
+            return [self.given[number] for number in order[:count]]
+        low, high = self.quiet
+        kinds = high - low + 1
+        return [self._one(rng, self.contents + low + number % kinds) for number in range(count)]
+
+    def pooled_sets(self, fingers: int, *, seed: int) -> list[FloatArray]:
+        """Sets of a number of fingers only, far apart, each the first once for each number.
+
+        For what is computed once for each finger. Sets given are taken as they are, up to three for
+        each finger.
+        """
+        low, high = self.quiet
+        if self.given:
+            return self.sets(fingers * 3, seed=seed)
+        rng = np.random.default_rng(seed)
+        pool = self.draw(rng, 1)
+        while len(pool) < fingers:
+            drawn = self.draw(rng, _DRAWN_FOR_EACH)
+            gaps = np.linalg.norm(drawn[:, None] - pool, axis=-1).min(axis=1)
+            pool = np.vstack([pool, drawn[best_of(gaps)]])
+        return [
+            pool[self._others(rng, pool, first, self.contents - 1 + quiet)]
+            for quiet in range(low, high + 1)
+            for first in range(fingers)
+        ]
+
+    def _others(
+        self, rng: np.random.Generator, pool: FloatArray, first: int, count: int
+    ) -> IntArray:
+        """Numbers of a finger and a count of others of a pool that are far enough apart."""
+        for _ in range(_MAX_TRIES):
+            others = rng.choice(len(pool), count, replace=False)
+            numbers = np.concatenate([[first], others])
+            if least_gap(pool[numbers]) > self.apart:
+                return np.asarray(numbers)
+        raise self._no_room(count + 1)
+
+    def _one(self, rng: np.random.Generator, fingers: int) -> FloatArray:
+        for _ in range(_MAX_TRIES):
+            places = self.draw(rng, fingers)
+            if least_gap(places) > self.apart:
+                return places
+        raise self._no_room(fingers)
+
+    def _no_room(self, fingers: int) -> InputError:
+        return InputError(
+            f"{fingers} fingers {1000 * self.apart:g} mm apart must find room in the regions of "
+            f"contacts, got none in {_MAX_TRIES} draws; lower apart or quiet, or enlarge the "
+            "regions"
+        )
+
+
+def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
+    """Fingers with contents and DEFAULT_QUIET ones anywhere on a plate."""
+    draw = partial(_drawn, [Rectangle(0.0, 0.0, plate.length, plate.width)], plate)
+    return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_APART, draw, contents=contents)
+
+
+def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactRule:
+    """The rule of a file, regions as those of a surface layout, or sets; `anywhere` for None.
+
+    contents: at the same time, each for a finger of its own. Raises ConfigError for what is wrong
+    in the file.
+    """
+    if not 1 <= contents <= MAX_CONTENTS:
+        raise InputError(f"contents must be 1 to {MAX_CONTENTS}, got {contents}")
+    if path is None:
+        return anywhere(plate, contents)
+    document = read_document(path, if_empty="it must have regions or sets")
+    validation = Validation(document, _ContactsSection)
+    for name in validation.mapping(("regions",)):
+        region = validation.part(("regions", name), _RegionSection)
+        problem = region and region.shape_problem((plate.length, plate.width))
+        if problem:
+            validation.add(("regions", name, *problem[0]), problem[1])
+    section = validation.finish()
+    given = tuple(np.array([*each.first, *each.quiet]) for each in section.sets)
+    problems = [
+        f"sets[{number}] must have {contents} fingers with contents, target or own, and another "
+        f"finger, got {len(each.first)} and {len(each.quiet)} quiet ones"
+        for number, each in enumerate(section.sets)
+        if len(each.first) != contents or len(each.first) + len(each.quiet) < MIN_FINGERS
+    ]
+    problems += [
+        f"sets[{number}] must be on the plate, from (0, 0) to ({plate.length:g}, {plate.width:g}) "
+        f"m, got ({x:g}, {y:g}) m"
+        for number, contacts in enumerate(given)
+        for x, y in contacts.tolist()
+        if not plate.contains(x, y)
+    ]
+    if bool(section.sets) == bool(section.regions):
+        problems.append(f"must have regions or sets, got {'both' if section.sets else 'neither'}")
+    low, high = section.quiet or DEFAULT_QUIET[contents == 1]
+    least = max(0, MIN_FINGERS - contents)
+    if not least <= low <= high <= MAX_CONTACTS - contents:
+        problems.append(
+            f"quiet must be two numbers from {least} to {MAX_CONTACTS - contents}, ascending, got "
+            f"{low}, {high}"
+        )
+    if problems:
+        raise InputError(f"{document.source}: {problems[0]}")
+    draw = partial(_drawn, [region.shape for region in section.regions.values()], plate)
+    return ContactRule((low, high), section.apart, draw, given, contents)
+
+
+def _drawn(
+    shapes: Sequence[Shape], plate: Plate, rng: np.random.Generator, count: int
+) -> FloatArray:
+    """Draw each finger in one of some shapes, each as likely as another."""
+    chosen = rng.integers(len(shapes), size=count)
+    return np.array([_place_in(shapes[number], plate, rng) for number in chosen])
+
+
+def _place_in(shape: Shape, plate: Plate, rng: np.random.Generator) -> Point:
+    """A place [m] of the plate in a shape; raises InputError where there is none."""
+    box = box_of(shape)
+    for _ in range(_MAX_TRIES):
+        x, y = rng.uniform(*box).tolist()
+        if plate.contains(x, y) and shape.contains(x, y):
+            return x, y
+    raise InputError("regions of contacts must have an area, got one that has none")
+
+
+class _RegionSection(ShapedSection):
+    """A region; what it plays, in a surface layout, does not matter here."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _SetSection(Section):
+    target: PointSection | None = None
+    own: Annotated[list[PointSection], Field(max_length=MAX_CONTENTS, default_factory=list)]
+    quiet: Annotated[
+        list[PointSection],
+        Field(max_length=MAX_CONTACTS - MAX_CONTENTS, default_factory=list),
+    ]
+
+    @property
+    def first(self) -> list[PointSection]:
+        """Fingers with contents."""
+        return self.own if self.target is None else [self.target, *self.own]
+
+
+class _ContactsSection(Section):
+    """Contacts of a design. Effects and the like of a surface layout are passed over."""
+
+    quiet: Annotated[tuple[int, int], Strict(strict=False)] | None = None
+    apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_APART
+    regions: Annotated[
+        dict[Identifier, _RegionSection], Field(min_length=1, max_length=256, default_factory=dict)
+    ]
+    sets: Annotated[list[_SetSection], Field(min_length=1, max_length=1000, default_factory=list)]
+    effects: Any = None
+    elsewhere: Any = None
+
+
+DEFAULT_LOWEST = 20.0
+"""Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
+
+MIN_SUPPORTING = 3
+"""ERAs, and other mounts, that can support a plate."""
+
+_ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
+
+
+def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
+    """How far ERAs are from supporting a rig's plate, 0 if they do.
+
+    lowest [Hz]: least rigid-body frequency. No mount may be pulled upwards by the plate's weight,
+    so that the centre of mass is within them and the plate does not tip.
+    """
+    frequency = float(rigid_body_frequencies(rig.plate, eras, loads=rig.masses)[0])
+    if frequency < 1e-3:
+        return 2.0
+    loads = static_loads(rig.plate, eras, loads=rig.masses)
+    pulled = -float(loads.min() / loads.mean())
+    return max(0.0, 1 - frequency / lowest) + (pulled if pulled > _ROUNDING else 0.0)
+
+
+CANDIDATES = {True: 48, False: 80}
+"""Candidates along the edge, and over an area."""
+
+SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
+
+JUDGED_SETS = 200
+"""Contact sets by which layouts are judged, other than those of the search."""
+
+PROBLEM_DEFAULT_APART = 0.03
+"""Least distance [m] of two ERAs."""
+
+_JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
+
+
+@dataclass(frozen=True, eq=False)
+class DesignProblem:
+    """What is sought.
+
+    kept: ERAs of the rig that stay, by name; count: of all ERAs; apart [m]: least distance of two;
+    lowest [Hz]: least rigid-body frequency; stiffness [N/m]: of ERAs that do not stay, None: that
+    of the rig's. Raises InputError for fewer ERAs than can support the plate.
+    """
+
+    rig: Rig
+    count: int
+    area: Area
+    contacts: ContactRule
+    kept: tuple[str, ...] = ()
+    apart: float = PROBLEM_DEFAULT_APART
+    lowest: float = DEFAULT_LOWEST
+    seed: int = 0
+    stiffness: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the number of ERAs."""
+        if self.count + self.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"eras must be at least {MIN_SUPPORTING - self.supports} to support the plate, "
+                f"got {self.count}"
+            )
+
+    @property
+    def supports(self) -> int:
+        """Mounts beside the ERAs."""
+        return sum(load.stiffness > 0 for load in self.rig.masses)
+
+    @property
+    def kept_positions(self) -> FloatArray:
+        """Places [m] of the ERAs that stay, (k, 2)."""
+        eras = [self.rig.era(name) for name in self.kept]
+        return np.array([[era.x, era.y] for era in eras]).reshape(-1, 2)
+
+    @property
+    def own_positions(self) -> FloatArray:
+        """Places [m] of the rig's own ERAs, (eras, 2)."""
+        return np.array([[era.x, era.y] for era in self.rig.eras])
+
+    @property
+    def like(self) -> Actuator:
+        """The rig's ERA like which those are that do not stay."""
+        return next((era for era in self.rig.eras if era.name not in self.kept), self.rig.eras[0])
+
+    def eras(self, positions: FloatArray) -> tuple[Actuator, ...]:
+        """ERAs at positions [m] (n, 2): those kept, and more like the first of the others.
+
+        Named E1, E2, ... by names that no kept ERA has.
+        """
+        like = self.like
+        if self.stiffness is not None:
+            like = replace(like, stiffness=self.stiffness)
+        names = (name for number in range(1, 999) if (name := f"E{number}") not in self.kept)
+        return tuple(self.rig.era(name) for name in self.kept) + tuple(
+            replace(like, name=next(names), x=float(x), y=float(y))
+            for x, y in positions[len(self.kept) :]
+        )
+
+    def rig_with(self, positions: FloatArray) -> Rig:
+        """The rig with ERAs at positions, without wiring."""
+        return replace(self.rig, eras=self.eras(positions), wiring={}, amplifiers={})
+
+    def shortfall(self, positions: FloatArray) -> float:
+        """How far ERAs at positions are from supporting the plate, 0 if they do."""
+        return shortfall(self.rig, self.eras(positions), lowest=self.lowest)
+
+    @property
+    def searched_frequencies(self) -> FloatArray:
+        """Frequencies [Hz] of the scores, some of those of the rig's tables, (f,).
+
+        As many times more as there are contents, each of which needs some of its own: three at
+        all 47 follow answers with a correlation of 0.83, at 16 of 0.49 (16 layouts of four ERAs).
+        """
+        every = default_drive_frequencies(self.rig.limits)
+        count = min(len(every), SEARCH_FREQUENCIES * self.contacts.contents)
+        chosen = np.linspace(0, len(every) - 1, count).round()
+        return np.asarray(every[chosen.astype(int)])
+
+    def judged_sets(self) -> list[FloatArray]:
+        """Contact sets that no search has seen, (fingers, 2) [m] each."""
+        return self.contacts.sets(JUDGED_SETS, seed=self.seed + _JUDGED_SEED)
+
+    @property
+    def candidates(self) -> FloatArray:
+        """Places [m] from which a search begins, (c, 2); raises InputError where there are none."""
+        return self._raster[0]
+
+    @property
+    def spacing(self) -> float:
+        """Distance [m] of candidates."""
+        return self._raster[1]
+
+    @cached_property
+    def _raster(self) -> tuple[FloatArray, float]:
+        return candidates_of(self.area, count=CANDIDATES[self.area.text == EDGE])
+
+    def open_candidates(self, positions: FloatArray) -> IntArray:
+        """Numbers of candidates far enough from positions (n, 2) [m].
+
+        Raises InputError where there are none.
+        """
+        gaps = np.linalg.norm(self.candidates[:, None] - positions, axis=-1)
+        found = np.flatnonzero(gaps.min(axis=1, initial=np.inf) >= self.apart)
+        if not len(found):
+            raise InputError(
+                f"where must have room for {self.count} ERAs {1000 * self.apart:g} mm apart, got "
+                f"room for {len(positions)}; enlarge it, or reduce eras or apart"
+            )
+        return found
+
+    def are_apart(self, positions: FloatArray) -> bool:
+        """Whether positions (n, 2) [m] keep the least distance."""
+        return least_gap(positions) >= self.apart
+
+    def random_layout(self, rng: np.random.Generator) -> FloatArray:
+        """ERAs at candidates by chance, those kept first, far enough apart: (count, 2) [m].
+
+        Raises InputError where there is no room for so many.
+        """
+        found = self.kept_positions
+        while len(found) < self.count:
+            place = self.candidates[rng.choice(self.open_candidates(found))]
+            found = np.vstack([found, place])
+        return found
+
+
+OWN = "own"
+"""Name of the rig's own layout."""
+
+MAX_LAYOUTS = 1_000_000
+
+_RANDOM = re.compile(r"random:(\d{1,9})")
+_TRIES = 20  # draws for each layout, of which some are there already
+
+NamedLayouts = dict[str, FloatArray]
+"""Positions [m] (n, 2) of the ERAs by the name of a layout, those kept first."""
+
+
+class _LayoutsSection(Section):
+    """Places of the ERAs that are not kept, by the name of the layout."""
+
+    layouts: Annotated[
+        dict[str, Annotated[list[PointSection], Field(min_length=1, max_length=32)]],
+        Field(min_length=1),
+    ]
+
+
+def supported_layouts(
+    text: str, problems: Sequence[DesignProblem]
+) -> dict[DesignProblem, NamedLayouts]:
+    """The `layouts_of` each problem; raises InputError where none supports the plate."""
+    given = {problem: layouts_of(text, problem) for problem in problems}
+    if not any(
+        problem.shortfall(each) == 0 for problem in given for each in given[problem].values()
+    ):
+        raise InputError(
+            f"a given layout must support the plate with its lowest rigid-body frequency at "
+            f"least {problems[0].lowest:g} Hz and weight on each ERA, got none that does; add ERAs "
+            "or stiffer ones, widen where, or reduce lowest"
+        )
+    return given
+
+
+def layouts_of(text: str, problem: DesignProblem) -> NamedLayouts:
+    """The layouts of `random:N` or of a file; raises InputError for what is wrong in it."""
+    found = _RANDOM.fullmatch(text)
+    if found is None:
+        return _layouts_of_file(Path(text), problem)
+    count = int(found[1])
+    if not 1 <= count <= MAX_LAYOUTS:
+        raise InputError(f"layouts must be random:1 to random:{MAX_LAYOUTS}, got {text}")
+    return random_layouts(problem, count)
+
+
+def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
+    """A number of different layouts: the rig's own, those with a name, others at candidates.
+
+    The first two where they are in the area. Fewer where there are no more; a longer list starts
+    with a shorter one.
+    """
+    found: NamedLayouts = {}
+    known: set[bytes] = set()
+    for name, positions in _problem_drawn(problem, count):
+        key = np.unique(positions.round(9), axis=0).tobytes()
+        if key not in known:
+            known.add(key)
+            found[name or f"{problem.count}-{len(found) + 1:06d}"] = positions
+        if len(found) == count:
+            break
+    return found
+
+
+def _problem_drawn(problem: DesignProblem, count: int) -> Iterator[tuple[str, FloatArray]]:
+    """Names, empty for random ones, and positions."""
+    if len(problem.rig.eras) == problem.count and not problem.kept:
+        yield OWN, problem.own_positions
+    kept = problem.kept_positions
+    for layout in named_layouts(problem.count - len(kept)):
+        others = layout.positions(problem.rig.plate)
+        positions = np.vstack([kept, others])
+        if problem.area.contains(others).all() and problem.are_apart(positions):
+            yield layout.name, positions
+    rng = np.random.default_rng(problem.seed)
+    for _ in range(_TRIES * count):
+        yield "", problem.random_layout(rng)
+
+
+def _layouts_of_file(path: Path, problem: DesignProblem) -> NamedLayouts:
+    document = read_document(path, if_empty="it must have layouts, each a name with places")
+    validation = Validation(document, _LayoutsSection)
+    plate, found = problem.rig.plate, {}
+    for name, places in validation.finish().layouts.items():
+        positions = np.vstack([problem.kept_positions, np.array(places)])
+        where = f"{path}: layouts.{name}"
+        for x, y in places:
+            if not plate.contains(x, y):
+                raise InputError(
+                    f"{where} must be on the plate, from (0, 0) to ({plate.length:g}, "
+                    f"{plate.width:g}) m, got ({x:g}, {y:g}) m"
+                )
+        if len(positions) + problem.supports < MIN_SUPPORTING:
+            raise InputError(
+                f"{where} must have at least {MIN_SUPPORTING} mounts to support the plate, got "
+                f"{len(positions) + problem.supports}"
+            )
+        if not problem.are_apart(positions):
+            raise InputError(
+                f"{where} must have ERAs at least {1000 * problem.apart:g} mm apart; move them, or "
+                "reduce apart"
+            )
+        found[name] = positions
+    return found

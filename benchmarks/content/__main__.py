@@ -58,8 +58,8 @@ def _print_alone(patterns: "Sequence[Pattern]") -> bool:
     import numpy as np
 
     from benchmarks.content.session import CASE
-    from controller.check.content_check import MAX_DELAY, check_content
     from controller.content.rendition import rendered
+    from era_haptics.lab.checks.content_check import MAX_DELAY, check_content
 
     table, delays = CASE.table, np.linspace(0, MAX_DELAY, 11)
     shares, lost = [], 0

@@ -2,10 +2,9 @@
 
 import typer
 
-from controller.cli.content import content_app
-from controller.cli.layout import layout_app
-from controller.cli.play import play
 from drivers.by_hand.cli import EXIT_STATUS as EXIT_STATUS
+from era_haptics.lab.checks.content_cli import content_app, play
+from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.paper_figures import figure_app

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.check.content_check import check_content, kept_shares
-from controller.check.simulated_touch import loaded_plate
 from controller.content.pattern import Pattern, Transient
+from era_haptics.lab.checks.content_check import check_content, kept_shares
+from era_haptics.lab.checks.layout_check import loaded_plate
 from era_haptics.lab.cli import app
 from model.errors import InputError
 from model.finger import (

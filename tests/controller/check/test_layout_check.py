@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from controller.check import layout_check, layout_together
-from controller.check.layout_check import CheckedEffect, check_layout
-from controller.check.representative import strongest_target
 from controller.cli.main import run as run_era
 from controller.content.pattern import Pattern
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import BUILT_IN, Buzz, Click, Detents, Dial, File, Ramp, Texture
 from controller.effects.layout import SurfaceLayout, load_layout
+from era_haptics.lab.checks import layout_check, layout_picture
+from era_haptics.lab.checks.layout_check import CheckedEffect, check_layout, strongest_target
 from era_haptics.lab.cli import app
 from long_form import in_turn
 from model.config.fields import Circle, Rectangle
@@ -229,7 +228,7 @@ def test_files_that_config_init_writes_fit_each_other(
     """Each beside the rig; fingers in any two regions of the layout are promised 4 dB at once."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(layout_check, "MAX_TOUCHES", 20)
-    monkeypatch.setattr(layout_together, "MAX_TRIPLES", 0)
+    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
     assert run_era(["config", "init", "rig.yaml"]) == 0
     if kind != "rig":
         assert run_era(["config", "init", f"{kind}.yaml", "--kind", kind]) == 0

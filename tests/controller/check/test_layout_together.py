@@ -9,8 +9,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from controller.check import layout_together
-from controller.check.layout_together import Together, check_together, close_pairs, matrix_of
 from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
@@ -19,6 +17,8 @@ from controller.play.intent import HapticIntent
 from controller.play.layer_contents import Prediction
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
+from era_haptics.lab.checks import layout_picture
+from era_haptics.lab.checks.layout_picture import Together, check_together, close_pairs, matrix_of
 from model.config.fields import Rectangle
 from only import phased, wants
 from several_fingers import playable, table
@@ -146,8 +146,8 @@ def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
 
 def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bound on what is computed keeps the pair that is hardest to tell apart."""
-    monkeypatch.setattr(layout_together, "MAX_PAIRS", 1)
-    monkeypatch.setattr(layout_together, "MAX_TRIPLES", 0)
+    monkeypatch.setattr(layout_picture, "MAX_PAIRS", 1)
+    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
     regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
     silent = Region("silent", Rectangle(0.03, 0.10, SIZE, SIZE))
     (found,) = check_together(layout(*regions, silent), table())

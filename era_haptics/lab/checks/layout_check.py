@@ -1,4 +1,9 @@
-"""Check of a surface layout on the plate of a table: how every region will feel."""
+"""One touch of an effect simulated in time: what the finger feels, and what a resting one does.
+
+What an effect makes felt in general: its strongest stimulus, at rest and along some ways.
+
+Check of a surface layout on the plate of a table: how every region will feel.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -7,15 +12,231 @@ from typing import Any
 
 import numpy as np
 
-from controller.check.representative import strongest_target
-from controller.check.simulated_touch import Position, SimulatedTouch, TouchSimulator
-from controller.effects.effect import ON_RELEASE, Region
+from controller.effects.effect import ON_RELEASE, Effect, EffectStimulus, Region
 from controller.effects.layout import ELSEWHERE, SurfaceLayout
 from controller.effects.player import CLICK_ABOVE_DB, NOTICED_ABOVE_DB
 from controller.play.intent import Target, band_problem
+from controller.play.joint_answers import answered
+from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
+from controller.play.selection import Chooser
+from controller.sources.touch import Contact, ContactKey
+from model.answer.answer import Answer, Limits
+from model.answer.answer_report import exposures
+from model.arrays import NEARLY, FloatArray
+from model.drive_modes import DRIVE_MODES
+from model.errors import InputError
+from model.finger import decibels, fingertip_points, fingertip_weights, over_threshold
 from model.processes import Progress, unseen
+from model.structure.attachments import fingertip_loads
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
+from model.transients.base_motion import Bases, ramped_pulse
+from model.transients.shaping import SAMPLE_RATE, Transients
+from model.transients.time_response import PlateInTime, plate_in_time
+from model.vibration import base_amplitudes
+
+Position = tuple[float, float]
+
+STEADY_AFTER, STEADY_FOR = 0.3, 0.1
+"""Start and length [s] of the part over which a vibration without a duration is felt."""
+
+_AFTER = 0.1  # s; what a resting finger feels after the end counts, too
+
+
+@dataclass(frozen=True)
+class SimulatedTouch:
+    """A touch at a position [m], with a resting finger [m] or None.
+
+    frequencies [Hz]; felt_db_sl: over the duration of the effect; resting_db_sl: the strongest that
+    the resting finger feels over as long, None without one; promised_contrast_db: over that finger
+    on nine of ten plates; held_back_db: by how much it is weaker for that finger; exposure_m_s2: of
+    it at full strength (`exposures`); reason: why nothing plays.
+    """
+
+    at: Position
+    resting: Position | None
+    frequencies: tuple[float, ...] = ()
+    felt_db_sl: float | None = None
+    resting_db_sl: float | None = None
+    promised_contrast_db: float | None = None
+    reason: str | None = None
+    held_back_db: float = 0.0
+    exposure_m_s2: float = 0.0
+
+
+def loaded_plate(table: LocalizationTable, contacts: Sequence[Position]) -> PlateInTime:
+    """A table's plate in time with fingers on it, if they weigh anything."""
+    if table.fingertip is None:
+        return table.in_time
+    loads = fingertip_loads(table.fingertip, contacts)
+    return plate_in_time(table.in_time.reduced, table.eras, loads=table.masses, contacts=loads)
+
+
+class TouchSimulator:
+    """Plays effects as the controller does, along plain ramps, on the plate of a table in time.
+
+    The fingers weigh on it.
+    """
+
+    def __init__(self, table: LocalizationTable) -> None:
+        self.table = table
+        self.chooser = Chooser(table)
+        """Chooses what is played beside other contents."""
+        self.capabilities = PlaybackCapabilities(
+            drive_mode=DRIVE_MODES[-1],
+            playable=DRIVE_MODES,
+            limits=Limits((float(table.frequencies[0]), float(table.frequencies[-1]))),
+            envelope_support=RAMPS_ONLY,
+        )
+        """Of amplifiers that play whatever the table has."""
+
+    def answered(self, target: Target, at: Position, quiet: Sequence[Position]) -> Answer:
+        """Answer a target at a position [m] among quiet fingers, along plain ramps.
+
+        Raises InputError where nothing can be played.
+        """
+        finger = Contact(target.key, *at, since=0.0)
+        others = [
+            Contact(ContactKey("quiet", number), *place, since=0.0)
+            for number, place in enumerate(quiet)
+        ]
+        return answered(self.table, [(finger, target)], others, self.capabilities, before={})
+
+    def touch(self, target: Target, at: Position, resting: Position | None) -> SimulatedTouch:
+        """Play a target's content at a finger."""
+        try:
+            answer = self.answered(target, at, [] if resting is None else [resting])
+        except InputError as error:
+            return SimulatedTouch(at, resting, reason=str(error))
+        layer, pulse, expected = answer.layers[0], target.pulse, answer.fingers[0]
+        is_whole = pulse is not None and pulse.is_raised
+        since = 0.0 if is_whole else STEADY_AFTER
+        duration = pulse.duration if pulse is not None and is_whole else STEADY_FOR
+        end, eras = since + duration, self.table.eras
+        bases = ramped_pulse(layer.excitation, eras, ramp=layer.ramp, duration=end)
+        transients = Transients(
+            loaded_plate(self.table, [at] if resting is None else [at, resting])
+        )
+        felt = self._levels_at(transients, at, bases, length=duration, until=end)
+        level = float(felt[round(since * SAMPLE_RATE)])
+        resting_level = promised = None
+        if resting is not None:
+            over = self._levels_at(transients, resting, bases, length=duration, until=end + _AFTER)
+            resting_level = float(over[round(since * SAMPLE_RATE) :].max())
+            promised = expected.promised_contrast_db
+        return SimulatedTouch(
+            at,
+            resting,
+            tuple(base_amplitudes(layer.excitation, eras)[0].tolist()),
+            level,
+            resting_level,
+            promised,
+            held_back_db=0.0 if answer.stroke_factor < 1 - NEARLY else expected.lowered_db,
+            exposure_m_s2=exposures(self.table, answer)[0],
+        )
+
+    def _levels_at(
+        self,
+        transients: Transients,
+        at: Position,
+        bases: Bases,
+        *,
+        length: float,
+        until: float,
+    ) -> FloatArray:
+        """Level [dB SL] of the rms over each stretch of a length [s] up to a time [s], (n,).
+
+        Mean over a fingertip; one value for each sample at which a stretch starts.
+        """
+        plate = self.table.plate
+        points, weights = fingertip_points(*at, plate), fingertip_weights(*at, plate)
+        acceleration = transients.acceleration(bases, points, duration=until)
+        felt = over_threshold(acceleration, SAMPLE_RATE, self.table.threshold)
+        total = np.vstack([np.zeros(len(points)), np.cumsum(felt**2, axis=0)])
+        count = min(round(length * SAMPLE_RATE), len(total) - 1)
+        mean = np.maximum((total[count:] - total[:-count]) / count, 0.0)
+        return decibels(math.sqrt(2) * np.sqrt(mean) @ weights)
+
+
+_REPORT = 0.01  # s; between two reports of the panel
+_WATCHED = 3.0  # s; of an effect that changes with time
+_MAX_STEPS = 2000
+_WAY = 0.12  # m
+_SPEEDS = (0.05, 0.2, 1.0, 5.0)  # m/s
+_TURNING_RADIUS = 0.02  # m
+
+
+_KEY = ContactKey("check", 1)
+
+
+def strongest_target(
+    layout: SurfaceLayout, name: str, region: Region | None, *, at: tuple[float, float]
+) -> Target | None:
+    """Return what an effect, by name, makes felt most in a region, or outside of all; or None.
+
+    at [m]: where a finger comes down. An effect for motion is moved along x, y and around `at`.
+    """
+    effect, level = layout.effects[name], layout.level_of(name, region)
+    watch = _while_moving if effect.is_for_motion else _while_resting
+    strongest = max(watch(effect, region, level, at), key=_strength, default=None)
+    if strongest is None:
+        return None
+    priority = 0 if region is None else region.priority
+    band = layout.band_of(name, region)
+    return strongest.target(_KEY, name, region, band=band, priority=priority)
+
+
+def _strength(stimulus: EffectStimulus) -> float:
+    return math.inf if stimulus.level_db_sl is None else stimulus.level_db_sl
+
+
+def _while_resting(
+    effect: Effect, region: Region | None, level: float | None, at: tuple[float, float]
+) -> Iterator[EffectStimulus]:
+    contact = _finger(at)
+    run = effect.start_in(region, contact, 0.0, level_db_sl=level)
+    now: float | None = 0.0
+    for _ in range(_MAX_STEPS):
+        if now is None or now > _WATCHED:
+            return
+        felt = run.feel(contact, now)
+        if felt is None:
+            return
+        if isinstance(felt, EffectStimulus):
+            yield felt
+        now = None if felt.until is None else max(felt.until, now + 1e-6)
+
+
+def _while_moving(
+    effect: Effect, region: Region | None, level: float | None, at: tuple[float, float]
+) -> Iterator[EffectStimulus]:
+    for speed in _SPEEDS:
+        for along in ((1.0, 0.0), (0.0, 1.0), None):
+            count = max(2, math.ceil(_WAY / speed / _REPORT)) + 8
+            way = [_along(at, along, step * speed * _REPORT) for step in range(count)]
+            run = effect.start_in(region, _finger(way[0]), 0.0, level_db_sl=level)
+            for step, position in enumerate(way):
+                felt = run.feel(_finger(position), step * _REPORT)
+                if isinstance(felt, EffectStimulus):
+                    yield felt
+
+
+def _along(
+    at: tuple[float, float], direction: tuple[float, float] | None, distance: float
+) -> tuple[float, float]:
+    """Return the position [m] after a distance [m] in a direction, None for around a circle."""
+    if direction is not None:
+        return (at[0] + distance * direction[0], at[1] + distance * direction[1])
+    angle = distance / _TURNING_RADIUS
+    return (
+        at[0] + _TURNING_RADIUS * math.cos(angle),
+        at[1] + _TURNING_RADIUS * math.sin(angle),
+    )
+
+
+def _finger(at: tuple[float, float]) -> Contact:
+    return Contact(_KEY, *at, since=0.0)
+
 
 LEVEL_TOLERANCE, MARGIN_TOLERANCE = 2.0, 4.0
 """How far [dB] a level may be off, and above where it is promised on nine of ten plates."""

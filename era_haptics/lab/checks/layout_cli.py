@@ -11,7 +11,7 @@ from model.quantities import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from controller.check.layout_check import CheckedEffect
+    from era_haptics.lab.checks.layout_check import CheckedEffect
     from model.arrays import FloatArray
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts.")
@@ -39,9 +39,9 @@ def check(
     """
     import time
 
-    from controller.check.layout_check import check_layout
-    from controller.check.layout_together import check_together, close_pairs, matrix_of
     from controller.effects.layout import load_layout
+    from era_haptics.lab.checks.layout_check import check_layout
+    from era_haptics.lab.checks.layout_picture import check_together, close_pairs, matrix_of
     from model.commands.options import progress_bar
     from model.files.array_file import check_picture_name
     from model.table.table_file import load_table
@@ -58,7 +58,7 @@ def check(
     elapsed = time.perf_counter() - started
     files = []
     if picture is not None:
-        from controller.check.picture import check_figure
+        from era_haptics.lab.checks.layout_picture import check_figure
         from model.figures import save_figure
 
         save_figure(check_figure(layout, table, checked, together), picture)
@@ -132,7 +132,7 @@ def _matrix(names: "Sequence[str]", promised: "FloatArray") -> list[str]:
 
 
 def _span(values: list[float]) -> str:
-    from controller.check.layout_check import summary
+    from era_haptics.lab.checks.layout_check import summary
 
     found = summary(values)
     return f"{found['min']:.1f} to {found['max']:.1f} (median {found['median']:.1f})"

@@ -32,7 +32,7 @@ class EngineHook(BuildHookInterface):  # type: ignore[type-arg]
         sys.path.insert(0, self.root)
         try:
             from model.compiled.kernels import compile_kernels
-            from sim.desk.soft_amp.library import ENGINE, compile_engine
+            from sim.soft_amp.engine import ENGINE, compile_engine
         finally:
             sys.path.pop(0)
         self._folder = tempfile.TemporaryDirectory(prefix="era-engine-")

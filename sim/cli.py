@@ -10,7 +10,7 @@ import typer
 from drivers.errors import LinkError
 from model.commands.options import ExactOption, SeedOption, seed_of_plate
 from model.errors import InputError
-from sim.desk.soft_amp_cli import port_option, soft_amp
+from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
     from sim.control import SimulationContext

@@ -135,7 +135,7 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     done = subprocess.run(
         [
             *(sys.executable, "-c"),
-            "from sim.desk.soft_amp.library import library as found; print(found()._name)",
+            "from sim.soft_amp.engine import library as found; print(found()._name)",
         ],
         env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "", "CC": "no-such-compiler"},
         cwd=tmp_path,

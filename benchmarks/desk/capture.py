@@ -6,8 +6,8 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import Float32Array
-from sim.desk.libjack import JackClient
 from sim.desk.measuring.sound_card import SoundCard, activate
+from sim.soft_amp.jack import JackClient
 
 AUDIBLE = 1e-6
 _START = 20.0  # s

@@ -80,7 +80,7 @@ def desk_plate(
     from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
     from model.calibration.responses import read_sensors
     from model.rig.rig_file import load_rig
-    from sim.desk.libjack import JackClient
+    from sim.soft_amp.jack import JackClient
 
     rig = load_rig(rig_file)
     sensors = read_sensors(sensors_file, rig.plate, may_move=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.desk_plate.desk_plate import BLOCK_MULTIPLE, DeskPlate
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.desk.libjack import IS_INPUT, IS_OUTPUT, JackClient, libjack
+from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, libjack
 
 _PROCESS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32, ctypes.c_void_p)
 _SHUTDOWN = ctypes.CFUNCTYPE(None, ctypes.c_void_p)

@@ -13,9 +13,9 @@ import numpy as np
 from drivers.errors import LinkError
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
-from sim.desk.libjack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
-from sim.desk.soft_amp.library import address_of
-from sim.desk.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
+from sim.soft_amp.engine import address_of
+from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
+from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
 
 MAX_PORTS = 64
 _POLL = 0.02  # s

@@ -1,4 +1,4 @@
-"""The process that plays; `sim.desk.soft_amp.supervisor` starts, watches and, if need be, kills it.
+"""The process that plays; `sim.soft_amp.supervisor` starts, watches and, if need be, kills it.
 
     python -m sim.desk.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RATE
 
@@ -20,11 +20,9 @@ from types import FrameType
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.desk.libjack import NoSound
-from sim.desk.soft_amp.engine import Counters, counters_in, start_engine, take_over
-from sim.desk.soft_amp.library import library
-from sim.desk.soft_amp.output import Output, open_output
-from sim.desk.soft_amp.settings import Settings
+from sim.soft_amp.engine import Counters, Settings, counters_in, library, start_engine, take_over
+from sim.soft_amp.jack import NoSound
+from sim.soft_amp.output import Output, open_output
 
 REFUSED, LOST, OTHER_RATE = 2, 75, 76
 _DEFAULT_RATE = 48_000  # Hz; until the device says its own

@@ -17,8 +17,8 @@ from gateway_bench import wait_for
 from installed_program import ERA
 from model.errors import InputError
 from sim.desk.measuring.sound_card import SoundCard, open_card
-from sim.desk.soft_amp.output import open_output
-from sim.desk.soft_amp.settings import Protocol, Settings
+from sim.soft_amp.engine import Protocol, Settings
+from sim.soft_amp.output import open_output
 from sound_card import JackServer, capture_on, jack_server
 
 pytestmark = [

@@ -24,7 +24,7 @@ from sim.desk.measuring.loopback import check_wiring, latency
 from sim.desk.measuring.measure import Measured, check_by_steps, measure
 from sim.desk.measuring.multisine import Estimate, Multisine, default_frequencies
 from sim.desk.measuring.sound_card import SoundCard
-from sim.desk.soft_amp.library import address_of
+from sim.soft_amp.engine import address_of
 
 RATE = 8_000.0
 DELAY = 73

@@ -12,9 +12,15 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from sim.desk.soft_amp.engine import Counters, JackCalls, start_engine, take_over
-from sim.desk.soft_amp.library import library
-from sim.desk.soft_amp.settings import Protocol, Settings
+from sim.soft_amp.engine import (
+    Counters,
+    JackCalls,
+    Protocol,
+    Settings,
+    library,
+    start_engine,
+    take_over,
+)
 
 pytestmark = pytest.mark.needs("cc")
 

@@ -8,10 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from model.errors import InputError
-from sim.desk.libjack import NoSound
-from sim.desk.soft_amp.library import compile_engine
-from sim.desk.soft_amp.output import PortAudioOutput, portaudio_stream
-from sim.desk.soft_amp.settings import Law, Place, Protocol, Settings, terminal_place
+from sim.soft_amp.engine import Law, Place, Protocol, Settings, compile_engine, terminal_place
+from sim.soft_amp.jack import NoSound
+from sim.soft_amp.output import PortAudioOutput, portaudio_stream
 
 
 def settings(**changed: object) -> Settings:
@@ -84,9 +83,9 @@ def test_block_is_shorter_than_a_reply_may_take(
     names = ("_terminate", "_initialize", "check_output_settings")
     library = SimpleNamespace(**dict.fromkeys(names, lambda *given, **others: None))
     device = {"name": "card", "index": 0, "default_samplerate": 48_000.0}
-    monkeypatch.setattr("sim.desk.soft_amp.output.sounddevice", lambda: library)
-    monkeypatch.setattr("sim.desk.soft_amp.output.portaudio_device", lambda *_, **others: device)
-    monkeypatch.setattr("sim.desk.soft_amp.output.may_be_realtime", lambda: is_realtime)
+    monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
+    monkeypatch.setattr("sim.soft_amp.output.portaudio_device", lambda *_, **others: device)
+    monkeypatch.setattr("sim.soft_amp.output.may_be_realtime", lambda: is_realtime)
     output = PortAudioOutput(settings(device="card"))
     assert output.block / output.rate < 0.01
 
@@ -127,7 +126,7 @@ def test_portaudio_without_its_host_is_waited_for(
         query_devices=query,
         PortAudioError=_NoSound,
     )
-    monkeypatch.setattr("sim.desk.soft_amp.output.sounddevice", lambda: library)
+    monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
     with pytest.raises(problem, match=cause):
         PortAudioOutput(settings(device="Scarlet 4i4"))
 
@@ -151,7 +150,7 @@ class _Busy:
 def test_stream_that_does_not_start_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Or its device would stay taken until the program ends."""
     library = SimpleNamespace(_StreamBase=_Busy, _ffi=SimpleNamespace(cast=lambda *_: None))
-    monkeypatch.setattr("sim.desk.soft_amp.output.sounddevice", lambda: library)
+    monkeypatch.setattr("sim.soft_amp.output.sounddevice", lambda: library)
     with pytest.raises(OSError, match="unavailable"):
         portaudio_stream(0, 0, 0, outputs=2)
     assert _Busy.is_closed

@@ -15,8 +15,8 @@ from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from gateway_bench import wait_for
 from model.errors import InputError
-from sim.desk.soft_amp.output import open_output
-from sim.desk.soft_amp.settings import Protocol, Settings
+from sim.soft_amp.engine import Protocol, Settings
+from sim.soft_amp.output import open_output
 from sound_card import BLOCK, RATE, SoftAmp, capture_on, host, jack_server
 from steady_host import WATCHDOG, linear_amplifier
 

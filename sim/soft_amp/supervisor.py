@@ -19,8 +19,7 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.desk.soft_amp.__main__ import LOST, OTHER_RATE
-from sim.desk.soft_amp.engine import Counters, counters_in, new_file
-from sim.desk.soft_amp.settings import Place, Settings
+from sim.soft_amp.engine import Counters, Place, Settings, counters_in, new_file
 
 STALL = 0.1
 """Time [s] without a rendered block, after which the process that plays is killed."""

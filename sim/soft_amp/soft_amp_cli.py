@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.errors import InputError
-from sim.desk.soft_amp.settings import Law, Protocol, Settings
+from sim.soft_amp.engine import Law, Protocol, Settings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from sim.desk.soft_amp.settings import Place
+    from sim.soft_amp.engine import Place
 
 
 def port_option(served: str) -> Any:
@@ -87,9 +87,9 @@ def soft_amp(
     full scale of the device. Silent within 50 ms once its host or itself is killed.
     """
     from model.commands.options import print_report
-    from sim.desk.devices import listed_devices
-    from sim.desk.soft_amp.library import library
-    from sim.desk.soft_amp.supervisor import Supervisor
+    from sim.soft_amp.engine import library
+    from sim.soft_amp.output import listed_devices
+    from sim.soft_amp.supervisor import Supervisor
 
     if list_devices:
         print_report(*listed_devices(), as_json=as_json)
@@ -143,7 +143,7 @@ def _serial_number(given: str | None, *, device: str) -> str:
 def _place(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
 ) -> "AbstractContextManager[Place]":
-    from sim.desk.soft_amp.settings import tcp_place, terminal_place
+    from sim.soft_amp.engine import tcp_place, terminal_place
 
     ports = {
         "--serial": 0 if serial else None,

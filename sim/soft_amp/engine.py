@@ -1,0 +1,329 @@
+"""The engine as a library: of a wheel of this platform, or compiled at first use.
+
+What a software amplifier is to do, as the command line hands it on, and where hosts reach it.
+
+A terminal or a port is kept while the process that plays restarts.
+
+The engine of `firmware/ports/sound/sound.h` in this process, and what it counts.
+
+Counters are in memory shared with the process that watches it.
+"""
+
+import ctypes
+import math
+import mmap
+import os
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from functools import cache
+from pathlib import Path
+from typing import IO
+
+from drivers.errors import LinkError
+from model.compiled.kernels import compile_library, kept_library
+from model.errors import InputError
+
+ENGINE = "engine.so"
+"""The file of the library in a wheel of one platform."""
+
+_HERE = Path(__file__).parent
+_FOLDERS = (_HERE / "firmware", _HERE.parents[2] / "firmware")  # of a wheel, of a checkout
+_PARTS = ("core", "wire", "ports/sound")
+_CORE = ("channel", "layers", "set", "sine", "states", "voice")
+_WIRE = ("crc", "mbap", "messages", "modbus", "serial")
+_FLAGS = (
+    "-std=c99",
+    "-O2",
+    "-fno-math-errno",
+    "-pthread",
+    '-DCONFIG_FILE="sound_config.h"',
+)
+_WHAT = "soft-amp: its engine"
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Load the library, compiled if there is none; raises InputError."""
+    own = _HERE / ENGINE
+    if own.exists():
+        try:
+            return ctypes.CDLL(str(own))
+        except OSError as problem:
+            raise InputError(
+                f"soft-amp: {own} cannot be loaded: {problem}; reinstall era-haptics"
+            ) from None
+    sources, headers, flags = _recipe()
+    return kept_library("soft-amp", sources, headers, flags=flags, what=_WHAT)
+
+
+def address_of(name: str) -> int:
+    """Return the address of a function of the library, a callback."""
+    found = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
+    assert found is not None  # noqa: S101  of a function
+    return found
+
+
+def compile_engine(path: Path) -> None:
+    """Compile the library to a file. Raises InputError."""
+    sources, _, flags = _recipe()
+    compile_library(path, sources, flags=flags, what=_WHAT)
+
+
+def _recipe() -> tuple[list[Path], list[Path], list[str]]:
+    """Sources, headers and flags of the compiler; raises InputError."""
+    folder = next((each for each in _FOLDERS if (each / "ports" / "sound").is_dir()), None)
+    if folder is None:
+        raise InputError(
+            f"soft-amp: its C sources are missing in {_FOLDERS[0]}; reinstall era-haptics"
+        )
+    sources = [
+        *(folder / "core" / f"{name}.c" for name in _CORE),
+        *(folder / "wire" / f"{name}.c" for name in _WIRE),
+        *(folder / "ports" / "sound").glob("*.c"),
+    ]
+    headers = [path for part in _PARTS for path in (folder / part).glob("*.h")]
+    return sources, headers, [*_FLAGS, *(f"-I{folder / part}" for part in _PARTS)]
+
+
+MAX_CHANNELS = 32
+"""Of two amplifiers; one has at most 16 by the protocol."""
+
+CHANNELS_OF_AMPLIFIER = 16
+
+
+class Law(StrEnum):
+    """How a sample follows from the wanted one; in the order of `enum law`."""
+
+    LINEAR = "linear"
+    SQUARE = "square"
+
+
+class Protocol(IntEnum):
+    """Of the line; the values are those of `enum protocol`."""
+
+    SERIAL = 0
+    MODBUS = 1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A software amplifier; its values pass as JSON.
+
+    device: `jack`, `jack:CLIENT`, or a name or number of PortAudio; rate [Hz] and block [frames]:
+    those of the device if None; limit: largest sample, 0..1; max_gaps: holes in the sound within
+    a second, more are a fault. Raises InputError.
+    """
+
+    device: str
+    channels: int
+    protocol: Protocol
+    serial_number: str
+    rate: int | None = None
+    block: int | None = None
+    law: Law = Law.LINEAR
+    limit: float = 1.0
+    max_gaps: int = 3
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.channels <= MAX_CHANNELS:
+            raise InputError(f"--channels must be 2 to {MAX_CHANNELS}, got {self.channels}")
+        if self.channels > CHANNELS_OF_AMPLIFIER and self.channels % 2:
+            raise InputError(
+                f"--channels above {CHANNELS_OF_AMPLIFIER} must be even, since they are two "
+                f"amplifiers of half as many, got {self.channels}"
+            )
+        least = math.sqrt(0.5) if self.law == Law.SQUARE else 0.0
+        if not least < self.limit <= 1:
+            raise InputError(
+                f"--limit must be above {least:.3g} and at most 1 with this law, got {self.limit:g}"
+            )
+        if self.rate is not None:
+            check_rate(self.rate, what="--rate")
+
+    @property
+    def amplifiers(self) -> int:
+        """Number of amplifiers, at addresses 1 and 2."""
+        return 1 if self.channels <= CHANNELS_OF_AMPLIFIER else 2
+
+
+def check_rate(rate: float, *, what: str) -> int:
+    """A sample rate [Hz] that the engine can have; InputError otherwise."""
+    if rate % 1000 or not 8000 <= rate <= 192_000:
+        raise InputError(
+            f"{what}: sample rate must be a multiple of 1000 Hz from 8000 to 192000, got {rate:g} "
+            "Hz; use 48000 Hz"
+        )
+    return int(rate)
+
+
+_LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A line; terminal, listening: its descriptors, -1 for none. url: of the first amplifier."""
+
+    url: str
+    terminal: int = -1
+    listening: int = -1
+
+    def urls(self, amplifiers: int, *, protocol: Protocol) -> list[str]:
+        """The URL of each amplifier."""
+        if protocol is Protocol.MODBUS:
+            return [f"{self.url}/{unit}" for unit in range(1, amplifiers + 1)]
+        others = range(2, amplifiers + 1)
+        return [self.url, *(f"{self.url}?address={address}" for address in others)]
+
+
+@contextmanager
+def terminal_place(link: Path | None) -> Iterator[Place]:
+    """A pseudo-terminal, and a symbolic link to it while this lasts; raises InputError."""
+    import tty  # not on Windows
+
+    from sim.transport.far_end import linked  # loads asyncio, which the help does without
+
+    with ExitStack() as stack:
+        near, far = os.openpty()
+        stack.callback(os.close, near)
+        # Kept open, so that a host that closes it does not hang up the line.
+        stack.callback(os.close, far)
+        tty.setraw(far)
+        os.set_blocking(near, False)
+        path = os.ttyname(far)
+        if link is not None:
+            path = stack.enter_context(linked(link, to=path))
+        yield Place(f"serial://{path}", terminal=near)
+
+
+@contextmanager
+def tcp_place(port: int, *, protocol: Protocol) -> Iterator[Place]:
+    """A port of this machine alone, 0 for any; raises InputError."""
+    try:
+        listening = socket.create_server((_LOOPBACK, port), backlog=4)
+    except OSError as problem:
+        raise InputError(
+            f"port {port}: cannot listen: {problem.strerror}; choose another"
+        ) from None
+    with listening:
+        listening.setblocking(False)
+        scheme = "serial+tcp" if protocol is Protocol.SERIAL else "modbus+tcp"
+        url = f"{scheme}://{_LOOPBACK}:{listening.getsockname()[1]}"
+        yield Place(url, listening=listening.fileno())
+
+
+class Counters(ctypes.Structure):
+    """`struct counters` of firmware/ports/sound/counters.h."""
+
+    _fields_ = (
+        ("blocks", ctypes.c_uint64),
+        ("frames", ctypes.c_uint64),
+        ("gaps", ctypes.c_uint64),
+        ("xruns", ctypes.c_uint64),
+        ("clipped", ctypes.c_uint64),
+        ("requests", ctypes.c_uint64),
+        ("is_streaming", ctypes.c_uint32),
+        ("is_lost", ctypes.c_uint32),
+        ("is_realtime", ctypes.c_uint32),
+        ("state", ctypes.c_uint32 * 2),
+        ("fault", ctypes.c_uint32 * 2),
+        ("block", ctypes.c_uint32),
+    )
+
+
+def new_file() -> IO[bytes]:
+    """A file without a name, of the size of the counters, all zero."""
+    file = tempfile.TemporaryFile()  # noqa: SIM115  the caller's
+    file.truncate(ctypes.sizeof(Counters))
+    return file
+
+
+def counters_in(descriptor: int) -> Counters:
+    """The counters in a file, shared with every process that maps it."""
+    return Counters.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(Counters)))
+
+
+_POLL = 0.001  # s
+_HANDOVER = 2.0  # s
+
+
+class _SoundSettings(ctypes.Structure):
+    _fields_ = (
+        ("rate", ctypes.c_uint32),
+        ("channels", ctypes.c_uint32),
+        ("law", ctypes.c_uint32),
+        ("protocol", ctypes.c_uint32),
+        ("limit", ctypes.c_double),
+        ("max_gaps", ctypes.c_uint32),
+        ("is_recovering", ctypes.c_uint32),
+        ("serial_number", ctypes.c_char_p),
+    )
+
+
+class _LinesSettings(ctypes.Structure):
+    _fields_ = (
+        ("terminal", ctypes.c_int),
+        ("listening", ctypes.c_int),
+        ("parent", ctypes.c_int),
+    )
+
+
+class JackCalls(ctypes.Structure):
+    """`struct jack_calls`: a client, its ports, and addresses of functions of libjack."""
+
+    _fields_ = (
+        ("client", ctypes.c_void_p),
+        ("ports", ctypes.c_void_p * MAX_CHANNELS),
+        ("buffer", ctypes.c_void_p),
+        ("cycle_times", ctypes.c_void_p),
+        ("time", ctypes.c_void_p),
+        ("latency", ctypes.c_void_p),
+        ("is_realtime", ctypes.c_void_p),
+        ("port_by_id", ctypes.c_void_p),
+        ("is_mine", ctypes.c_void_p),
+    )
+
+
+def start_engine(
+    settings: Settings,
+    *,
+    rate: int,
+    counters: Counters,
+    is_recovering: bool,
+    terminal: int,
+    listening: int,
+    parent: int,
+) -> None:
+    """Start the amplifiers at a rate [Hz] and their lines; descriptors: -1 for none.
+
+    Raises InputError, LinkError.
+    """
+    sound = _SoundSettings(
+        rate,
+        settings.channels,
+        list(Law).index(settings.law),
+        settings.protocol,
+        settings.limit,
+        settings.max_gaps,
+        is_recovering,
+        settings.serial_number.encode(),
+    )
+    lines = _LinesSettings(terminal, listening, parent)
+    problem = library().sound_start(
+        ctypes.byref(sound), ctypes.byref(lines), ctypes.byref(counters)
+    )
+    if problem:
+        raise LinkError(f"soft-amp: cannot start: {os.strerror(abs(problem))}")
+
+
+def take_over() -> None:
+    """Let the sound thread render from now on."""
+    end = time.monotonic() + _HANDOVER
+    while not library().sound_take_over():
+        if time.monotonic() > end:
+            raise LinkError(f"soft-amp: its lines did not respond within {_HANDOVER:g} s")
+        time.sleep(_POLL)

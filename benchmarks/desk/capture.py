@@ -5,8 +5,8 @@ import time
 import numpy as np
 
 from drivers.errors import LinkError
+from era_haptics.lab.measuring.sound_card import SoundCard, activate
 from model.arrays import Float32Array
-from sim.desk.measuring.sound_card import SoundCard, activate
 from sim.soft_amp.jack import JackClient
 
 AUDIBLE = 1e-6

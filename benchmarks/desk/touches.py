@@ -14,9 +14,9 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
+from era_haptics.lab.measuring.sound_card import open_card
 from model.arrays import FloatArray
 from model.finger import detection_threshold
-from sim.desk.measuring.sound_card import open_card
 
 _START = 180.0  # s; on a busy machine
 REPEAT = 0.05  # s; a contact that is not confirmed is lifted

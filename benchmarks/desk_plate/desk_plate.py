@@ -9,12 +9,12 @@ from benchmarks.desk_plate.lifted_blocks import SAMPLES, LiftedBlocks, sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
+from era_haptics.lab.measuring.sound_card import Desk
 from model.arrays import FloatArray
 from model.calibration.responses import WiredSensor, are_places
 from model.errors import InputError
 from model.finger import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
-from sim.desk.measuring.desk import Desk
 
 _LOOPED = 0.9  # of what a cable from an output to an input brings back
 

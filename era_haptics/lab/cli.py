@@ -7,12 +7,10 @@ from era_haptics.lab.checks.content_cli import content_app, play
 from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
+from era_haptics.lab.measuring.measure_cli import MeasureCommand, measure, outputs
 from era_haptics.lab.paper_figures import figure_app
 from era_haptics.lab.report import report
 from era_haptics.lab.witness.witness_cli import witness
-from sim.desk.impedance_cli import MeasureCommand
-from sim.desk.measure_cli import measure
-from sim.desk.outputs_cli import outputs
 
 amp = typer.Typer()
 amp.command()(conformance)

@@ -169,7 +169,7 @@ class DeviceSettings:
     seed: int
 
 
-_MEASURER = "sim.desk.measuring.plate_measurement:measure_plate"
+_MEASURER = "era_haptics.lab.measuring.measure:measure_plate"
 """By name: this package does not import the one beside it."""
 
 

@@ -212,7 +212,7 @@ class TableCheck(Protocol):
         """Raises InputError, LinkError."""
 
 
-_CHECK = "sim.desk.measuring.table_check:check_table"
+_CHECK = "era_haptics.lab.measuring.table_measurement:check_table"
 """By name: this package does not import the one beside it."""
 
 

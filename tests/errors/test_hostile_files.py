@@ -15,15 +15,15 @@ from controller.gateway.settings import read_token
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
 from era_haptics.lab.design.problem import area_of
+from era_haptics.lab.measuring.impedance import read_impedance
+from era_haptics.lab.measuring.loopback import read_stepped
+from era_haptics.lab.measuring.sound_card import Desk
 from era_haptics.lab.witness import capture
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.errors import InputError
 from model.identification.learned_plate import load_learned
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import load_table
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.impedance_run import read_impedance
-from sim.desk.measuring.stepped_file import read_stepped
 
 RIG = load_rig(example_rig_path())
 DESK = Desk(RIG, (WiredSensor("P1", 0.1, 0.1, 1, 1.0),))

@@ -6,8 +6,8 @@ from types import MappingProxyType
 import numpy as np
 
 from benchmarks.desk_plate.desk_plate import DeskPlate
+from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import Float32Array, FloatArray
-from sim.desk.measuring.sound_card import SoundCard
 
 BLOCK = 4800
 

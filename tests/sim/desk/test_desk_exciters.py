@@ -11,6 +11,8 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import as_built, draw_truth
 from desk_card import DeskCard
+from era_haptics.lab.measuring.moved_sensor import PlacesFile, measure_places
+from era_haptics.lab.measuring.sound_card import Desk, Multisine
 from model.calibration.fit import sensed_plate
 from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.identification.identify import identify
@@ -18,9 +20,6 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.moved_sensor import PlacesFile, measure_places
-from sim.desk.measuring.multisine import Multisine
 
 BOARD = """
 plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,

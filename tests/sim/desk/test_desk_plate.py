@@ -14,6 +14,8 @@ from benchmarks.desk_plate.truth import Truth
 from benchmarks.direct_plate import direct_responder
 from desk_card import DeskCard
 from drivers.errors import LinkError
+from era_haptics.lab.measuring.measure import measure_through
+from era_haptics.lab.measuring.sound_card import Desk, Multisine
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import WiredSensor, read_sensors
 from model.errors import InputError
@@ -22,9 +24,6 @@ from model.identification.identify import identify
 from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.multisine import Multisine
-from sim.desk.measuring.plate_measurement import measure_through
 
 RATE = 48_000.0
 POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])

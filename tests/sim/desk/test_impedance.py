@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from era_haptics.lab.measuring.impedance import Bench, exciter_values, fitted
 from model.errors import InputError
-from sim.desk.measuring.impedance import Bench, exciter_values, fitted
 
 F = np.unique(np.geomspace(10, 1000, 100).round())
 # A 25 mm exciter: coil, magnet [kg], k [N/m], c [N s/m], Bl [N/A], R [ohm], L [H].

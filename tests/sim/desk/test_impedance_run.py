@@ -13,15 +13,15 @@ from typer.testing import CliRunner
 
 from benchmarks.desk.capture import open_client
 from benchmarks.desk_plate.jack_plate import JackPlate
+from era_haptics.lab.measuring.impedance import read_impedance
+from era_haptics.lab.measuring.measure_cli import app
+from era_haptics.lab.measuring.sound_card import SoundCard
 from exciter_circuit import ExciterCircuit
 from exciter_rig import exciter_rig_text
 from installed_program import ERA
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.rig.rig_file import parse_rig
-from sim.desk.impedance_cli import app
-from sim.desk.measuring.impedance_run import read_impedance
-from sim.desk.measuring.sound_card import SoundCard
 from sound_card import jack_server
 
 RATE = 48_000
@@ -55,7 +55,7 @@ def measured(
     monkeypatch: pytest.MonkeyPatch, card: SoundCard, *arguments: object, typed: str = ""
 ) -> tuple[int, str]:
     """Exit status of the command with a card in memory, and its last line."""
-    monkeypatch.setattr("sim.desk.measuring.sound_card.open_card", lambda *_, **__: card)
+    monkeypatch.setattr("era_haptics.lab.measuring.sound_card.open_card", lambda *_, **__: card)
     words = ["--impedance", "--device", "x", "--json", *map(str, arguments)]
     done = CliRunner().invoke(app, words, input=typed)
     return done.exit_code, done.stdout.splitlines()[-1] if done.stdout else str(done.exception)

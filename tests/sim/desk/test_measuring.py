@@ -13,17 +13,20 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from drivers.errors import LinkError
+from era_haptics.lab.measuring.loopback import check_wiring, latency
+from era_haptics.lab.measuring.measure import STEPS, Measured, check_by_steps, measure, plot
+from era_haptics.lab.measuring.sound_card import (
+    Desk,
+    Estimate,
+    Multisine,
+    SoundCard,
+    default_frequencies,
+)
 from model.calibration.responses import WiredSensor
 from model.errors import InputError
 from model.processes import unseen
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.live_plot import STEPS, plot
-from sim.desk.measuring.loopback import check_wiring, latency
-from sim.desk.measuring.measure import Measured, check_by_steps, measure
-from sim.desk.measuring.multisine import Estimate, Multisine, default_frequencies
-from sim.desk.measuring.sound_card import SoundCard
 from sim.soft_amp.engine import address_of
 
 RATE = 8_000.0

@@ -16,13 +16,13 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from controller.cli.main import run
 from desk_card import DeskCard
+from era_haptics.lab.measuring.sound_card import DeviceLost
 from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import read_measured, read_sensors, responses_of
 from model.errors import InputError
 from model.identification.identify import identify
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
-from sim.desk.measuring.sound_card import DeviceLost
 
 RATE, GRAMS = 8_000.0, 5.0
 Places = Mapping[str, tuple[float, float]]
@@ -81,7 +81,7 @@ class Bench:
         converters = Converters(delay=73, noise=noise)
         self._plate = DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1)
         self.card = PulledCard(self._plate, rate=RATE, **wires)  # type: ignore[arg-type]
-        patch.setattr("sim.desk.measuring.measure.open_card", lambda *_, **__: self.card)
+        patch.setattr("era_haptics.lab.measuring.measure.open_card", lambda *_, **__: self.card)
         patch.setattr(sys, "stdin", self)
 
     def readline(self) -> str:

@@ -14,6 +14,8 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from desk_card import DeskCard
 from era_haptics.lab.cli import app
+from era_haptics.lab.measuring.outputs import Heard, listen, matched, tone
+from era_haptics.lab.measuring.sound_card import Desk
 from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.responses import WiredSensor
@@ -22,8 +24,6 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.outputs import Heard, listen, matched, tone
 
 RATE = 8000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
@@ -160,7 +160,7 @@ def test_said_channels_are_written(
 ) -> None:
     """As they were said, one asked again; with one that no output drives no file is written."""
     card = cabled(truth)
-    monkeypatch.setattr("sim.desk.measuring.outputs_run.open_card", lambda *_, **__: card)
+    monkeypatch.setattr("era_haptics.lab.measuring.outputs.open_card", lambda *_, **__: card)
     output = tmp_path / "wired.yaml"
     done = CliRunner().invoke(
         app,

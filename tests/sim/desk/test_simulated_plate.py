@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from controller.cli.main import run
+from era_haptics.lab.measuring import measure
+from era_haptics.lab.measuring.sound_card import Desk
 from examples.make_measured import record_responses
 from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.rig.rig import Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
-from sim.desk.measuring import simulated_plate
-from sim.desk.measuring.desk import Desk
 from sim.plant.fingers import Accelerometer
 
 PLACES = ((0.03, 0.05), (0.20, 0.11))
@@ -25,12 +25,10 @@ FREQUENCIES = np.array([61.0, 151.0, 311.0])
 @pytest.mark.parametrize("sensors", [FIXED, MOVED], ids=["fixed", "moved"])
 def test_responses_are_those_of_the_plate_in_time(sensors, monkeypatch, tmp_path) -> None:
     """Of a plate that is the rig's, without noise; a sensor of 20 g weighs where it is moved to."""
-    monkeypatch.setattr(simulated_plate, "NOISE", 0.0)
+    monkeypatch.setattr(measure, "NOISE", 0.0)
     rig = replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
     output = tmp_path / "measured.csv"
-    simulated_plate.measured_by_simulation(
-        Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0
-    )
+    measure.measured_by_simulation(Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0)
     found = responses_of(read_measured(output), rig)
     for number, each in enumerate(sensors):
         load = PointLoad(each.x, each.y, mass=each.mass)

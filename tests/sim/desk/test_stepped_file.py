@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from era_haptics.lab.measuring.loopback import read_stepped
+from era_haptics.lab.measuring.sound_card import Desk
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import Responses, WiredSensor, responses_of
 from model.errors import InputError
 from model.rig.rig import Rig
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.stepped_file import read_stepped
 
 RATE = 12_000
 TONES = (61.0, 151.5, 311.0)

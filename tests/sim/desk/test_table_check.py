@@ -19,6 +19,8 @@ from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
 from drivers.playing import Layer
+from era_haptics.lab.measuring import table_measurement
+from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import read_sensors
 from model.cli import app
@@ -30,8 +32,6 @@ from model.study.promise_at_sensors import CheckSettings, Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.vibration import tone_fields
-from sim.desk.measuring import table_check
-from sim.desk.measuring.sound_card import SoundCard
 
 RATE = 8_000.0
 LEVEL = 0.5
@@ -102,7 +102,7 @@ def measured_on(
         plate = DeskPlate(truth, sensors, rate=RATE, converters=converters, seed=1)
         return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(table_check, "open_card", opened)
+    monkeypatch.setattr(table_measurement, "open_card", opened)
     arguments = ["table", "verify", str(folder / "t.npz"), "--device", "memory", "--samples", "4"]
     arguments += ["--sensors", str(folder / "sensors.csv"), "--json", "--level", "0.5", *more]
     result = CliRunner().invoke(app, arguments)
@@ -233,12 +233,14 @@ def test_limits_of_the_rig_hold_for_a_card(
     def refuse() -> None:
         raise AssertionError
 
-    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard(refuse))
+    monkeypatch.setattr(
+        table_measurement, "open_card", lambda _device, **_counts: EndingCard(refuse)
+    )
     (tmp_path / "sensors.csv").write_text(SENSORS)
     bounded = replace(rig, limits=replace(rig.limits, **limits))
     settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, level)
     with pytest.raises(InputError, match=key):
-        table_check.check_table(table, bounded, settings, progress=lambda _done, _count: None)
+        table_measurement.check_table(table, bounded, settings, progress=lambda _done, _count: None)
 
 
 def test_no_output_exceeds_half_of_what_the_rig_allows(
@@ -253,12 +255,12 @@ def test_no_output_exceeds_half_of_what_the_rig_allows(
         cards.append(DeskCard(plate, rate=RATE))
         return cards[0]
 
-    monkeypatch.setattr(table_check, "open_card", opened)
+    monkeypatch.setattr(table_measurement, "open_card", opened)
     (tmp_path / "sensors.csv").write_text(SENSORS)
     sensors = read_sensors(tmp_path / "sensors.csv", rig.plate)
     bounded = replace(rig, limits=replace(rig.limits, level=0.1))
     settings = CheckSettings("memory", tmp_path / "sensors.csv", None, 1, 0, None)
-    table_check.check_table(table, bounded, settings, progress=lambda _done, _count: None)
+    table_measurement.check_table(table, bounded, settings, progress=lambda _done, _count: None)
     assert cards[0].loudest[[cards[0].loudest.argmax(), -1]] == pytest.approx(0.05, rel=1e-3)
 
 
@@ -294,11 +296,11 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
         assert playing.wait(60.0)
         raise trouble
 
-    monkeypatch.setattr(table_check, "BlockingAmplifier", Observed)
-    monkeypatch.setattr(table_check, "open_card", lambda _device, **_counts: EndingCard(end))
+    monkeypatch.setattr(table_measurement, "BlockingAmplifier", Observed)
+    monkeypatch.setattr(table_measurement, "open_card", lambda _device, **_counts: EndingCard(end))
     (tmp_path / "sensors.csv").write_text(SENSORS)
     url = f"sim://{example_rig_path()}"
     settings = CheckSettings("memory", tmp_path / "sensors.csv", url, 1, 0, LEVEL)
     with pytest.raises(trouble):
-        table_check.check_table(table, rig, settings, progress=lambda _done, _count: None)
+        table_measurement.check_table(table, rig, settings, progress=lambda _done, _count: None)
     assert ended == ["disarmed"]

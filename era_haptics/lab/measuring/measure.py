@@ -1,20 +1,22 @@
-"""A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check."""
+"""Responses in plain text while they are measured: a line for each sensor, one screen in all.
 
-from collections.abc import Iterator
+A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check.
+
+A plate measured through a sound card for its identification: multisines, some of them again.
+
+Responses that a desk would measure of a simulated plate, which deviates from its rig's file.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses, write_responses
-from model.commands.options import Stopwatch, progress_bar
-from model.processes import Progress
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.live_plot import Show, live_plot
-from sim.desk.measuring.loopback import (
+from era_haptics.lab.measuring.loopback import (
     check_clocks,
     check_coherence,
     check_levels,
@@ -22,10 +24,106 @@ from sim.desk.measuring.loopback import (
     is_as_late,
     is_whole,
     latency,
+    written,
 )
-from sim.desk.measuring.multisine import PERIOD, Multisine, default_frequencies, estimate
-from sim.desk.measuring.runs import TRIES, Run, play, run_time
-from sim.desk.measuring.sound_card import SoundCard, open_card
+from era_haptics.lab.measuring.sound_card import (
+    PERIOD,
+    TRIES,
+    Desk,
+    Multisine,
+    Run,
+    SoundCard,
+    converters,
+    default_frequencies,
+    estimate,
+    open_card,
+    play,
+    run_time,
+)
+from model.arrays import ComplexArray, FloatArray, best_first
+from model.calibration.responses import (
+    Responses,
+    WiredSensor,
+    are_places,
+    read_sensors,
+    write_responses,
+)
+from model.commands.options import Stopwatch, progress_bar
+from model.identification.forward import Sensor
+from model.identification.least_squares import DeviceSettings, MeasuredPlate, Measurement, Repeat
+from model.processes import Progress
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.structure.attachments import PointLoad
+from sim.plant.imperfections import draw_imperfections
+
+Show = Callable[[Sequence[FloatArray]], None]
+"""Takes what was recorded so far: whole periods of each run, (n, inputs)."""
+
+STEPS = "▁▂▃▄▅▆▇█"
+_RANGE = 60.0  # dB from the highest step to the lowest
+_BESIDE = 40  # columns of names and numbers
+_LINES = 5  # of a screen that are not of sensors
+
+
+def plot(
+    multisine: Multisine,
+    recorded: Sequence[FloatArray],
+    sensors: Sequence[WiredSensor],
+    *,
+    width: int,
+    height: int,
+) -> str:
+    """Lines of text, at most so many of so many columns.
+
+    Each sensor with its response over frequency, the highest of all sensors the full step, and its
+    largest sample, 100 % is full scale.
+    """
+    shown = sensors[: max(1, height - _LINES)]
+    columns = [sensor.input - 1 for sensor in shown]
+    heard = np.array([multisine.found(each[:, columns]).T for each in recorded])
+    # To all sources together, a sample by a sample: the turns of their phases are orthogonal.
+    power = (np.abs(heard) ** 2).mean(axis=0) / np.abs(multisine.played(0)[:, 0]) ** 2
+    found = 10 * np.log10(np.maximum(power, 1e-30))  # (sensors, f) [dB]
+    groups = np.array_split(np.arange(found.shape[1]), min(found.shape[1], max(8, width - _BESIDE)))
+    drawn = np.array([found[:, group].max(axis=1) for group in groups]).T  # (sensors, columns)
+    top = drawn.max()
+    step = np.clip((drawn - top) / _RANGE * len(STEPS) + len(STEPS), 0, len(STEPS) - 1)
+    peaks = np.max([np.abs(each[:, columns]).max(axis=0) for each in recorded], axis=0)
+    low, high = (f"{multisine.frequencies[end]:g} Hz" for end in (0, -1))
+    rows = [
+        f"{sensor.name[:10]:10s} {''.join(STEPS[int(each)] for each in one)} "
+        f"{float(loudest) - top:6.1f} dB, input {100 * float(peak):5.1f} %"
+        for sensor, one, loudest, peak in zip(shown, step, drawn.max(axis=1), peaks, strict=True)
+    ]
+    rows.append(f"{'':10s} {low}{high.rjust(len(groups) - len(low))}")
+    hidden = len(sensors) - len(shown)
+    rows.append(
+        f"{len(recorded)} of {multisine.sources} runs; a step is {_RANGE / len(STEPS):g} dB"
+        + (f"; {hidden} more sensors" if hidden else "")
+    )
+    return "\n".join(rows)
+
+
+@contextmanager
+def live_plot(multisine: Multisine, sensors: Sequence[WiredSensor]) -> Iterator[Show]:
+    """Yield what draws the runs anew after each, on standard error if that is a terminal."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda recorded: None
+        return
+    with Live(console=console) as live:
+
+        def show(recorded: Sequence[FloatArray]) -> None:
+            width, height = console.size
+            text = plot(multisine, recorded, sensors, width=width, height=height)
+            live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
+
+        yield show
 
 
 def loopback_gain(
@@ -284,3 +382,143 @@ def _rows(found: Measured, check: dict[str, Any] | None, *, rate: float) -> Iter
             "stepped tones differ by {level_rms_db:.3f} dB rms, {level_max_db:.2f} dB at most, and "
             "{phase_rms_deg:.2f}° rms, {phase_max_deg:.1f}° at most".format(**check)
         )
+
+
+_REPEATED = 1  # the run: phases differ between ERAs, so that modes of every symmetry vibrate
+_COMPARED = 2  # lines of it
+
+
+def measure_plate(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+    """Measure through a sound card, which plays and records.
+
+    Raises InputError, LinkError, as `era measure` does.
+    """
+    desk = Desk(rig, read_sensors(settings.sensors_file, rig.plate))
+    with open_desk(
+        desk,
+        settings.device,
+        level=settings.level,
+        frequencies=settings.frequencies,
+        seed=settings.seed,
+    ) as (card, multisine):
+        return measure_through(desk, card, multisine, periods=settings.periods, progress=progress)
+
+
+def measure_through(
+    desk: Desk, card: SoundCard, multisine: Multisine, *, periods: int, progress: Progress
+) -> MeasuredPlate:
+    """All runs; then one of them at half the level, and at the whole one again.
+
+    progress: called with the runs done and all.
+    """
+    started, runs = time.monotonic(), multisine.sources
+    found = measure(
+        desk,
+        card,
+        multisine,
+        periods=periods,
+        show=lambda recorded: progress(len(recorded), runs + 2),
+    )
+    repeats = []
+    for number, factor in enumerate((0.5, 1.0), start=1):
+        again = replace(multisine, level=factor * multisine.level)
+        run = play_run(desk, card, again, _REPEATED, periods=periods, before=found.looped)
+        repeats.append(_repeats(desk, found, again, run.whole))
+        progress(runs + number, runs + 2)
+    measurement = replace(
+        _measurement(desk, found),
+        half_level=repeats[0],
+        at_end=repeats[1],
+        drives_lag=True,
+    )
+    return MeasuredPlate(
+        measurement,
+        multisine.level,
+        time.monotonic() - started,
+        sensors=tuple(
+            {
+                "sensor": sensor.name,
+                "input": sensor.input,
+                "x_m": sensor.x,
+                "y_m": sensor.y,
+                "coherence_min": found.quality(n)["coherence_min"],
+            }
+            for n, sensor in enumerate(desk.sensors)
+        ),
+        notes=(),
+        details={"latency_s": found.latency, "repeated_runs": found.repeated},
+    )
+
+
+def _measurement(desk: Desk, found: Measured) -> Measurement:
+    """Responses with the usual error of readings and the noise beside it."""
+    responses = found.responses
+    values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
+    plain = Measurement.of(
+        [Sensor(each.name, x=each.x, y=each.y, mass=each.mass) for each in desk.sensors],
+        responses.frequencies,
+        values,
+    )
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
+    noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
+    return replace(plain, std=np.hypot(plain.std, noise))
+
+
+def _repeats(
+    desk: Desk, found: Measured, multisine: Multisine, recorded: FloatArray
+) -> tuple[Repeat, ...]:
+    """The loudest lines of a run and what the responses make of them, all ERAs together."""
+    full = [*desk.rig.full_levels.values()]
+    bases = multisine.played(_REPEATED)[:, : len(full)] * full  # (f, eras)
+    first = np.einsum("fes,fe->fs", found.responses.values, bases)
+    heard = multisine.found(recorded)[:, desk.columns] / desk.sensitivities
+    again = heard / converters(found.looped)[:, None]
+    size = np.linalg.norm(bases, axis=1, keepdims=True)
+    first, again = first / size, again / size
+    names = ", ".join(name for name, _ in desk.eras)
+    loudest = best_first(np.linalg.norm(first, axis=1))[:_COMPARED]
+    return tuple(
+        Repeat(names, float(multisine.frequencies[n]), first[n], again[n]) for n in loudest
+    )
+
+
+NOISE = 2e-3
+"""Of a sensor's root mean square over all that it reads, of each part."""
+
+
+def measured_by_simulation(
+    desk: Desk, output: Path, *, frequencies: FloatArray | None, seed: int
+) -> tuple[list[str | None], dict[str, Any]]:
+    """Write responses of a plate drawn within a rig's uncertainty; return the report.
+
+    frequencies (f,) [Hz]: None for those of `era measure`; seed: of the plate and of the noise.
+    Sensors weigh what their file says, one that is moved at one place at a time. Raises InputError
+    for frequencies beyond the rig's limits.
+    """
+    rig, sensors = desk.rig, desk.sensors
+    limits, drawn = rig.limits, draw_imperfections(rig, seed=seed)
+    if frequencies is None:
+        frequencies = default_frequencies(limits.frequency_min, limits.frequency_max)
+    desk.check_frequencies(frequencies, what="--frequencies")
+    real = drawn.plate.realised(rig)
+    plate = solve_free_plate(real.plate, real.mesh, frequency_max=limits.frequency_max)
+    points = np.array([[each.x, each.y] for each in sensors])
+    weights = [PointLoad(each.x, each.y, mass=each.mass) for each in sensors]
+    found = [
+        plate.acceleration(
+            real.eras,
+            frequencies,
+            point[None],
+            loads=[*real.masses, *([weight] if are_places(sensors) else weights)],
+        )
+        for point, weight in zip(points, weights, strict=True)
+    ]
+    drives = drawn.factors(rig) / np.array([*rig.full_levels.values()])
+    values = np.concatenate(found, axis=2) * drives[:, None]
+    parts = np.random.default_rng(seed).standard_normal((2, *values.shape))
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 1)))
+    values += NOISE * rms * (parts[0] + 1j * parts[1])
+    names = tuple(each.name for each in sensors)
+    masses = np.array([each.mass for each in sensors]) if are_places(sensors) else None
+    responses = Responses(names, points, frequencies, values, masses=masses)
+    return written(responses, desk, output, source="simulated plate")

@@ -9,6 +9,8 @@ import numpy as np
 from drivers import playing as contents
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
+from era_haptics.lab.measuring.loopback import check_levels, is_whole
+from era_haptics.lab.measuring.sound_card import Desk, Run, SoundCard, open_card, play, ramped
 from model.answer.answer import Layer
 from model.calibration.responses import read_sensors
 from model.processes import Progress
@@ -20,11 +22,6 @@ from model.study.promise_at_sensors import (
     promises,
 )
 from model.table.table import LocalizationTable
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.loopback import check_levels, is_whole
-from sim.desk.measuring.multisine import ramped
-from sim.desk.measuring.runs import Run, play
-from sim.desk.measuring.sound_card import SoundCard, open_card
 from sim.plant.fingers import fit_tones
 
 _SETTLING = 1.5  # s; T60 of a plate with little damping, and an amplifier that starts later

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import LinkError
+from era_haptics.lab.measuring.measure import Measured, measure
+from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import (
     Responses,
@@ -26,10 +28,6 @@ from model.calibration.responses import (
 )
 from model.commands.options import Stopwatch
 from model.errors import InputError
-from sim.desk.measuring.desk import Desk
-from sim.desk.measuring.measure import Measured, measure
-from sim.desk.measuring.multisine import Multisine
-from sim.desk.measuring.sound_card import DeviceLost, SoundCard
 
 _SAME = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0

@@ -1,0 +1,642 @@
+"""Periodic multisines on all outputs at once, told apart by the turns of their phases.
+
+In run e the phase of source i is turned by 2 pi e i / S, S the number of sources and of runs: at
+every line the S runs are orthogonal (the matrix of the discrete Fourier transform), so that the
+response to each source follows from all runs, with the full amplitude of all sources.
+
+Lines are odd multiples of the lowest: a square law shows in the empty even ones. Amplitudes fall
+with frequency, since accelerations grow.
+
+A sound card that plays from memory and records into it at the same time, by a callback in C.
+
+Python is not in the path of the sound: one array is played, another is filled, and what is lost
+meanwhile is counted.
+
+How a rig is wired to a sound card, and what its limits allow of that.
+
+A run through a sound card: what is played, and what is kept of it once the plate has settled.
+"""
+
+import ctypes
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drivers.errors import LinkError
+from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
+from model.calibration.responses import Responses, WiredSensor
+from model.errors import InputError
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Rig
+from model.structure.attachments import footprints_of
+from model.transients.time_response import plate_in_time
+from sim.soft_amp.engine import address_of
+from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
+from sim.soft_amp.output import portaudio_device, portaudio_stream, sounddevice
+
+PERIOD = 1.0
+"""s; lines are whole numbers of hertz."""
+
+_DRAWS = 20  # of phases; the lowest crest of them is 3.1 to 3.6
+_RAMP = 0.02  # s
+_STEP = 10  # Hz
+
+
+@dataclass(frozen=True, eq=False)
+class Multisine:
+    """The signals of so many sources; level: their largest sample; seed: of the phases.
+
+    frequencies (f,) [Hz]: whole multiples of 1 / PERIOD.
+    """
+
+    frequencies: FloatArray
+    sources: int
+    rate: float
+    level: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be played."""
+        if self.rate * PERIOD % 1:
+            raise InputError(f"sample rate must be a whole number of hertz, got {self.rate:g} Hz")
+        lines = self.frequencies * PERIOD
+        if len(lines) == 0 or np.abs(lines - np.round(lines)).max() > 1e-6 or lines.min() < 1:
+            raise InputError(
+                f"frequencies must be whole multiples of {1 / PERIOD:g} Hz, got "
+                f"{', '.join(f'{each:g}' for each in self.frequencies[:3]) or 'none'}, ..."
+            )
+        if self.frequencies.max() > 0.4 * self.rate:
+            raise InputError(
+                f"frequencies must be at most {0.4 * self.rate:g} Hz at this sample rate, got "
+                f"{self.frequencies.max():g} Hz"
+            )
+
+    @property
+    def slew(self) -> float:
+        """Highest rise [1/s] of the level, along the ramp at the start."""
+        return np.pi / 2 * self.level / _RAMP
+
+    @property
+    def samples(self) -> int:
+        """Samples of a period."""
+        return round(self.rate * PERIOD)
+
+    @cached_property
+    def lines(self) -> IntArray:
+        """Number of each line in the spectrum of a period, (f,)."""
+        return np.round(self.frequencies * PERIOD).astype(int)
+
+    @cached_property
+    def _amplitudes(self) -> ComplexArray:
+        """Complex amplitudes of cosines of source 0 in run 0, (f,), of the lowest crest drawn."""
+        rng = np.random.default_rng(self.seed)
+        sizes = 1 / self.frequencies
+        best, lowest = sizes + 0j, np.inf
+        for _ in range(_DRAWS):
+            drawn = sizes * np.exp(2j * np.pi * rng.uniform(size=len(sizes)))
+            peak = np.abs(self._analytic(drawn)).max()
+            if peak < lowest:
+                best, lowest = drawn, peak
+        # The envelope is the largest sample under any turn of the phases.
+        return np.asarray(best * self.level / lowest)
+
+    def _analytic(self, amplitudes: ComplexArray) -> ComplexArray:
+        """One period of the sum of a exp(i omega t), whose real part is played, (n,)."""
+        spectrum = np.zeros(self.samples, dtype=complex)
+        spectrum[self.lines] = amplitudes
+        return np.asarray(np.fft.ifft(spectrum) * self.samples)
+
+    def played(self, run: int) -> ComplexArray:
+        """Complex amplitudes (f, sources) of the samples of a run."""
+        return self._amplitudes[:, None] * self._phase_factors(run)
+
+    def signal(self, run: int, *, periods: float) -> FloatArray:
+        """Samples (n, sources) of so many periods, with ramps at both ends."""
+        period = (self._analytic(self._amplitudes)[:, None] * self._phase_factors(run)).real
+        found = np.resize(period, (round(periods * self.samples), self.sources))
+        return ramped(found, round(_RAMP * self.rate))
+
+    def found(self, recorded: FloatArray) -> ComplexArray:
+        """Complex amplitudes (f, ...) at the lines of whole periods of samples (n, ...)."""
+        lines = self.lines * (len(recorded) // self.samples)
+        return np.asarray(np.fft.rfft(recorded, axis=0)[lines] * 2 / len(recorded))
+
+    def _phase_factors(self, run: int) -> ComplexArray:
+        return np.asarray(np.exp(2j * np.pi * run * np.arange(self.sources) / self.sources))
+
+
+def ramped(samples: FloatArray, count: int) -> FloatArray:
+    """Samples (n, sources), ramped along squared sines over so many of them at both ends."""
+    ramp = np.sin(np.linspace(0, np.pi / 2, count)) ** 2
+    shape = np.ones((len(samples), 1))
+    shape[:count, 0] = ramp
+    shape[-count:, 0] *= ramp[::-1]
+    return samples * shape
+
+
+def default_frequencies(low: float, high: float) -> FloatArray:
+    """Odd whole frequencies [Hz] in steps of 10 from above a lowest to below a highest one."""
+    odd = np.arange(1.0, high + 1e-9, 2)
+    odd = odd[odd >= low]
+    if not odd.size:
+        raise InputError(f"limits.frequency must leave odd hertz, got {low:g} to {high:g} Hz")
+    return np.unique([*odd[:: _STEP // 2], odd[-1]])
+
+
+_AROUND = 4  # lines of a period on either side, from which noise is taken
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Responses (f, inputs, sources) of samples to samples, H1 over all runs.
+
+    std (f, inputs): standard deviation of each response's modulus; coherence (f, inputs): share of
+    the power that comes from the sources; even (inputs,): what came back at even lines, which
+    nobody played, relative to the lines played, amplitudes, noise taken off.
+    """
+
+    values: ComplexArray
+    std: FloatArray
+    coherence: FloatArray
+    even: FloatArray
+
+
+def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> Estimate:
+    """Estimate responses from whole periods of each run, (periods x samples, inputs).
+
+    Two periods or more: between the lines of a period the spectrum of several has nothing but
+    noise. Least squares of Y = U H^T at each line, U the amplitudes played (runs, sources).
+    """
+    n = multisine.samples
+    periods = len(recorded[0]) // n
+    spectra = np.array([np.fft.rfft(each, axis=0) for each in recorded], dtype=complex)
+    spectra *= 2 / len(recorded[0])
+    lines = multisine.lines * periods
+    heard = spectra[:, lines]  # (runs, f, inputs)
+    played = np.array([multisine.played(run) for run in range(len(recorded))])  # (runs, f, s)
+    values = np.linalg.solve(played.transpose(1, 0, 2), heard.transpose(1, 0, 2))
+    noise = _noise(spectra, lines, periods)
+    power = (np.abs(heard) ** 2).mean(axis=0)
+    size = np.abs(multisine.played(0)[:, :1])
+    return Estimate(
+        values.transpose(0, 2, 1),
+        np.sqrt(noise / len(recorded)) / size,
+        np.clip(1 - noise / np.maximum(power, 1e-300), 0.0, 1.0),
+        _even(spectra, lines, periods, noise),
+    )
+
+
+def _noise(spectra: ComplexArray, lines: IntArray, periods: int) -> FloatArray:
+    """Mean power of the bins around each line that no period has, (f, inputs)."""
+    offsets = np.arange(-_AROUND * periods, _AROUND * periods + 1)
+    offsets = offsets[offsets % periods != 0]
+    bins = np.clip(lines[:, None] + offsets, 1, spectra.shape[1] - 1)
+    return np.asarray((np.abs(spectra[:, bins]) ** 2).mean(axis=(0, 2)))
+
+
+def _even(spectra: ComplexArray, lines: IntArray, periods: int, noise: FloatArray) -> FloatArray:
+    """Amplitude at the even lines beside the odd ones, relative to those, (inputs,)."""
+    beside = lines + periods
+    power = (np.abs(spectra[:, beside]) ** 2).mean(axis=0) - noise
+    played = (np.abs(spectra[:, lines]) ** 2).mean(axis=0).sum(axis=0)
+    return np.asarray(np.sqrt(np.maximum(power.sum(axis=0), 0) / np.maximum(played, 1e-300)))
+
+
+MAX_PORTS = 64
+_POLL = 0.02  # s
+_STALLED = 10.0  # s without a sample; `jackd -S` may be slow on a loaded machine
+
+
+class _Transfer(ctypes.Structure):
+    """`struct transfer` of firmware/ports/sound/transfer.h."""
+
+    _fields_ = (
+        ("play", ctypes.c_void_p),
+        ("record", ctypes.c_void_p),
+        ("frames", ctypes.c_uint64),
+        ("position", ctypes.c_uint64),
+        ("outputs", ctypes.c_uint32),
+        ("inputs", ctypes.c_uint32),
+        ("is_running", ctypes.c_uint32),
+        ("gaps", ctypes.c_uint32),
+        ("is_lost", ctypes.c_uint32),
+        ("has_next", ctypes.c_uint32),
+        ("next_frame", ctypes.c_uint32),
+        ("ports", ctypes.c_void_p),
+        ("arrivals", ctypes.c_void_p),
+        ("blocks", ctypes.c_uint64),
+    )
+
+
+class Ports(ctypes.Structure):
+    """`struct transfer_ports`: ports of a JACK client, and addresses of functions of libjack."""
+
+    _fields_ = (
+        ("client", ctypes.c_void_p),
+        ("outputs", ctypes.c_void_p * MAX_PORTS),
+        ("inputs", ctypes.c_void_p * MAX_PORTS),
+        ("buffer", ctypes.c_void_p),
+        ("frame_time", ctypes.c_void_p),
+    )
+
+
+class DeviceLost(LinkError):
+    """A device that is gone, or takes no samples, in the middle of a run."""
+
+
+class SoundCard(ABC):
+    """An open device with some outputs and inputs, the first ones that it has.
+
+    name: of the device; rate [Hz]; limit: no sample played is larger, since nothing behind this
+    checks it. Its stream runs until `close`, so that the delay through it stays the same.
+    """
+
+    name: str
+    rate: float
+
+    def __init__(self, *, outputs: int, inputs: int, limit: float) -> None:
+        for what, count in (("outputs", outputs), ("inputs", inputs)):
+            if count > MAX_PORTS:
+                raise InputError(f"{what} must be at most {MAX_PORTS}, got {count}")
+        self._transfer = _Transfer(outputs=outputs, inputs=inputs)
+        self._limit = limit * (1 + 1e-6)  # of rounding
+        self.gaps = 0
+
+    def given(self, ports: Ports | None = None) -> int:
+        """The address of what the callbacks are to be given; ports: those of JACK."""
+        self._ports = ports  # kept, since the callbacks use it
+        self._transfer.ports = None if ports is None else ctypes.addressof(ports)
+        return ctypes.addressof(self._transfer)
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Play samples (n, outputs), and return those recorded meanwhile (n, inputs).
+
+        `gaps` counts holes in the sound. Raises DeviceLost, ValueError for samples beyond the
+        limit.
+        """
+        transfer = self._transfer
+        before = transfer.gaps
+        found = self.begin(played)
+        done, since = 0, time.monotonic()
+        try:
+            while done < len(found):
+                time.sleep(_POLL)
+                if transfer.position != done:
+                    done, since = transfer.position, time.monotonic()
+                elif transfer.is_lost or time.monotonic() - since > _STALLED:
+                    raise DeviceLost(f"{self.name}: the device was lost, or takes no samples")
+        finally:
+            if done < len(found):
+                self.close()  # the callback still has the memory
+        self.gaps = transfer.gaps - before
+        return found
+
+    def begin(self, played: FloatArray) -> Float32Array:
+        """Play samples (n, outputs); return at once what is recorded meanwhile (n, inputs).
+
+        Raises ValueError for samples beyond the limit.
+        """
+        transfer = self._transfer
+        out = np.ascontiguousarray(played, dtype=np.float32)
+        if not (np.abs(out) <= self._limit).all():  # neither is what is no number
+            raise ValueError(f"samples must be at most {self._limit:g}, got {np.abs(out).max():g}")
+        found = np.zeros((len(out), transfer.inputs), dtype=np.float32)
+        self._memory = out, found  # kept, since the callback uses it
+        transfer.play, transfer.record = out.ctypes.data, found.ctypes.data
+        transfer.frames, transfer.position, transfer.blocks = len(out), 0, 0
+        transfer.is_running = 1
+        return found
+
+    @property
+    def position(self) -> int:
+        """Frames that were played and recorded since `begin`."""
+        return int(self._transfer.position)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop, and leave the device."""
+
+
+CLIENT = "era-measure"
+
+
+def activate(
+    card: SoundCard, client: JackClient, *, outputs: int, inputs: int
+) -> tuple[list[int], list[int]]:
+    """Let a client's new ports out_1, ... and in_1, ... be those of a card; returns them."""
+    out = client.register((f"out_{n + 1}" for n in range(outputs)), IS_OUTPUT)
+    into = client.register((f"in_{n + 1}" for n in range(inputs)), IS_INPUT)
+    library = libjack()
+    ports = Ports(client=client.pointer)
+    ports.outputs[: len(out)], ports.inputs[: len(into)] = out, into
+    ports.buffer = ctypes.cast(library.jack_port_get_buffer, ctypes.c_void_p)
+    ports.frame_time = ctypes.cast(library.jack_last_frame_time, ctypes.c_void_p)
+    given = card.given(ports)
+    for name, set_callback in (
+        ("transfer_jack_process", library.jack_set_process_callback),
+        ("transfer_jack_shutdown", library.jack_on_shutdown),
+    ):
+        set_callback(client.pointer, address_of(name), given)
+    client.activate()
+    return out, into
+
+
+class JackCard(SoundCard):
+    """Ports of its own, each connected to the next one of a client; "": of the hardware."""
+
+    def __init__(self, other: str, *, outputs: int, inputs: int, limit: float) -> None:
+        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
+        self.name = jack_name(other)
+        self._client = JackClient(CLIENT)
+        try:
+            self.rate = float(self._client.rate)
+            takers = self._client.first_ports(other, IS_INPUT, outputs)
+            givers = self._client.first_ports(other, IS_OUTPUT, inputs)
+            out, into = activate(self, self._client, outputs=outputs, inputs=inputs)
+            for port, taker in zip(out, takers, strict=True):
+                self._client.connect(port, taker)
+            for giver, port in zip(givers, into, strict=True):
+                self._client.connect(giver, port)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the server."""
+        self._client.close()
+
+
+_BLOCK = 512  # frames; late samples are worse than a delay, which is measured
+
+
+class PortAudioCard(SoundCard):
+    """One stream in both directions, of one device: two devices would have two clocks."""
+
+    def __init__(self, device: str, *, outputs: int, inputs: int, limit: float) -> None:
+        super().__init__(outputs=outputs, inputs=inputs, limit=limit)
+        found = portaudio_device(device, outputs=outputs, inputs=inputs)
+        self.name, self.rate = found["name"], float(found["default_samplerate"])
+        try:
+            self._stream = portaudio_stream(
+                found["index"],
+                address_of("transfer_portaudio"),
+                self.given(),
+                outputs=outputs,
+                inputs=inputs,
+                samplerate=self.rate,
+                blocksize=_BLOCK,
+                latency="high",
+            )
+        except sounddevice().PortAudioError as problem:
+            raise LinkError(
+                f"--device {self.name}: cannot be opened: {problem.args[0]}; end the program that "
+                "uses it"
+            ) from None
+
+    def close(self) -> None:
+        """Stop at once, and close the device."""
+        self._stream.close(ignore_errors=True)
+
+
+def open_card(device: str, *, outputs: int, inputs: int, limit: float) -> SoundCard:
+    """Open `jack`, `jack:CLIENT`, or a device of PortAudio by its name or number.
+
+    limit: of the samples played, in full scale. Raises InputError for a device that does not suit;
+    LinkError where it is busy or gone.
+    """
+    kind, _, name = device.partition(":")
+    if kind == "jack":
+        return JackCard(name, outputs=outputs, inputs=inputs, limit=limit)
+    return PortAudioCard(device, outputs=outputs, inputs=inputs, limit=limit)
+
+
+MIN_SETTLING = 1.0
+"""Time [s] of a run before what counts, at least: a plate with a usual loss factor has settled."""
+
+_MAX_SETTLING = 5.0  # s
+_LEFT = 0.01  # of a free vibration
+
+
+def converters(response: ComplexArray) -> ComplexArray:
+    """The loop-back's complex response (f,) with a modulus of 1 in the median.
+
+    Dividing by it takes out the delay, fractions of a sample included, and the shape of filters;
+    gains are left, since those of a level and of a sensitivity are stated.
+    """
+    return np.asarray(response / np.median(np.abs(response)))
+
+
+@dataclass(frozen=True)
+class Desk:
+    """How a rig is wired to a sound card: its ERAs by their channels, counted from 1; a loop-back.
+
+    The loop-back is a cable from the output after those of the ERAs to the input after those of
+    the sensors; or, where a card has no output left, it has that of the last ERA (is_shared).
+    """
+
+    rig: Rig
+    sensors: tuple[WiredSensor, ...]
+    is_shared: bool = False
+
+    @property
+    def eras(self) -> list[tuple[str, int]]:
+        """Name and output of each ERA."""
+        return [(era.name, self.rig.wiring[era.name].number + 1) for era in self.rig.eras]
+
+    @property
+    def output(self) -> int:
+        """Output of the loop-back, the last one."""
+        return max(at for _, at in self.eras) + (not self.is_shared)
+
+    @property
+    def sources(self) -> list[int]:
+        """Output of each source: of the ERAs in their order, and of a loop-back of its own."""
+        outputs = [at for _, at in self.eras]
+        return outputs if self.is_shared else [*outputs, self.output]
+
+    @property
+    def input(self) -> int:
+        """Input of the loop-back, the last one."""
+        return max(sensor.input for sensor in self.sensors) + 1
+
+    @property
+    def looped(self) -> int:
+        """Number of the source that the loop-back brings back, the last one."""
+        return self.sources.index(self.output)
+
+    @property
+    def named_inputs(self) -> dict[int, str]:
+        """What each input has, the loop-back included."""
+        named = {sensor.input: f"sensor {sensor.name}" for sensor in self.sensors}
+        return named | {self.input: f"the loop-back of output {self.output}"}
+
+    @property
+    def columns(self) -> list[int]:
+        """Index of each sensor's input."""
+        return [sensor.input - 1 for sensor in self.sensors]
+
+    @property
+    def sensitivities(self) -> FloatArray:
+        """Sensitivity of each sensor, see `WiredSensor`."""
+        return np.array([sensor.sensitivity for sensor in self.sensors])
+
+    def responses(
+        self, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
+    ) -> Responses:
+        """Accelerations per base displacement [1/s²] from those of samples (f, inputs, sources).
+
+        looped (f,): of the loop-back.
+        """
+        full = np.array([*self.rig.full_levels.values()])
+        plain = values[:, self.columns, : len(self.eras)] / converters(looped)[:, None, None]
+        return Responses(
+            tuple(sensor.name for sensor in self.sensors),
+            np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
+            frequencies,
+            plain.transpose(0, 2, 1) / full[:, None] / self.sensitivities,
+            masses=np.array([sensor.mass for sensor in self.sensors]),
+        )
+
+    def on_outputs(self, sources: FloatArray) -> FloatArray:
+        """Samples (n, outputs) of the sources (n, sources)."""
+        return np.asarray(sources @ np.eye(self.output)[[at - 1 for at in self.sources]])
+
+    @cached_property
+    def settling(self) -> float:
+        """Time [s] of a run until free vibrations are at most 1 %, whole periods within 1 to 5 s.
+
+        By the mode within the rig's limits that decays slowest; those below them hardly move.
+        Raises InputError for a plate that is not supported.
+        """
+        rig = self.rig
+        points = footprints_of(rig.eras, rig.masses)
+        high = rig.limits.frequency_max
+        reduced = reduce_plate(rig.plate, rig.mesh, points, frequency_max=high)
+        modes = plate_in_time(reduced, rig.eras, loads=rig.masses).eigenvalues
+        played = np.abs(modes.imag) / (2 * np.pi)
+        within = (played >= rig.limits.frequency_min) & (played <= high)
+        slowest = -float(modes.real[within].max(initial=-math.inf))
+        least = max(slowest, -math.log(_LEFT) / _MAX_SETTLING)
+        return max(MIN_SETTLING, PERIOD * math.ceil(-math.log(_LEFT) / least / PERIOD))
+
+    @property
+    def highest(self) -> float:
+        """The highest level that the rig's limits allow on all ERAs at once."""
+        limits = self.rig.limits
+        return min(limits.level, float(np.sqrt(limits.power / len(self.rig.eras))), 1.0)
+
+    def check(self, level: float) -> None:
+        """Raise InputError for several amplifiers, and a level beyond the rig's limits."""
+        if len({self.rig.wiring[era.name].amplifier for era in self.rig.eras}) > 1:
+            raise InputError(
+                "all ERAs must be on one sound card, got several amplifiers in the rig"
+            )
+        if not 0 < level <= self.highest:
+            raise InputError(
+                f"--level must be above 0 and at most {self.highest:.3g}, as the rig's limits "
+                f"allow, got {level:g}"
+            )
+
+    def check_times(self, *, seconds: float, slew: float) -> None:
+        """Raise InputError for limits in time that samples from memory would not keep.
+
+        seconds: that are played without a pause; slew [1/s]: highest rise of a level.
+        """
+        limits = self.rig.limits
+        for key, is_kept, played in (
+            ("on_time", seconds <= limits.on_time, f"{seconds:.3g} s without a pause"),
+            ("duty", limits.duty >= 1, "one run after the other"),
+            ("slew", slew <= limits.slew, f"ramps of {slew:.3g} per second"),
+        ):
+            if not is_kept:
+                raise InputError(
+                    f"limits.{key} must allow what a sound card plays from memory, {played}, got "
+                    f"{getattr(limits, key):g}; check whether the ERAs bear it, and widen it"
+                )
+
+    def check_frequencies(self, frequencies: FloatArray, *, what: str) -> None:
+        """Raise InputError for frequencies [Hz] beyond the rig's limits; what: has them."""
+        limits = self.rig.limits
+        low, high = limits.frequency_min, limits.frequency_max
+        if frequencies.min() < low or frequencies.max() > high:
+            raise InputError(
+                f"{what} must be within the rig's limits.frequency of {low:g} to {high:g} "
+                f"Hz, got {frequencies.min():g} to {frequencies.max():g} Hz"
+            )
+
+
+TRIES = 3
+"""Attempts of a run."""
+
+_TAIL = 0.05  # s; longer than the ramp
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What was recorded of a run, (n, inputs).
+
+    is_whole: whether no block was lost, in the last attempt; repeated: attempts before it.
+    """
+
+    recorded: FloatArray
+    is_whole: bool
+    repeated: int
+
+    @property
+    def whole(self) -> FloatArray:
+        """What was recorded; raises LinkError where blocks were lost in each attempt."""
+        if self.is_whole:
+            return self.recorded
+        raise LinkError(
+            f"blocks of sound were lost in {self.repeated + 1} attempts of a run; end other "
+            "programs, give the sound server real-time priority, or choose larger blocks"
+        )
+
+
+def run_time(periods: int, *, settling: float = MIN_SETTLING) -> float:
+    """Time [s] of a run of which so many periods are analysed, after it has settled."""
+    return settling + PERIOD * periods + _TAIL
+
+
+def play(
+    card: SoundCard,
+    played: FloatArray,
+    *,
+    settling: float,
+    seconds: float,
+    is_whole: Callable[[FloatArray], bool],
+    tries: int = TRIES,
+) -> Run:
+    """Play samples (n, outputs), and keep some seconds behind the settling [s].
+
+    is_whole: whether no block was lost in what is kept (n, inputs); the run is repeated otherwise.
+    """
+    start, count = round(settling * card.rate), round(seconds * card.rate)
+    for repeated in range(tries):
+        kept = card.run(played)[start : start + count].astype(float)
+        if is_whole(kept):
+            return Run(kept, True, repeated)
+    return Run(kept, False, tries - 1)
+
+
+def play_on_one(
+    card: SoundCard, sines: Multisine, output: int, *, outputs: int, periods: int
+) -> FloatArray:
+    """Play a multisine on one output, counted from 1, without a loop-back.
+
+    Return what was recorded (n, inputs), whole periods; again where the device reports gaps. Raises
+    LinkError after three times.
+    """
+    signal = sines.signal(0, periods=run_time(periods) / PERIOD)
+    return play(
+        card,
+        signal * np.eye(outputs)[output - 1],
+        settling=MIN_SETTLING,
+        seconds=PERIOD * periods,
+        is_whole=lambda _kept: not card.gaps,
+    ).whole

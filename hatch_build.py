@@ -40,7 +40,7 @@ class EngineHook(BuildHookInterface):  # type: ignore[type-arg]
         made = {"model/compiled": compile_kernels(folder)}
         if os.name == "posix":
             compile_engine(folder / ENGINE)
-            made["sim/desk/soft_amp"] = [folder / ENGINE]
+            made["sim/soft_amp"] = [folder / ENGINE]
         for where, paths in made.items():
             for path in paths:
                 build_data["force_include"][str(path)] = f"{where}/{path.name}"

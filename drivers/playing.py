@@ -35,9 +35,9 @@ from drivers.protocol.sets import Command, Envelope, LayerSet
 
 __all__ = [
     "LAYERS_MAX",
+    "SAME",
     "Layer",
     "Playback",
-    "SAME",
     "Tone",
     "Transition",
     "Voice",

@@ -34,7 +34,7 @@ RATE = 16_000.0
 CHANNELS = 4
 """Channels of an amplifier."""
 
-FOLDER = Path(__file__).parents[2] / "out" / "firmware"
+FOLDER = Path(__file__).parents[1] / "out" / "firmware"
 """Where `make firmware` puts its programs."""
 
 _FULL_STROKE = 32767.0  # as a sample

@@ -32,7 +32,7 @@ ENGINE = "engine.so"
 """The file of the library in a wheel of one platform."""
 
 _HERE = Path(__file__).parent
-_FOLDERS = (_HERE / "firmware", _HERE.parents[2] / "firmware")  # of a wheel, of a checkout
+_FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout
 _PARTS = ("core", "wire", "ports/sound")
 _CORE = ("channel", "layers", "set", "sine", "states", "voice")
 _WIRE = ("crc", "mbap", "messages", "modbus", "serial")

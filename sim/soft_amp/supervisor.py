@@ -18,7 +18,7 @@ from typing import Any
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.desk.soft_amp.__main__ import LOST, OTHER_RATE
+from sim.soft_amp.__main__ import LOST, OTHER_RATE
 from sim.soft_amp.engine import Counters, Place, Settings, counters_in, new_file
 
 STALL = 0.1
@@ -130,7 +130,7 @@ class Supervisor:
         inherited = [self._file.fileno(), self._place.terminal, self._place.listening, life]
         self._process = subprocess.Popen(  # noqa: S603  this program
             [
-                *(sys.executable, "-P", "-m", "sim.desk.soft_amp"),
+                *(sys.executable, "-P", "-m", "sim.soft_amp"),
                 json.dumps(asdict(self._settings)),
                 *map(str, inherited),
                 str(self._rate),

@@ -41,11 +41,11 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     ),
     (("drivers/wires/",), ("make pages", "make fuzz")),
     (("drivers/host/",), ("make fuzz", "make stop-test", "make late-test")),
-    (("drivers/judge/asking/", "docs/how-to/", "docs/tutorials/"), ("make test-long",)),
+    (("era_haptics/lab/conformance/", "docs/how-to/", "docs/tutorials/"), ("make test-long",)),
     (("controller/daemon/", "controller/operation/"), ("make fault-test", "make kill-test")),
     (("controller/play/", "drivers/host/group.py"), ("make soak",)),
     (("model/compiled/",), ("make test-kernels",)),
-    (("sim/desk/soft_amp/", "sim/desk/measuring/"), ("make desk-test",)),
+    (("sim/soft_amp/", "era_haptics/lab/measuring/"), ("make desk-test",)),
     (("firmware/",), ("make firmware-test",)),
     (("examples/application/",), ("make qt-test",)),
     (

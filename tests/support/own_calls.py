@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 _COUNTED = tuple(f"{ROOT / name}/" for name in ("controller", "drivers", "model", "registry"))
 _CALLBACK = str(Path("asyncio", "events.py"))  # what calls what the event loop runs
-_BESIDE = tuple(f"{ROOT / name}/" for name in ("sim", "drivers/judge"))
+_BESIDE = tuple(f"{ROOT / name}/" for name in ("sim", "era_haptics/lab"))
 
 
 @dataclass

@@ -34,8 +34,7 @@ def conformance(
 ) -> None:
     """Check that an amplifier fulfils the contract. Reads only, unless --write is given."""
     from drivers.by_hand.actions import leave
-    from era_haptics.lab.conformance import judge_client as judge
-    from era_haptics.lab.conformance.contract import LEVEL
+    from era_haptics.lab.conformance.contract import LEVEL, judge
 
     level = LEVEL if level is None else level
     show = (lambda result: None) if json_ else _show_result

@@ -27,9 +27,9 @@ from registry import threads
 __all__ = [
     "CHECKS",
     "CLIENTS",
+    "LEVEL",
     "Check",
     "CheckResult",
-    "LEVEL",
     "Report",
     "Result",
     "judge",

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 //
 // What a running software amplifier counts, in memory that the process which watches it shares.
-// The order and sizes are those of sim/desk/soft_amp/counters.py.
+// The order and sizes are those of sim/soft_amp/counters.py.
 
 #ifndef COUNTERS_H
 #define COUNTERS_H

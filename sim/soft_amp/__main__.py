@@ -1,6 +1,6 @@
 """The process that plays; `sim.soft_amp.supervisor` starts, watches and, if need be, kills it.
 
-    python -m sim.desk.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RATE
+    python -m sim.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RATE
 
 SETTINGS as JSON, then descriptors, -1 for none; RATE [Hz]: of the process that it follows, in
 fault; 0 for the first one. It prints one line of JSON for each event.

@@ -1,1 +1,0 @@
-"""What a surface layout would do on the plate, before anybody touches it."""

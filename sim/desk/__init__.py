@@ -1,1 +1,0 @@
-"""A sound card as amplifier and as instrument."""

@@ -1,1 +1,0 @@
-"""A plate measured through a sound card: orthogonal multisines out, accelerometers in."""

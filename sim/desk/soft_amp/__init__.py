@@ -1,1 +1,0 @@
-"""An amplifier made of software: the firmware's core, played by a sound device."""

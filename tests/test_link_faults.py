@@ -21,12 +21,12 @@ from drivers.playing import Layer, Tone
 from drivers.protocol.definition import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig
+from real_wires import WIRES, HostedRig, rig_on_wire
 from registry import threads as clock
 from registry.threads import no_long_collections
-from rig_on_wire import WIRES, HostedRig, rig_on_wire
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 WATCHDOG = 0.25  # s
 THREE_HEARTBEATS = 0.150  # s

@@ -9,7 +9,7 @@ import pytest
 
 CONFTEST = """
 import pytest
-from installed_program import needs
+from typed_page import needs
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):

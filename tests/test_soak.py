@@ -11,8 +11,7 @@ import pytest
 
 from sim.faults import FaultWindow
 from soak import run_seed
-from soak_chain import Trace, run_plan
-from soak_plan import (
+from soak_runs import (
     AMPLIFIER_FAULTS,
     FRAME_FAULTS,
     KINDS,
@@ -21,6 +20,8 @@ from soak_plan import (
     OperatorAction,
     Plan,
     TouchSequence,
+    Trace,
+    run_plan,
 )
 
 SEEDS = (501, 508, 973, 62, 1, 305, 8)

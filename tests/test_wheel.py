@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from packaging.tags import platform_tags
 
-from installed_era import InstalledEra, try_first
 from licences import NOTES
 from model.compiled.kernels import versions
 from smoke import lowest, requirements
+from typed_page import InstalledEra, try_first
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim")

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import realised, versions
 from model.table.table_file import build_table
-from paper_table import smooth_rig
+from plates import smooth_rig
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:

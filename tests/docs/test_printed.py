@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from page_reader import PORTS
-from printed import difference
-from typed_page import PageError, read_steps
+from typed_page import PORTS, PageError, difference, read_steps
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from page_reader import Reader
-from typed_page import Typed, Written, read_steps
+from typed_page import Reader, Typed, Written, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"

@@ -10,15 +10,13 @@ from drivers.playing import Layer, Tone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from firmware_records import records_header
-from grown_status import LATER, WORD
-from grown_status import age as age
-from hand_written_talk import HALF, Talk
-from judged_line import judged
+from hand_written import HALF, Talk
 from protocol_tables import records
+from real_wires import LATER, WORD
+from real_wires import age as age
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.can_amplifiers import ObjectServer, SdoAbort
-from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, group_of
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, judged
 
 STATED = {"older": {"later_voltage": None}, "same": {"later_voltage": WORD}, "newer": {}}
 """Of what is added, by the age of the amplifier."""

@@ -12,7 +12,7 @@ import pytest
 from drivers import trace
 from drivers.errors import CommandError
 from drivers.trace import Direction, TraceWriter, tracing
-from full_disk import full_disk
+from long_form import full_disk
 
 
 def fail() -> str:

@@ -11,7 +11,7 @@ import era_haptics as era
 from era_haptics.drive import as_points, layers_of
 from model.answer.answer import Layer
 from model.rig.rig import Channel
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 RIG = make_paper_rig(12, 9)
 URL = f"sim://{era.example_rig_path()}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import era_haptics as era
-from small_table import small_table
+from plates import small_table
 
 RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
 PLATE, DRIVE, TARGET = era.SolvedPlate(RIG), {"SW": 110}, (0.08, 0.06)

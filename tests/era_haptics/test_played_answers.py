@@ -7,9 +7,9 @@ import pytest
 
 import era_haptics as era
 from model.table.table_file import build_table
+from real_wires import SHARED_WIRES, on_two_amplifiers, rig_on_wire
 from registry import threads
-from rig_on_wire import SHARED_WIRES, on_two_amplifiers, rig_on_wire
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 RIG = on_two_amplifiers(era.load_rig(era.example_rig_path()))
 PLATE = era.SolvedPlate(RIG)

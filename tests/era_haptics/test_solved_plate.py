@@ -11,7 +11,7 @@ import era_haptics as era
 from era_haptics.lab.design import problem
 from model.structure.attachments import PointLoad
 from model.vibration import plate_map
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16)]
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import era_haptics as era
 from model.cli import app
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 TARGET, QUIET = (0.08, 0.06), [(0.22, 0.16), (0.25, 0.04)]
 

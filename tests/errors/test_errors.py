@@ -17,9 +17,8 @@ import pytest
 
 from controller.cli.main import run
 from error_cases import PAGE, RIG, Case, Quotation, cases, filled, provoke, quotations
-from full_disk import full_disk
 from interrupted import interrupted
-from long_form import shortly
+from long_form import full_disk, shortly
 from model.calibration import calibrate
 
 INTERNALS = re.compile(

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from page_reader import Reader
-from typed_page import Typed, read_steps
+from typed_page import Reader, Typed, read_steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "how-to"

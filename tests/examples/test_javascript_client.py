@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon_bench import (
+from daemons import (
     ENABLED,
     PATIENCE,
     READY,
@@ -19,7 +19,7 @@ from daemon_bench import (
     ready_daemon,
     until_state,
 )
-from installed_program import installed_program
+from typed_page import installed_program
 
 BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"

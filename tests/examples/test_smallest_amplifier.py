@@ -13,8 +13,8 @@ import pytest
 import era_haptics
 from drivers.by_hand.actions import identify
 from drivers.wires.serial_frames import Frame, encode_frame
-from installed_program import installed_program
-from judged_line import judged
+from typed_page import installed_program
+from virtual_lines import judged
 
 SOURCE = Path(era_haptics.__file__).parents[1] / "examples" / "smallest_amplifier" / "amplifier.c"
 MOVED = Path(__file__).parents[1] / "support" / "moved_smallest.c"

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import model
-from installed_program import installed_program
+from typed_page import installed_program
 
 FOLDER = Path(model.__file__).parents[1] / "examples" / "systemd"
 WEEKEND = FOLDER.parent / "weekend"

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
-from firmware_programs import build_firmware
-from judged_line import KINDS, judged, plain
-from moved_firmware import FirmwareEnd
+from firmware_machine import FirmwareEnd, build_firmware
+from virtual_lines import JUDGED_LINE_KINDS, judged, plain
 
-_CASES = [(kind, check.name) for kind in KINDS for _, check in of_kind(kind)]
+_CASES = [(kind, check.name) for kind in JUDGED_LINE_KINDS for _, check in of_kind(kind)]
 _OF_ANY_WIRE = [check.name for check in CHECKS if not check.kinds]
 _OF_SERIAL_LINES = [check.name for _, check in of_kind("serial")]
 

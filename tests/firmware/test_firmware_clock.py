@@ -14,7 +14,7 @@ import pytest
 import hand_written as hand
 from drivers.protocol.definition import MESSAGES
 from drivers.wires.modbus_frames import framed
-from moved_firmware import CAN, MODBUS, SERIAL, SESSION, MovedFirmware, apply, request, values_of
+from firmware_machine import CAN, MODBUS, SERIAL, SESSION, MovedFirmware, apply, request, values_of
 
 TURN = 20.0  # s
 STEP = TURN / 2**16  # s; of the high word

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 from drivers.protocol.definition import BY_NUMBER, READINGS, ahead
-from firmware_requests import RandomHost
-from judged_line import judged
+from firmware_machine import LINES, RATE, FirmwareEnd, MovedFirmware, Pair, RandomHost, Sent
 from long_form import shortly
-from moved_firmware import LINES, RATE, FirmwareEnd, MovedFirmware, Pair, Sent
 from sim.amplifier.simulated_amplifier import Amplifier
+from virtual_lines import judged
 
 REQUESTS = 600
 TOLERANCE = 3e-4  # of full level: 16-bit samples, and fixed point in up to 16 voices

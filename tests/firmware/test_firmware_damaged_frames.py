@@ -18,9 +18,8 @@ import hand_written as hand
 from drivers.protocol.definition import STATES, STATUS_FLAGS, VERSION
 from drivers.wires.can_frames import REQUEST, SLCAN, CanFrame, segments
 from drivers.wires.modbus_frames import framed
-from firmware_requests import RandomHost
-from moved_firmware import CAN, MODBUS, SERIAL, TCP, MovedFirmware, values_of
-from mutation import damage
+from firmware_machine import CAN, MODBUS, SERIAL, TCP, MovedFirmware, RandomHost, values_of
+from real_wires import damage
 
 COUNT = int(os.environ.get("FRAMES", "1000"))
 LINES = {"serial": SERIAL, "rtu": MODBUS, "tcp": TCP, "can": CAN}

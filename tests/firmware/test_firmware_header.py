@@ -5,7 +5,7 @@ from pathlib import Path
 
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rows, WireQuantity
 from firmware_records import records_header
-from installed_program import installed_program
+from typed_page import installed_program
 
 ROOT = Path(__file__).parents[2]
 WORD = WireQuantity("word", "u16", 1, "", 0, 0xFFFF)

@@ -15,8 +15,8 @@ from drivers.host.line import Line, Priority
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
-from firmware_programs import running_firmware
-from foreign_masters import MASTERS, drive
+from firmware_machine import running_firmware
+from real_wires import MASTERS, drive
 from registry.limits import GuardLimits
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)

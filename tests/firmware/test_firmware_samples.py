@@ -8,9 +8,7 @@ import pytest
 from cobs import cobs
 
 import hand_written as hand
-from hand_written import tone as command
-from model.arrays import FloatArray
-from moved_firmware import (
+from firmware_machine import (
     PER_MS,
     RATE,
     SERIAL,
@@ -22,6 +20,8 @@ from moved_firmware import (
     request,
     values_of,
 )
+from hand_written import tone as command
+from model.arrays import FloatArray
 
 TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
 

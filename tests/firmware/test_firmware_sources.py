@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from installed_program import installed_program
+from typed_page import installed_program
 
 ROOT = Path(__file__).parents[2]
 PAIR = "struct pair { int a, b; };\nstruct pair "

@@ -13,7 +13,7 @@ from model.calibration.responses import write_responses_csv
 from model.cli import app
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from perturbed_plate import FREQUENCIES, perturbed
+from plates import PERTURBED_PLATE_FREQUENCIES, perturbed
 from sim.plant.fingers import Accelerometer
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
@@ -36,7 +36,7 @@ def measured(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
         replace(sensor, scale=scales.get(sensor.name, 1.0))
         for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
     ]
-    responses = record_responses(perturbed(rig), sensors, FREQUENCIES)
+    responses = record_responses(perturbed(rig), sensors, PERTURBED_PLATE_FREQUENCIES)
     folder = tmp_path_factory.mktemp("measured")
     write_responses_csv(folder / "measured.csv", responses, rig)
     return folder
@@ -58,6 +58,6 @@ def test_calibration_finds_the_true_parameters(rig: Rig, measured: Path, tmp_pat
     assert told["held_out"]["error_after"] < 0.03 < 0.3 < told["held_out"]["error_before"]
     assert told["files"] == [str(new)]
     back = load_rig(new, mesh=MESH)
-    gains = np.column_stack([era.gain(FREQUENCIES) for era in back.eras])
-    true_gains = np.column_stack([era.gain(FREQUENCIES) for era in truth.eras])
+    gains = np.column_stack([era.gain(PERTURBED_PLATE_FREQUENCIES) for era in back.eras])
+    true_gains = np.column_stack([era.gain(PERTURBED_PLATE_FREQUENCIES) for era in truth.eras])
     assert np.median(np.abs(gains / true_gains - 1)) < 0.01

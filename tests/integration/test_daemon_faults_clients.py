@@ -11,15 +11,17 @@ import pytest
 
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from daemon_bench import PATIENCE, far_end, until
-from daemon_process import (
+from daemons import (
+    PATIENCE,
     DaemonProcess,
     daemon_process,
+    far_end,
     loudness,
     play,
     playing_daemon,
     plays_on,
     run_era,
+    until,
 )
 from floods import flood
 from long_form import shortly

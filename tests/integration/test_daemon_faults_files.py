@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.daemon import check_daemon
-from daemon_bench import ENABLED, holding, ready_daemon, write_daemon
+from daemons import ENABLED, holding, ready_daemon, write_daemon
 from model.errors import InputError
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
 

@@ -22,9 +22,9 @@ import patient_daemon
 from controller.api.client import AsyncClient
 from controller.play.selection import GIVEN_UP
 from controller.sources.touch import Touch, TouchFrame
-from daemon_bench import PATIENCE, far_end, holding, until, until_state, write_daemon
-from daemon_process import (
+from daemons import (
     ERA,
+    PATIENCE,
     REACTION,
     WATCHDOG,
     Journal,
@@ -32,6 +32,8 @@ from daemon_process import (
     daemon_process,
     disarmed,
     energised,
+    far_end,
+    holding,
     loudness,
     play,
     playing_daemon,
@@ -39,11 +41,14 @@ from daemon_process import (
     ready,
     run_era,
     silent_from,
+    until,
+    until_state,
+    write_daemon,
 )
 from examples.make_touches import tuio_datagram
 from kills import PLACES, kill_everywhere
+from several_fingers import free_port, panel
 from sim.faults import FaultWindow
-from tuio_messages import free_port, panel
 
 pytestmark = pytest.mark.real_time
 

@@ -17,11 +17,10 @@ import pytest_asyncio
 
 import dashboard_pictures
 import patient_daemon
-from chromium import Browser, Page
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.effects.layout import LAYOUT, load_layout
-from daemon_bench import PATIENCE
+from daemons import PATIENCE
 from dashboard_pictures import (
     PLACES,
     REASON,
@@ -36,7 +35,9 @@ from dashboard_pictures import (
 )
 from gateway_bench import (
     TOKEN,
+    Browser,
     GatewayProcess,
+    Page,
     gateway_process,
     real_daemon,
     wait_for,

@@ -9,14 +9,13 @@ from unittest.mock import Mock
 import pytest
 
 import dashboard_pictures
-from chromium import Page
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.schema import ContactStatus, DaemonStateName
 from controller.api.server import Hub, LayoutEvent, PatternEvent, StateEvent
 from controller.gateway.app import MAX_SESSIONS
-from daemon_bench import PATIENCE, ready, running_daemon
+from daemons import PATIENCE, ready, running_daemon
 from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
-from gateway_bench import UNCONFIRMED, RawWebSocket, ScriptedDaemon, gateway_process
+from gateway_bench import UNCONFIRMED, Page, RawWebSocket, ScriptedDaemon, gateway_process
 from sim.faults import FaultWindow
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")

@@ -20,11 +20,11 @@ from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder
 from controller.sources.tuio import read_capture
 from gateway_bench import wait_for
-from installed_program import ERA
 from model.rig.rig_file import example_rig_path, load_rig
 from patient_daemon import wait_long
-from tuio_messages import write_schedule
-from virtual_loop import run_virtual
+from several_fingers import write_schedule
+from typed_page import ERA
+from virtual_lines import run_virtual
 
 ERA_NAMES = {"SW", "SE", "NE", "NW"}
 

@@ -17,7 +17,7 @@ import pytest
 import model
 from chain import Chain
 from controller.plate_measurement import TonePlayer
-from daemon_bench import READY, daemon_at, far_end, until_state
+from daemons import READY, daemon_at, far_end, until_state
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
@@ -29,13 +29,13 @@ from model.fem import Mesh
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.vibration import Tone
+from real_wires import WIRES, far_side
 from registry import threads
 from registry.limits import GuardLimits
-from rig_on_wire import WIRES, far_side
 from set_table import SetTable, make_rig
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {

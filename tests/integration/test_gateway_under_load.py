@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.client import Client
-from daemon_bench import PATIENCE, PLACE
+from daemons import PATIENCE, PLACE
 from gateway_bench import (
     ERA,
     TOKEN,

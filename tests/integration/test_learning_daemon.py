@@ -20,15 +20,15 @@ from controller.daemon.daemon import Daemon
 from controller.demo.recorder import FingerVibration, steady_contrast_db
 from controller.learning.estimator_process import EstimatorTimeouts
 from controller.learning.learning import Learning
-from daemon_bench import daemon_at, far_end, ready
+from daemons import daemon_at, far_end, ready
 from model.identification.learned_plate import load_learned
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
+from real_wires import FarSide
 from registry import threads
-from rig_on_wire import FarSide
-from virtual_loop import VirtualLoop
+from virtual_lines import VirtualLoop
 
 P = ParamSpec("P")
 T = TypeVar("T")

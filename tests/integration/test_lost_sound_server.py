@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import pytest
 
 from controller.api.client import AsyncClient
-from daemon_bench import PATIENCE, PLACE, READY, daemon_at, holding, ready, until, until_state
+from daemons import PATIENCE, PLACE, READY, daemon_at, holding, ready, until, until_state
 from patient_daemon import wait_long
-from sound_card import SoftAmp, capture_on, jack_server
+from sound_cards import SoftAmp, capture_on, jack_server
 
 pytestmark = [
     pytest.mark.long,

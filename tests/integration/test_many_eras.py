@@ -13,8 +13,8 @@ from controller.sources.tuio import read_capture
 from long_form import shortly
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
-from tuio_messages import write_schedule
-from virtual_loop import run_virtual
+from several_fingers import write_schedule
+from virtual_lines import run_virtual
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}

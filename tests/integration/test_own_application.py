@@ -13,14 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from chromium import Page, open_browser
 from controller.api.client import Client
 from controller.api.server import StateEvent
-from daemon_bench import PATIENCE
+from daemons import PATIENCE
 from gateway_bench import (
     TOKEN,
+    Page,
     ScriptedDaemon,
     gateway_process,
+    open_browser,
     real_daemon,
     wait_for,
     wait_for_state,

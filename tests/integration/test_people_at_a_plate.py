@@ -12,8 +12,7 @@ import pytest
 import model
 from controller.api.client import AsyncClient
 from controller.api.methods import StatusResult
-from daemon_bench import PATIENCE, holding, next_event, ready, until
-from daemon_process import STARTING
+from daemons import PATIENCE, STARTING, holding, next_event, ready, until
 from long_form import shortly
 from patient_daemon import RESTING
 

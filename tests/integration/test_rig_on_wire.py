@@ -21,11 +21,11 @@ from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import SCALED
-from rig_files import write_rig
-from rig_on_wire import WIRES, far_side
+from plates import write_rig
+from real_wires import WIRES, far_side
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.plant.fingers import Accelerometer
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 Typed = Callable[..., Result]
 PORT = "serial:///dev/memory0?baud=921600"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_responder
-from felt_chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
+from chain import LEVEL_DB_SL, ONSET, SENSORS, Heard, Played, Situation, Stream, play_stream
 from long_form import shortly
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
@@ -36,8 +36,8 @@ from model.structure.attachments import FingertipLoad, footprints_of
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope, shaped
-from only import only
-from rig_files import TWO_AMPLIFIERS, write_rig
+from plates import TWO_AMPLIFIERS, write_rig
+from set_table import only
 from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant

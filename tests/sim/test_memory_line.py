@@ -15,13 +15,13 @@ from drivers.protocol.definition import FAULTS
 from drivers.wires.serial_line import SerialWire
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
+from plates import TWO_AMPLIFIERS, write_rig
+from real_wires import LIMITS, layer, make_bench
 from registry import threads
-from rig_files import TWO_AMPLIFIERS, write_rig
-from rig_on_wire import LIMITS, layer, make_bench
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults import FaultWindow
 from sim.memory_line import MemoryPort
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 def line_to(device: AmplifierDevice) -> Line:

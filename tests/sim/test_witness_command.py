@@ -27,11 +27,11 @@ from era_haptics.lab.witness.witness_cli import parse_endpoint, relays
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
+from plate_witness import witness_config
+from real_wires import WIRES, far_side
 from registry.limits import GuardLimits
-from rig_on_wire import WIRES, far_side
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import in_virtual_time
-from witness_config import witness_config
+from virtual_lines import in_virtual_time
 
 
 def _witness(url: str, *, level: float) -> Witness:

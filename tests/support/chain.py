@@ -2,36 +2,64 @@
 
 Everything between the touch frames and the plate is the project's own, with the durations of the
 wires; only the lines are memory. The witness reads every byte, and the plate is judged beside it.
+
+A chain with a table that a test sets, on a rig for which nothing has to be solved.
+
+The chain with a touch stream: what fingertips felt and sensors read in each of its situations.
+
+Fingers are at every place of the stream, so that what they felt can be read for any window
+afterwards; those that do not touch have no weight.
+
+The chain with a table of two patterns, played scenarios: touches and operator commands.
+
+What each touch must give is known by hand.
 """
 
 import asyncio
+import math
+import random
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
+from operator import methodcaller
 from types import MappingProxyType
-from typing import Any, Self, cast
+from typing import Any, Self, TypeVar, cast
 
+import numpy as np
+
+import hand_written as hand
+from controller.daemon.messages import PlateView
+from controller.effects.layout import SurfaceLayout, default_effects
+from controller.effects.player import EffectPlayer
 from controller.play.loop import Controller
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.sources.touch import Touch, TouchFrame
+from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
+from era_haptics.lab.witness.capture import Violation
 from era_haptics.lab.witness.witness_cli import parse_endpoint
-from memory_machine import MemoryMachine
+from model.answer.answer_report import Timing
+from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig
-from newest_contact import BuzzNewestContact
-from plate_judge import STEP, WATCHDOG, PlateJudge
-from plate_witness import OperatorCommand
+from model.table.table import LocalizationTable
+from model.vibration import Excitation, Tone
+from plate_witness import STEP, WATCHDOG, LoopWitness, OperatorCommand, PlateJudge
+from real_wires import FarSide, far_side
 from registry import threads
-from rig_on_wire import FarSide, far_side
-from set_table import SetTiming
+from registry.limits import GuardLimits
+from set_table import STROKE, BuzzNewestContact, SetTable, SetTiming, make_rig
+from sim.amplifier.readings import AmplifierSummary
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultKind, FaultWindow
-from sim.plant.imperfections import Imperfections
-from witness_config import LoopWitness
+from sim.plant.fingers import Accelerometer, Felt
+from sim.plant.imperfections import Imperfections, draw_imperfections
+from sim.sensors import Accelerometers, Recording
+from virtual_lines import MemoryMachine, run_virtual
 
 Position = tuple[float, float]
 Finger = tuple[int, float, float]
@@ -375,3 +403,486 @@ class FarEnd:
     def times(self, *names: str) -> list[float]:
         """When something was requested [s]."""
         return [time for time, name, _ in self.asked if name in names]
+
+
+Made = TypeVar("Made", bound=Chain)
+
+FINGER = (1, 0.15, 0.1)
+OTHER = (2, 0.27, 0.02)
+"""Fingers on these rigs."""
+
+
+@asynccontextmanager
+async def set_chain(
+    *amplifiers: str,
+    of: type[Made] = Chain,  # type: ignore[assignment]
+    wire: str = "serial",
+    rate: float = math.inf,
+    on_time: float = math.inf,
+    knots: int = 0,
+    **options: Any,
+) -> AsyncIterator[Made]:
+    """A chain with a table that a test sets, not open yet; one amplifier unless more are named.
+
+    of: its class; wire: its kind; rate [1/s], on_time [s]: limits of the rig; knots: of an
+    envelope, none that can be played without; options: as for `Chain.on`. Its wires have no delays,
+    its fingers load no plate.
+    """
+    names = amplifiers or ("main",)
+    rig = make_rig(names, GuardLimits(40.0, 500.0, 1.0, rate=rate, on_time=on_time))
+    table = SetTable({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
+    options = {"passing": (0.0, 0.0), "capabilities": {"knots": knots}, **options}
+    async with of.on(Wire(wire, unpluggable=True), rig, table, **options) as chain:
+        chain.is_felt = chain.must_be_felt = False
+        yield chain
+
+
+@asynccontextmanager
+async def set_running(
+    *amplifiers: str, of: type[Made] = Chain, breaks: str | None = None, **options: Any
+) -> AsyncIterator[Made]:
+    """The same, armed, and judged at its end; breaks: the only rule that is broken."""
+    async with set_chain(*amplifiers, of=of, **options) as chain:
+        await chain.open()
+        await chain.operate("arm")
+        await asyncio.sleep(0.001)
+        yield chain
+        await chain.close()
+        chain.judge(breaks)
+
+
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What is so from one change of the fingers to the next [s] of the stream.
+
+    fingers: places by id, in order of arrival; target: the id of the one to feel it, None where
+    no finger is there; from_rest: whether the plate was silent before.
+    """
+
+    begin: float
+    end: float
+    fingers: Mapping[int, str]
+    target: int | None
+    from_rest: bool
+
+    @property
+    def quiet(self) -> tuple[str, ...]:
+        """Where nothing may be felt."""
+        return tuple(place for id, place in self.fingers.items() if id != self.target)
+
+    @property
+    def felt_at(self) -> str:
+        """Where it is to be felt."""
+        assert self.target is not None
+        return self.fingers[self.target]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Places [m] by name, and who is where from when [s] on; the last change ends it."""
+
+    places: Mapping[str, Place]
+    changes: Sequence[tuple[float, Mapping[int, str]]]
+
+    @property
+    def situations(self) -> list[Situation]:
+        """Each change with what it asks for: the finger that came last feels it."""
+        found = []
+        before: Mapping[int, str] = {}
+        for (begin, fingers), (end, _) in pairwise(self.changes):
+            target = max(fingers, default=None)  # ids are given in order of arrival
+            found.append(Situation(begin, end, fingers, target, not before))
+            before = fingers
+        return found
+
+
+LEVEL_DB_SL = 30.0
+LEVEL_LIMIT = 1.0  # of the example's rig, written by hand
+SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcand": 500_000}
+"""Default speeds of the wires that have one [bit/s]."""
+SENSORS: Mapping[str, Place] = {
+    "P1": (0.03, 0.05),
+    "P2": (0.20, 0.11),
+    "P3": (0.29, 0.20),
+    "P4": (0.08, 0.19),
+    "P5": (0.15, 0.04),
+    "P6": (0.26, 0.09),
+}
+STEADY = 0.3  # s; the end of each situation, when its transients have decayed
+ONSET = 0.1  # s; over which an onset is judged
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A situation as it was on the plate, from start to end [s].
+
+    patterns: as a daemon would report them; clocks: errors of the amplifiers' clocks, rms [s] by
+    name, as the last of them counts them, empty for one amplifier; steady, onset: what fingertips
+    felt in the end and in the first 100 ms, by place; phasors (f, s) [m/s²]: at the sensors in the
+    end, at the frequencies that were played; fading: what sensors read where nobody touched.
+    """
+
+    situation: Situation
+    begin: float
+    end: float
+    patterns: tuple[Mapping[str, Any], ...] = ()
+    clocks: Mapping[str, float] = field(default_factory=dict)
+    steady: Mapping[str, Felt] = field(default_factory=dict)
+    onset: Mapping[str, Felt] = field(default_factory=dict)
+    phasors: ComplexArray | None = None
+    fading: Recording | None = None
+
+
+@dataclass(frozen=True)
+class Played:
+    """Results of a stream; violations: what the witness found."""
+
+    heard: list[Heard]
+    summaries: Sequence[AmplifierSummary]
+    violations: Sequence[Violation]
+
+
+def play_stream(
+    stream: Stream,
+    wires: Mapping[str, str],
+    rig: Rig,
+    table: LocalizationTable,
+    *,
+    plate: Rig | None = None,
+    drive_mode: str | None = None,
+) -> Played:
+    """Play a stream from arming to closing; wires: kinds by amplifier.
+
+    rig, table: of the controller; plate: its rig, which the controller does not know.
+    """
+
+    async def run() -> Played:
+        async with Streamed.on(
+            {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in wires.items()},
+            rig,
+            table,
+            plate=plate,
+            imperfections=draw_imperfections(plate or rig),
+            intent_source=EffectPlayer(SurfaceLayout(effects=default_effects(LEVEL_DB_SL))),
+            timing=Timing(table),
+            drive_mode=drive_mode,
+            judged={"level": LEVEL_LIMIT},
+        ) as chain:
+            await chain.open()
+            await chain.operate("arm")
+            times = await chain.send(stream)
+            heard = [
+                chain.hear(situation, begin, end)
+                for situation, begin, end in zip(stream.situations, times, times[1:], strict=False)
+            ]
+            await chain.close()
+            summaries = [chain.far.summary(name) for name in chain.far.devices]
+            return Played(heard, summaries, chain.witness.finish(threads.now()))
+
+    return run_virtual(run(), rng=random.Random(1))
+
+
+@dataclass
+class Streamed(Chain):
+    """A chain with sensors, to which a stream is sent."""
+
+    def __post_init__(self) -> None:
+        """Place the sensors."""
+        super().__post_init__()
+        self.is_felt = False
+        self._counted: list[tuple[float, Mapping[str, float]]] = []
+        self.controller.cycle.observers.pattern_applied.append(self._note_clocks)
+        self._sensors = Accelerometers(self.far.bench)
+        self._sensors.place([Accelerometer(name, *at) for name, at in SENSORS.items()])
+
+    async def send(self, stream: Stream) -> list[float]:
+        """Deliver a stream at its pace; return the times of its changes [s]."""
+        times = []
+        for (begin, fingers), (end, _) in pairwise([(0.0, {}), *stream.changes]):
+            times.append(threads.now())
+            self._touch(stream, fingers)
+            await self.hold(end - begin)
+        return [*times[1:], threads.now()]
+
+    def hear(self, situation: Situation, begin: float, end: float) -> Heard:
+        """Read what was felt in a situation between two times [s]."""
+        bench = self.far.bench
+        bench.advance(threads.now())
+        heard = Heard(situation, begin, end)
+        if situation.target is None:
+            return replace(heard, fading=self._sensors.read(begin, end))
+        applied = [each for each in self.applied if begin <= each.time < end]
+        steady = bench.felt(end - STEADY, end)
+        heard = replace(
+            heard,
+            patterns=tuple(map(_pattern, applied)),
+            clocks=next((each for time, each in reversed(self._counted) if time < end), {}),
+            steady=steady,
+            phasors=_phasors(
+                self._sensors.read(end - STEADY, end),
+                np.array(next(iter(steady.values())).frequencies),
+            ),
+        )
+        if not situation.from_rest:
+            return heard
+        first = self._sensors.read(begin, begin + 2 * ONSET)
+        motion = np.abs(first.samples).max(axis=1)
+        onset = float(first.times[np.argmax(motion > 1e-3 * motion.max())])
+        return replace(heard, onset=bench.felt(onset, onset + ONSET))
+
+    def _note_clocks(self, applied: PlayReport) -> None:
+        """Keep how far off clocks are counted in what has just begun to play."""
+        planner = self.controller.cycle.planner
+        assert planner is not None
+        self._counted.append((applied.time, planner.clocks.errors))
+
+    def _touch(self, stream: Stream, fingers: Mapping[int, str]) -> None:
+        """Rest fingers on places; at the others they only feel."""
+        self.at = {id: stream.places[name] for id, name in fingers.items()}
+        observers = stream.places.keys() - {*fingers.values()}
+        self.far.bench.place_fingers(stream.places, now=threads.now(), observers=observers)
+
+
+def _pattern(applied: PlayReport) -> Mapping[str, Any]:
+    event = PlateView(effect_of=lambda key: None, report=applied).pattern_event()
+    assert event is not None
+    return event.model_dump()
+
+
+def _phasors(signals: Recording, frequencies: FloatArray) -> ComplexArray:
+    """Complex amplitudes (f, s) of Im[a exp(i omega t)], t from the first sample on.
+
+    Least squares under a Hann window, which keeps out what still rings at other frequencies.
+    """
+    weights = np.sqrt(np.hanning(len(signals.times)))[:, None]
+    angles = 2 * np.pi * np.outer(signals.times - signals.times[0], frequencies)
+    basis = np.hstack([np.sin(angles), np.cos(angles)])
+    found = np.linalg.lstsq(weights * basis, weights * signals.samples, rcond=None)[0]
+    return np.asarray(found[: len(frequencies)] + 1j * found[len(frequencies) :])
+
+
+SENSED_EVERY = 0.001  # s
+_LONGEST = 5.0  # s; a planted bug may cause a deadlock
+ALONE: Excitation = {"SW": Tone(110.0, 20e-6, math.pi / 2), "NE": Tone(150.0, 40e-6, -math.pi)}
+SHARED: Excitation = {"SW": Tone(90.0, 30e-6, 0.0)}
+WITNESSED = ("serial", "modbus-tcp", "modbus-rtu", "socketcand", "slcan")
+"""Every kind of wire."""
+
+
+@dataclass
+class Scene(Chain):
+    """A chain whose source repeats its touches; errors: what its callers were told."""
+
+    errors: list[BaseException] = field(default_factory=list)
+    _holding: "asyncio.Task[None] | None" = None
+
+    def __post_init__(self) -> None:
+        """Have a source whose fingers do not load the plate."""
+        super().__post_init__()
+        self.is_felt = False
+
+    @property
+    def amplifier(self) -> AmplifierAmplifier:
+        """The first amplifier."""
+        return next(iter(self.controller.amplifiers.values()))
+
+    async def rest(self, seconds: float) -> None:
+        """Sleep for a time [s]."""
+        if seconds:
+            await asyncio.sleep(seconds)
+
+    async def operate(self, command: OperatorCommand, *, rest: float = 0.0) -> None:
+        """Carry out an operator's command, then sleep for `rest` [s]."""
+        await self.tried(super().operate(command))
+        await self.rest(rest)
+
+    def run(self) -> None:
+        """Start the control loop, or let it go on."""
+        self.turning.set()
+        if self.running is None:
+            self.running = asyncio.create_task(self.tried(self.controller.cycle.run()))
+
+    def hang(self) -> None:
+        """Stall the control loop."""
+        self.turning.clear()
+
+    def touch_beside(self) -> None:
+        """Deliver a touch beside the plate."""
+        self.deliver(TouchFrame("panel", threads.now(), (Touch(9, 1.3, 0.5),)))
+
+    async def touch(self, *fingers: int, answerable: bool = True, rest: float = 0.0) -> None:
+        """Replace the fingers on the plate, which the source repeats, then sleep for `rest` [s]."""
+        self.must_be_felt = answerable
+        self.at = {number: (0.03 + 0.06 * number, 0.1) for number in fingers}
+        self.witness.expect(self.expected())
+        self.report()
+        if self._holding is None:
+            self._holding = asyncio.create_task(self.hold(math.inf))
+        await self.rest(rest)
+
+    def expected(self) -> dict[str, dict[int, list[tuple[float, float, float]]]]:
+        """Expected patterns on the wire, by hand: metres over 100 um, radians in degrees."""
+        alone = {0: [(110.0, 0.2, 90.0)]}, {1: [(150.0, 0.4, 180.0)]}
+        parts = alone if len(self.at) < 2 else ({0: [(90.0, 0.3, 0.0)]}, {})
+        names = tuple(self.far.devices)
+        if len(names) == 1:
+            return {names[0]: {**parts[0], **parts[1]}}
+        return {names[0]: parts[0], names[1]: parts[1]}
+
+    async def reopen(self) -> None:
+        """Close and reopen all, including the control loop."""
+        await super().close()
+        self.running = None
+        await self.rest(0.01)
+        await self.open()
+
+    def trip(self) -> None:
+        """Trip the first amplifier by an arc."""
+        self.far.bench.advance(threads.now())
+        self.far.amplifier.trip("ARC", threads.now())
+
+    async def fall_silent(self) -> None:
+        """Stop the source with fingers down: after its lease of 150 ms they count as lifted."""
+        self.report()
+        if self._holding is not None:
+            self._holding.cancel()
+        await self.rest(0.150)
+
+    def inject(self, kind: int, words: Sequence[int]) -> None:
+        """Inject a request of another program toward the amplifier on the first wire."""
+        link, data = self.witness.wires[0], hand.frame(kind, words, sequence=999)
+        self.operation.deliver(link, "amplifier", data, self.operation._terminals[link].inward)
+
+    async def poll(self, times: int) -> None:
+        """Read the status of the amplifier every 20 ms."""
+        for _ in range(times):
+            await self.rest(0.02)
+            await self.amplifier.read_status()
+
+    async def ask(self, name: str) -> None:
+        """Ask the amplifier something."""
+        await self.amplifier.request(name, {})
+
+    async def identify(self) -> None:
+        """Identify the amplifier again."""
+        await self.amplifier.identify()
+
+    def delayed(self, seconds: float) -> None:
+        """Delay what goes to the host from now on."""
+        for end in self.far_ends:
+            end.delay(seconds)
+
+    async def touch_for(self, frequency: float, level: float, phase: float = 0.0) -> None:
+        """Touch where the table has this tone for one ERA, which may not be played."""
+        self.table.excitation = {**ALONE, "NE": Tone(frequency, level * STROKE, phase)}
+        await self.touch(1, answerable=False)
+        self.witness.expect(None)
+
+    async def close(self) -> None:
+        """Lift what is down, disarm and close all."""
+        if self._holding is not None:
+            self._holding.cancel()
+        self.witness.contacts(threads.now(), ())
+        await self.tried(super().close())
+
+    async def tried(self, work: Awaitable[Any]) -> None:
+        """Do something, and note its error."""
+        try:
+            await work
+        except Exception as error:
+            self.errors.append(error)
+
+
+def play(
+    wire: str, scenario: Sequence[Callable[[Scene], Any]], *, amplifiers: Sequence[str] = ("main",)
+) -> tuple[Scene, list[Violation]]:
+    """Play the steps of a scenario on a wire of this kind; returns what the witness found."""
+
+    async def steps(scene: Scene) -> None:
+        for step in scenario:
+            done = step(scene)
+            if done is not None:
+                await done
+
+    async def run() -> tuple[Scene, list[Violation]]:
+        rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
+        table = SetTable(ALONE, rig.plate, SHARED)
+        judged = {"channels": 3, "level": 0.5, "slew": 100}
+        options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
+        async with Scene.on(Wire(wire), rig, table, **options) as scene:
+            scene.witness.contacts(threads.now(), ())
+            await scene.tried(scene.open())
+            if not scene.errors:
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(_LONGEST):
+                        await scene.tried(steps(scene))
+            await scene.close()
+            return scene, scene.witness.finish(threads.now())
+
+    return run_virtual(run(), rng=random.Random(1))
+
+
+Step = Callable[[Scene], Any]
+operate, touch, rest = (partial(methodcaller, name) for name in ("operate", "touch", "rest"))
+"""Each makes a step: a method of the scene with its arguments."""
+
+SCENARIOS: Mapping[str, Sequence[Step]] = {
+    # An amplifier trips amid a touch, is asked for its faults, cleared and identified again.
+    "arc": [
+        *(operate("arm"), touch(1, rest=0.06), methodcaller("trip"), methodcaller("poll", 5)),
+        *(methodcaller("ask", "GetFaults"), touch(rest=0.1), operate("clear", rest=0.05)),
+        *(methodcaller("identify"), methodcaller("trip"), methodcaller("ask", "GetFaults")),
+    ],
+    # Touches, a neighbour, a lift, a stop amid a touch, clearing, arming, disarming.
+    "day": [
+        *(operate("arm", rest=0.12), touch(1, rest=0.12), touch(1, 2, rest=0.12)),
+        *(touch(1, rest=0.05), touch(rest=0.1), touch(1, rest=0.1), touch(rest=0.1)),
+        *(touch(3, rest=0.1), operate("stop", rest=0.1), touch(), operate("clear")),
+        *(operate("arm"), touch(4, rest=0.06), operate("disarm", rest=0.1), touch()),
+    ],
+    # Other fingers touch every 4 ms, within the ramp of a pattern; then all is opened again.
+    "hasty": [
+        operate("arm", rest=0.12),
+        *(touch(1, rest=0.004), touch(1, 2, rest=0.004)) * 5,
+        *(rest(0.1), touch(rest=0.06), methodcaller("reopen")),
+        *(operate("arm"), touch(1, rest=0.06), touch(rest=0.05)),
+    ],
+    # The control loop stalls during a touch; a client polls the status, clears and rearms.
+    "hung": [
+        *(operate("arm"), touch(1, rest=0.1), methodcaller("hang"), methodcaller("poll", 20)),
+        *(touch(), operate("clear", rest=0.05), methodcaller("run"), operate("arm")),
+        *(touch(2, rest=0.06), touch(rest=0.06)),
+    ],
+    # The last finger is lifted, then an amplifier is stopped, each before a late reply.
+    "slow": [
+        *(operate("arm", rest=0.02), methodcaller("delayed", 0.025), touch(1, rest=0.001)),
+        *(touch(rest=0.05), touch(1, rest=0.001), operate("stop"), touch(rest=0.05)),
+        *(methodcaller("delayed", 0.0), rest(0.05)),
+    ],
+    # A finger beside the plate is none; the source of touches dies with a finger down.
+    "source_dies": [
+        *(operate("arm", rest=0.05), methodcaller("touch_beside"), rest(0.1)),
+        *(touch(1, rest=0.1), methodcaller("fall_silent"), rest(0.1)),
+    ],
+    # Another program sends a silent set while disarmed, later a heartbeat of its own session.
+    "stranger": [
+        rest(0.1),
+        methodcaller("inject", hand.SET, hand.part(7, hand.layer(0), now=True)),
+        *(rest(0.01), operate("arm", rest=0.05), touch(1, rest=0.06)),
+        lambda scene: scene.inject(hand.PING, (scene.amplifier.session % 65535 + 1, 0)),
+        *(rest(0.01), touch(rest=0.05)),
+    ],
+    # The table asks for more than full level on one ERA, 620 Hz, or is damaged: NaN.
+    "too_much": [
+        operate("arm"),
+        *(
+            step
+            for tone in ((150.0, 0.7), (620.0, 0.4), (150.0, 0.4, float("nan")))
+            for step in (methodcaller("touch_for", *tone), rest(0.1), touch(rest=0.05))
+        ),
+    ],
+}
+"""By name, in the order of the names."""

@@ -23,7 +23,7 @@ from pathlib import Path
 import grimp
 import pytest
 
-from slowest_files import SLOWEST
+from long_form import SLOWEST
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("registry", "controller", "drivers", "era_haptics", "model", "sim", "benchmarks")

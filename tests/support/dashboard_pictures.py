@@ -17,11 +17,10 @@ from pathlib import Path
 import numpy as np
 
 import patient_daemon
-from chromium import Page, open_browser
 from controller.demo.demonstration import layout_of_people
-from gateway_bench import GatewayProcess, gateway_process, real_daemon
+from gateway_bench import GatewayProcess, Page, gateway_process, open_browser, real_daemon
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,10 @@ from ruamel.yaml import YAML
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
-from distorted_responses import DISTORTIONS, every
 from gateway_bench import real_daemon, wait_for
 from model.calibration.responses import read_measured, responses_of, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
+from plates import DISTORTIONS, every
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "errors.md"

@@ -39,7 +39,7 @@ from gateway_bench import (
     upgrade,
     wait_for_daemon,
 )
-from installed_program import installed_program
+from typed_page import installed_program
 
 LIMIT = 0.5  # s; for a stop
 _INTERVAL = 0.2  # s; between stops

@@ -98,8 +98,8 @@ def differences(one: Sequence[Answer], other: Sequence[Answer]) -> tuple[list[in
 
 def answers() -> list[Answer]:
     """Answers to the fixed questions: one target, none to five quiet fingers, both drive modes."""
-    from only import only
-    from paper_table import contact_sets, smooth_table
+    from plates import contact_sets, smooth_table
+    from set_table import only
 
     found = []
     for quiet in (0, 1, 2, 3, 5):

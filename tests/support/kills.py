@@ -23,8 +23,7 @@ from pathlib import Path
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from daemon_bench import until, until_state
-from daemon_process import (
+from daemons import (
     REACTION,
     STARTING,
     WATCHDOG,
@@ -35,10 +34,12 @@ from daemon_process import (
     energised,
     loudness,
     silent_from_of,
+    until,
+    until_state,
 )
 from model.rig.rig_file import load_rig
-from rig_files import TWO_AMPLIFIERS, write_rig
-from rig_on_wire import WIRES, far_side
+from plates import TWO_AMPLIFIERS, write_rig
+from real_wires import WIRES, far_side
 from sim.far_ends.wire_assignment import Wire
 
 READY = "READY_TO_SWITCH_ON"

@@ -29,7 +29,7 @@ from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 WIRES: Mapping[str, Wire] = {
     "serial": Wire("serial", 921_600, shared=True),

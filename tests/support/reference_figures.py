@@ -20,8 +20,7 @@ from model.caching import NUMERICS_VERSION
 from model.drive_modes import DRIVE_MODES
 from model.table.table_file import solve_table
 from model.vibration import natural_modes
-from paper_plate import make_paper_rig
-from small_table import small_problem
+from plates import make_paper_rig, small_problem
 
 RECORD = Path(__file__).parents[1] / "model" / "reference_figures.json"
 

@@ -2,6 +2,10 @@
 
 The control loop asks a table that has `answer` by that, once this is imported, and any other as it
 does without.
+
+Fingers and answers of tests, and of an only vibration the layer and the first sensation.
+
+What fingers shall feel without a layout: the newest one a buzz, until it lifts.
 """
 
 from collections import defaultdict
@@ -13,16 +17,31 @@ from typing import Any
 import numpy as np
 
 from controller.play import joint_answers, planner
-from model.answer.answer import NO_LIMITS, Answer, Layer, Limits
+from controller.play.intent import NO_CONTACTS, HapticIntent, Target
+from controller.sources.touch import Contact, ContactKey
+from model.answer.answer import NO_LIMITS, Answer, Layer, Limits, Sensation
 from model.answer.plan import answer, prepare_answers, query
 from model.answer.promise import scaled
-from model.answer.stimulus import Contents, Finger, Placement, Stimulus, Stream, Tones, together
-from model.arrays import FloatArray
+from model.answer.stimulus import (
+    ANY,
+    ANY_BAND,
+    BY_NAME,
+    Contents,
+    Finger,
+    Placement,
+    Stimulus,
+    Stream,
+    Tones,
+    together,
+)
+from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.fem import Mesh
+from model.finger import STRONG_DB_SL
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
 from model.structure.plate import Material, Plate
+from model.table.table import LocalizationTable
 from model.vibration import Excitation
 from registry.limits import GuardLimits
 
@@ -224,3 +243,65 @@ class SetTiming:
     def transient_contrast_db(self, layer: Layer, placed: Placement) -> float | None:
         """Of nothing."""
         return None
+
+
+def only(
+    table: LocalizationTable, placed: Placement, level_db_sl: float = 20.0, **more: Any
+) -> tuple[Layer, Sensation]:
+    """What is played for fingers, and what the first of them feels."""
+    found = query(table, placed, level_db_sl, **more)
+    return found.layers[0], found.fingers[0]
+
+
+def wants(
+    at: Point,
+    band_hz: tuple[float, float] = ANY_BAND,
+    level_db_sl: float = 20.0,
+    priority: int = 0,
+    *,
+    may_share: bool = False,
+    name: str | None = None,
+    modulation_hz: float | None = None,
+    **more: Any,
+) -> Finger:
+    """A finger that is to feel a stimulus of its own."""
+    stimulus = Stimulus(level_db_sl, band_hz, modulation_hz=modulation_hz, name=name)
+    sharing = ANY if may_share else BY_NAME
+    return Finger(at, stimulus, priority=priority, sharing=sharing, **more)
+
+
+def phased(
+    table: LocalizationTable,
+    fingers: Sequence[Finger],
+    quiet: Sequence[Finger | Point] = (),
+    **more: Any,
+) -> Answer:
+    """The answer in mode `phased`, whatever the table's own is."""
+    return answer(table, fingers, quiet=quiet, **{"drive_mode": "phased"} | more)
+
+
+def drives(found: Answer) -> list[Excitation]:
+    """What plays for each finger, empty where nothing does."""
+    numbers = [each.layer for each in found.fingers]
+    return [{} if n is None else found.layers[n].excitation for n in numbers]
+
+
+class BuzzNewestContact:
+    """Targets the newest contact; after it lifts, none until the next one."""
+
+    def __init__(self, level_db_sl: float | None = STRONG_DB_SL) -> None:
+        self._level = level_db_sl
+        self._seen: frozenset[ContactKey] = frozenset()
+        self._target: ContactKey | None = None
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """Target the newest contact if it is new, else the previous target while it is down."""
+        keys = [contact.key for contact in contacts]
+        if keys and keys[-1] not in self._seen:
+            self._target = keys[-1]
+        elif self._target not in keys:
+            self._target = None
+        self._seen = frozenset(keys)
+        if self._target is not None:
+            return HapticIntent((Target(self._target, self._level),))
+        return HapticIntent((), "the target was lifted" if keys else NO_CONTACTS)

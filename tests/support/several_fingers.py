@@ -1,29 +1,44 @@
-"""Fingers on a layout in virtual time: real bytes on a wire, a plate in time, what is felt."""
+"""Fingers on a layout in virtual time: real bytes on a wire, a plate in time, what is felt.
+
+The chain under a supervisor, in virtual time; events of the daemon are steps of its courses.
+
+TUIO as a sender makes it, by python-osc; captures of it, and a panel of a daemon.
+"""
 
 import asyncio
+import itertools
+import socket
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pytest
+from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+from pythonosc.osc_message_builder import OscMessageBuilder
 
-from chain import Chain, Position
+from chain import Chain, Position, set_chain
 from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from controller.operation.links import Supervisor
+from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
 from controller.play.intent import Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.layer_contents import Content, Selection
 from controller.play.planner import PlayReport
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
-from controller.sources.touch import Contact, ContactKey
-from drivers.errors import CommandRefused
+from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
+from controller.sources.tuio import RecordedDatagram
+from courses import Acted, Planted, Step
+from drivers.errors import CommandRefused, LinkError
 from drivers.playing import Layer
+from examples.make_touches import tuio_datagram, write_capture
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
 from model.arrays import FloatArray
@@ -32,11 +47,11 @@ from model.finger import detection_threshold
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from paper_table import smooth_rig
+from plates import smooth_rig
+from real_wires import after_each
 from registry import threads
-from rig_on_wire import after_each
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
 """Places on the paper's plate, 11 to 23 cm apart."""
@@ -354,3 +369,203 @@ class _Starts(Chain):
         self.starts.clear()
         self.applied.clear()
         return felt
+
+
+@dataclass
+class Watched(Acted):
+    """A chain under a running supervisor, and what that has reported.
+
+    failing: of states, links, refusals, alive and cycles that whose observer raises.
+    """
+
+    supervisor: Supervisor = field(init=False)
+    states: list[DaemonState] = field(default_factory=list)
+    links: list[str] = field(default_factory=list)
+    alive: list[float] = field(default_factory=list)
+    cycles: list[float] = field(default_factory=list)
+    failing: str = ""
+
+    @property
+    def state(self) -> DaemonState:
+        """The state of the daemon."""
+        return self.supervisor.operation.state
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the daemon is, or any amplifier."""
+        return self.state is DaemonState.OPERATION_ENABLED or super().is_armed
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it never was without a sign of life for more than 0.6 s."""
+        moments = [*self.alive, threads.now()]
+        return max(b - a for a, b in itertools.pairwise(moments)) <= 0.6
+
+    @property
+    def turns_often(self) -> bool:
+        """Whether the control loop has made more turns than those of a few seconds at rest."""
+        return len(self.cycles) >= 20
+
+    async def take(self, step: Step) -> None:
+        """Take a step, which may be an event in capitals."""
+        if isinstance(step, str) and step.isupper():
+            await self.does(step)
+        else:
+            await super().take(step)
+
+    async def handle(self, event: DaemonEvent) -> None:
+        """Let the supervisor handle an event."""
+        await self.supervisor.handle(event)
+
+    async def does(self, trigger: str) -> None:
+        """Let the supervisor handle an event of this kind."""
+        await self.handle(DaemonEvent(Trigger[trigger]))
+
+    async def leases(self, seconds: float) -> None:
+        """Arm for a client, for so long."""
+        await self.handle(DaemonEvent(Trigger.ARM, lease=Lease("me", seconds)))
+
+    def renews(self) -> None:
+        """Renew the lease."""
+        assert self.supervisor.operation.lease is not None
+        self.supervisor.renew(self.supervisor.operation.lease)
+
+    async def stops(self, **confirmed: bool) -> None:
+        """Stop all; it is confirmed, or not, that they are silent."""
+        stopped = await self.supervisor.stop("as told")
+        assert {name: each.is_confirmed for name, each in stopped.items()} == confirmed
+
+    def becomes(self, serial_number: str) -> None:
+        """Have another amplifier in place of the first."""
+        self.far_end.amplifier.identity["serial_number"] = serial_number
+        self.far_end.disturb()
+
+    def fails_once(self, method: str) -> None:
+        """Let a method of the controller fail once, while the amplifier is reached."""
+        work, failures = getattr(self.controller, method), [LinkError("as told")]
+
+        async def fail() -> None:
+            if failures:
+                assert self.far_end.is_open
+                raise failures.pop()
+            await work()
+
+        setattr(self.controller, method, fail)
+
+    def was_never(self, *states: str) -> None:
+        """Require that it was in none of these states."""
+        assert not {*states} & {*self.states}
+
+    def energised_in(self, seconds: float, expected: bool) -> None:
+        """Require that amplifiers are taken for energised, or not, in some seconds."""
+        now = threads.now()
+        assert self.supervisor.assume_energised(now + seconds) is expected
+
+
+@asynccontextmanager
+async def watched(
+    *amplifiers: str,
+    refuses: bool = False,
+    unplugged: bool = False,
+    breaks: str | None = None,
+    **options: Any,
+) -> AsyncIterator[Watched]:
+    """A supervisor with a running control loop, which must end when it is closed.
+
+    amplifiers: one unless more are named; refuses: whether it refuses all requests at first;
+    unplugged: whether the first is not reached then;
+    breaks: the only rules of the witness that are broken; options: as for `set_chain`.
+    """
+
+    def heard(name: str, value: object) -> None:
+        if daemon.failing == name:
+            raise Planted(name)
+        getattr(daemon, name).append(value)
+
+    supervisor = Supervisor(
+        state_changed=[lambda old, new: heard("states", new.state)],
+        link_changed=lambda event, lost, message: heard("links", event),
+        alive=lambda: heard("alive", threads.now()),
+    )
+    options = {"connected": supervisor.connected, "observe": supervisor.observe, **options}
+    async with set_chain(*amplifiers, of=Watched, **options) as daemon:
+        daemon.supervisor, supervisor.controller = supervisor, daemon.controller
+        loop = daemon.controller.cycle.observers
+        loop.cycle_completed.append(lambda: heard("cycles", threads.now()))
+        loop.refused.append(lambda reason: heard("refused", reason))
+        if refuses:
+            daemon.refuse("GetCaps")
+        if unplugged:
+            daemon.fault("unplug", of=0)
+        running = asyncio.create_task(supervisor.run())
+        await supervisor.started.wait()
+        await asyncio.sleep(0.005)
+        try:
+            yield daemon
+        finally:
+            daemon.failing = ""
+            daemon.witness.commanded("disarm")
+            await supervisor.close("end of the test")
+            await asyncio.wait_for(running, 20)
+            assert not any(each.is_open for each in daemon.far_ends)
+        daemon.judge(breaks)
+
+
+def message(*arguments: Any, address: str = "/tuio/2Dcur") -> Any:
+    """An OSC message with python-osc's own choice of types."""
+    builder = OscMessageBuilder(address)
+    for argument in arguments:
+        builder.add_arg(argument)
+    return builder.build()
+
+
+def bundle(*messages: Any) -> bytes:
+    """A bundle as a TUIO sender makes it."""
+    builder = OscBundleBuilder(IMMEDIATELY)
+    for part in messages:
+        builder.add_content(part)
+    return builder.build().dgram
+
+
+def cursor(id: int, x: float, y: float) -> Any:
+    """A set message of a cursor at rest."""
+    return message("set", id, x, y, 0.0, 0.0, 0.0)
+
+
+def frame(*touches: tuple[int, float, float], fseq: int = -1, source: str = "table@a") -> bytes:
+    """A complete bundle."""
+    return bundle(
+        message("source", source),
+        message("alive", *(id for id, _, _ in touches)),
+        *(cursor(*touch) for touch in touches),
+        message("fseq", fseq),
+    )
+
+
+def free_port() -> int:
+    """Find a free UDP port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def panel(port: int) -> str:
+    """The lines of a daemon's file for a TUIO panel."""
+    return f'touch: [{{name: panel, url: "tuio:127.0.0.1:{port}?timeout=0.15"}}]\n'
+
+
+FRAME = 1 / 50  # s
+
+
+def write_schedule(
+    path: Path, schedule: Sequence[tuple[int, float, float, float, float]], seconds: float
+) -> Path:
+    """Write a TUIO capture of fingers: id, down and up [s], place in TUIO's coordinates."""
+    datagrams = []
+    for number in range(round(seconds / FRAME)):
+        now = number * FRAME
+        touches = tuple(Touch(id, x, y) for id, down, up, x, y in schedule if down <= now < up)
+        frame = TouchFrame("test", now, touches)
+        datagrams.append(RecordedDatagram(now, tuio_datagram(frame, number + 1)))
+    write_capture(path, datagrams)
+    return path

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from installed_era import (
+from typed_page import (
     Failed,
     InstalledEra,
     try_demo,

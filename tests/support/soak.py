@@ -21,8 +21,7 @@ from pathlib import Path
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"  # before numpy loads
 
-from soak_chain import Outcome, Trace, run_plan  # noqa: E402
-from soak_plan import KINDS, PLATES, make_plan  # noqa: E402
+from soak_runs import KINDS, PLATES, Outcome, Trace, make_plan, run_plan  # noqa: E402  # noqa: E402
 
 _PROGRESS_INTERVAL = 250  # runs
 gc.freeze()  # what is loaded stays

@@ -16,9 +16,8 @@ from typing import Any, TypeAlias
 
 import controller
 import drivers
-from daemon_bench import ready_daemon, until
-from served_api import Wire, request
-from virtual_loop import VirtualLoop, run_virtual
+from daemons import Wire, ready_daemon, request, until
+from virtual_lines import VirtualLoop, run_virtual
 
 Function: TypeAlias = tuple[str, str]
 """File, and the name in it."""

@@ -12,13 +12,47 @@ reader sees, say of the next fence:
     <!-- not typed: WHY -->    is for another machine
 
 Whatever else stands on the page is for reading.
+
+An installed `era`, run from an empty folder where nothing of a checkout can be found.
+
+Each step is what a user types first; Failed says which command did what else.
+
+The `era` under test, and what of the system a machine may lack: skipped by name, not in CI.
+
+Whether a command prints the facts that a page shows; the words around them are free.
+
+Facts are numbers and what holds a digit, an underscore, a slash, a dot within, or two capitals:
+names of states, files and addresses. `...` stands for any of them within a line, and on a line of
+its own for any lines. A number may be off by one in its last printed digit, or by two parts in a
+hundred, whichever is more. Lines without facts are not compared.
+
+Follow a page to the letter: type, edit, open terminals and end them.
 """
 
+import contextlib
+import ctypes.util
+import json
+import os
 import re
-from dataclasses import dataclass
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any, NoReturn
 
+import pytest
 from markdown_it import MarkdownIt
+
+from patient_daemon import RESTING
 
 _COMMENT = re.compile(r"<!-- ([a-z ]+): (.+) -->")
 _OF_A_FENCE = {"terminal", "seen in", "status", "file", "edit", "not typed"}
@@ -132,3 +166,467 @@ def _with_output(step: Step, shown: str, *, where: str) -> Step:
             return Typed(line, commands, terminal, status, shown)
         case _:
             raise PageError(f"{where}: nothing is typed above this output")
+
+
+_TOKEN = "a-token-of-the-smoke-test"
+PATIENCE = 120.0  # s; on a machine that is busy with other things
+
+
+class Failed(AssertionError):
+    """A command of the installed distribution did not do what it is for."""
+
+
+@dataclass(frozen=True)
+class InstalledEra:
+    """The interpreter of an environment, beside which `era` lies, and where its commands run."""
+
+    python: Path
+    folder: Path
+
+    def __call__(self, *arguments: str) -> str:
+        """What `era` prints with these arguments; raises Failed where it does not end well."""
+        return self._run(str(self.python.with_name("era")), *arguments)
+
+    def module(self, *arguments: str) -> str:
+        """What `python -m` prints with these arguments."""
+        return self._run(str(self.python), "-m", *arguments)
+
+    def script(self, text: str) -> str:
+        """What a program prints."""
+        return self._run(str(self.python), "-c", text).strip()
+
+    @contextlib.contextmanager
+    def running(self, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+        """Run an `era` until the end of the block, where it is terminated."""
+        with subprocess.Popen(
+            [self.python.with_name("era"), *arguments],
+            cwd=self.folder,
+            env=self._environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        ) as process:
+            try:
+                yield process
+            finally:
+                process.terminate()
+                process.wait(PATIENCE)
+
+    def _run(self, *command: str) -> str:
+        done = subprocess.run(
+            command,
+            cwd=self.folder,
+            env=self._environment(),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
+        )
+        if done.returncode != 0:
+            raise Failed(f"{' '.join(command)}: {done.returncode}\n{done.stdout}{done.stderr}")
+        return done.stdout
+
+    def _environment(self) -> dict[str, str]:
+        """That of the caller, without what leads to another Python or to the user's own files."""
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+        places = {"XDG_CACHE_HOME": "cache", "XDG_RUNTIME_DIR": "run"}
+        return kept | {name: str(self.folder / place) for name, place in places.items()}
+
+
+def try_first(era: InstalledEra) -> None:
+    """Help, the example rig, and its plate's modes."""
+    expect("Usage: era " in era("--help"), "help")
+    era("config", "init", "rig.yaml")
+    modes = json.loads(era("plate", "modes", "rig.yaml", "-n", "6", "--json"))
+    expect(modes["frequencies_hz"] == sorted(modes["frequencies_hz"]), "modes out of order")
+
+
+def try_files(era: InstalledEra) -> None:
+    """Configuration files, a small table, a picture, a bug report; after `try_first`."""
+    for kind in ("layout", "daemon"):
+        era("config", "init", "--kind", kind, f"{kind}.yaml")
+    for kind in ("rig", "layout", "daemon"):
+        expect("good" in era("config", "check", f"{kind}.yaml"), f"the example of a {kind} is bad")
+    coarse = ("--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9")
+    era("table", "build", "rig.yaml", "-o", "small.npz", *coarse)
+    asked = ("--target", "0.06,0.05", "--quiet", "0.2,0.1")
+    answer = json.loads(era("table", "query", "small.npz", *asked, "--json"))
+    expect(
+        answer["fingers"][0]["contrast_db"] > 6.0, f"the two fingers are not told apart: {answer}"
+    )
+    era("plate", "map", "rig.yaml", "--drive", "SW=110", "--points", "12x9", "-o", "map.png")
+    expect((era.folder / "map.png").stat().st_size > 1000, "no picture")
+    era("report", "daemon.yaml", "-o", "report.zip")
+
+
+def try_wire(era: InstalledEra) -> None:
+    """A simulated amplifier on a pseudo-terminal, and what is asked of it by hand."""
+    with era.running("sim", "rig.yaml", "--serial") as sim:
+        assert sim.stdout is not None
+        name, _, url = sim.stdout.readline().strip().partition(": ")
+        expect(name == "main" and url.startswith("serial:"), f"not an amplifier: {name} {url}")
+        expect("4" in era("amp", "identify", url), "an amplifier without channels")
+        tone = ("--channel", "0", "--frequency", "110", "--level", "0.2", "--for", "0.2")
+        era("amp", "drive", url, *tone)
+        era("amp", "stop", url)
+
+
+def try_demo(era: InstalledEra) -> None:
+    """The demonstration: the recorded touches that come with it are felt as promised."""
+    told = json.loads(era("demo", "--out", "demo", "--json"))
+    pairs = [
+        (touch["promised_contrast_db"], touch["measured_contrast_db"])
+        for touch in told["touches"]
+        if touch["steady"] and touch["promised_contrast_db"] is not None
+    ]
+    expect(len(pairs) > 5, "hardly a touch with others on the plate")
+    kept = sum(promised <= felt for promised, felt in pairs)
+    expect(kept >= 0.7 * len(pairs), f"not as promised: {pairs}")
+    expect(all((era.folder / name).is_file() for name in told["files"]), "pictures are missing")
+
+
+def try_gateway(era: InstalledEra) -> None:
+    """A daemon and its page; needs the extra `gateway`."""
+    (era.folder / "panel.yaml").write_text("rig: rig.yaml\ntable: small.npz\n", encoding="utf-8")
+    (era.folder / "token").touch(mode=0o600)
+    (era.folder / "token").write_text(f"{_TOKEN}\n", encoding="utf-8")
+    listening = ("gateway", "--listen", "127.0.0.1:0", "--token-file", "token")
+    with era.running("daemon", "panel.yaml"), era.running(*listening) as gateway:
+        assert gateway.stdout is not None
+        url = gateway.stdout.readline().split()[1]
+        with urllib.request.urlopen(url, timeout=PATIENCE) as page:
+            expect(b"<html" in page.read(), "no page")
+        with urllib.request.urlopen(f"{url}app.js", timeout=PATIENCE) as program:
+            expect(b"import" in program.read(), "a page without its program")
+        expect("101 " in _websocket(url), "no WebSocket")
+
+
+def _websocket(url: str) -> str:
+    """The first line of what is answered to a WebSocket's handshake; its key is RFC 6455's."""
+    host, _, port = url.removeprefix("http://").strip("/").partition(":")
+    lines = [
+        "GET /api/v1/ws HTTP/1.1",
+        f"Host: {host}:{port}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        f"Sec-WebSocket-Protocol: era-haptics.v1, era-haptics.token.{_TOKEN}",
+    ]
+    with socket.create_connection((host, int(port)), PATIENCE) as connection:
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        with connection.makefile(encoding="latin-1") as answer:
+            return answer.readline()
+
+
+def expect(holds: bool, what: str) -> None:
+    """Raise Failed unless it holds."""
+    if not holds:
+        raise Failed(what)
+
+
+ERA = str(Path(sys.executable).with_name("era"))
+
+
+PACKAGES = {"cc": "gcc", "jackd": "jackd2", "portaudio": "libportaudio2"}
+"""What to install on Debian where the package has another name."""
+
+
+def installed_program(*names: str, package: str = "") -> str:
+    """Path of the first program that is found; without any skip the test, fail it where CI is set.
+
+    package: what to install on Debian.
+    """
+    found = next(filter(None, map(shutil.which, names)), None)
+    return found or _miss(names[0], package)
+
+
+def needs(*names: str) -> None:
+    """As `installed_program`, for programs and libraries, all of which the test needs."""
+    for name in names:
+        if not (shutil.which(name) or ctypes.util.find_library(name)):
+            _miss(name, "")
+
+
+def _miss(name: str, package: str) -> NoReturn:
+    package = package or PACKAGES.get(name, name)
+    reason = f"{name} is not installed; on Debian: apt install {package}"
+    if os.environ.get("CI"):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_FACT = re.compile(r"\d|_|/|\w\.\w|[A-Z]{2}")
+GAP = "..."
+_WORDS = re.compile(r"ERAs?|JSON|YAML|SL")
+_PUNCTUATION = ",;:()[]{}'\"`"
+_SHARE = 0.02
+
+
+def difference(shown: str, printed: str) -> str | None:
+    """Return the first shown line whose facts are not printed where they should be, else None."""
+    wanted = [_facts(line) for line in shown.splitlines()]
+    lines = [facts for line in printed.splitlines() if (facts := _facts(line))]
+    if not any(wanted):
+        enough = len(printed.splitlines()) >= len(wanted)
+        return None if enough else f"{len(wanted)} lines shown; printed: {printed!r}"
+    reached = (0, 0)
+
+    @cache
+    def fits(number: int, at: int) -> bool:
+        """Whether the shown lines from this one on are the printed ones from there on."""
+        nonlocal reached
+        reached = max(reached, (number, at))
+        if number == len(wanted):
+            return at == len(lines)
+        if not wanted[number]:
+            return fits(number + 1, at)
+        if set(wanted[number]) == {GAP}:
+            return any(fits(number + 1, later) for later in range(at, len(lines) + 1))
+        return at < len(lines) and _match(wanted[number], lines[at]) and fits(number + 1, at + 1)
+
+    if fits(0, 0):
+        return None
+    number, at = reached
+    instead = " ".join(lines[at]) if at < len(lines) else "the end"
+    if number == len(wanted):
+        return f"printed beyond what is shown: {instead}"
+    return f"line {number + 1} shown: {shown.splitlines()[number]!r}; printed there: {instead!r}"
+
+
+def _match(shown: Sequence[str], printed: Sequence[str]) -> bool:
+    """Whether the facts of a printed line are those of the shown one."""
+    if not shown:
+        return not printed
+    first, *rest = shown
+    if first == GAP:
+        return any(_match(rest, printed[at:]) for at in range(len(printed) + 1))
+    return bool(printed) and _is_same(first, printed[0]) and _match(rest, printed[1:])
+
+
+def _is_same(shown: str, printed: str) -> bool:
+    if _NUMBER.fullmatch(shown) and _NUMBER.fullmatch(printed):
+        return _is_about(shown, printed)
+    return re.fullmatch(".*".join(map(re.escape, shown.split(GAP))), printed) is not None
+
+
+def _facts(line: str) -> list[str]:
+    tokens = (token.strip(_PUNCTUATION) for token in line.split())
+    cut = [token if token.endswith(GAP) else token.removesuffix(".") for token in tokens]
+    known = [GAP if GAP in token and not _is_fact(token) else token for token in cut]
+    return [token for token in known if token == GAP or _is_fact(token)]
+
+
+def _is_fact(token: str) -> bool:
+    words = token.replace(GAP, " ")
+    return _FACT.search(words) is not None and not _WORDS.fullmatch(token)
+
+
+def _is_about(shown: str, printed: str) -> bool:
+    mantissa, _, exponent = shown.partition("e")
+    last_digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    if "." not in shown and not exponent:
+        last_digit = 0.0 if abs(int(shown)) < 10 else 1.0  # counts are counts
+    allowed = max(1.001 * last_digit, _SHARE * abs(float(shown)))
+    return abs(float(shown) - float(printed)) <= allowed
+
+
+_PROGRESS = re.compile(r"^\d+ of \d+ [a-z ]+\n", re.MULTILINE)
+"""Lines that appear where a command takes long; how many depends on the machine."""
+
+PAGE_READER_PATIENCE = 300.0  # s; for one command, on a machine that is busy with other things
+LOOK_AGAIN = 0.05  # s
+PORTS = {
+    "3333": socket.SOCK_DGRAM,
+    "4444": socket.SOCK_DGRAM,
+    "5020": socket.SOCK_STREAM,
+    "7010": socket.SOCK_STREAM,
+    "8137": socket.SOCK_STREAM,
+    "8786": socket.SOCK_STREAM,
+}
+"""Those that pages name; a reader takes others, for on this machine they may be taken."""
+_TERMINAL = re.compile(r"/dev/pts/\d+")
+
+
+def free_ports() -> dict[str, str]:
+    """Find a free port for every port that pages name."""
+    with ExitStack() as held:
+        here = {}
+        for port, kind in PORTS.items():
+            free = held.enter_context(socket.socket(socket.AF_INET, kind))
+            free.bind(("127.0.0.1", 0))
+            here[port] = str(free.getsockname()[1])
+        return here
+
+
+class Reader:
+    """Does steps in a folder; leave the block to have every terminal closed.
+
+    folder: where the files go. home: a short path for what programs keep, sockets among them.
+    programs: a folder of those that come before all others. site: where Python finds what is
+    installed. What a page names and what is another one here, ports and
+    pseudo-terminals, is replaced in all that is typed, written and shown.
+    """
+
+    def __init__(
+        self, folder: Path, *, home: Path, programs: Path | None = None, site: Path | None = None
+    ) -> None:
+        self._folder = folder
+        self._swaps = free_ports()
+        first = [str(programs)] if programs else []
+        self._environment = {
+            "HOME": str(home),
+            "LANG": "C.UTF-8",
+            "NO_COLOR": "1",
+            "COLUMNS": "100",
+            "PATH": ":".join([*first, str(Path(sys.executable).parent), os.environ["PATH"]]),
+            "PYTHONUNBUFFERED": "1",
+            # Of `make test-kernels`: what processor to compute as.
+            **{
+                name: value
+                for name, value in os.environ.items()
+                if name.startswith(("OPENBLAS_", "PYTHONPATH"))
+            },
+            "OPENBLAS_NUM_THREADS": "1",
+            "TMPDIR": str(home),
+            "XDG_CACHE_HOME": str(home / "cache"),
+            "XDG_RUNTIME_DIR": str(home),
+            **({"PYTHONPATH": str(site)} if site else {}),
+        }
+        self._held: list[int] = []
+        self._terminals: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
+
+    def __enter__(self) -> "Reader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process, _output in self._terminals.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        for line in self._held:
+            os.close(line)
+
+    def follow(self, step: Step) -> None:
+        """Do one step; raises PageError where anything else comes of it than the page says."""
+        step = self._here(step)
+        match step:
+            case Written():
+                (self._folder / step.name).write_text(step.text, encoding="utf-8")
+            case Edited():
+                self._edit(step)
+            case Interrupted():
+                self._interrupt(step)
+            case Typed(terminal=None):
+                self._type(step)
+            case Typed():
+                self._begin(step)
+            case Seen():
+                self._wait_for(step.line, step.terminal, f"...\n{step.shown}")
+
+    def _here(self, step: Step) -> Step:
+        told: dict[str, Any] = {k: self._swapped(v) for k, v in asdict(step).items()}
+        return replace(step, **told)
+
+    def _swapped(self, told: object) -> object:
+        if isinstance(told, str):
+            for theirs, ours in self._swaps.items():
+                told = re.sub(rf"(?<![\w.]){theirs}(?!\w)", ours, told)
+        return told
+
+    def _edit(self, step: Edited) -> None:
+        path = self._folder / step.name
+        text = path.read_text(encoding="utf-8")
+        if text.count(step.old) != 1:
+            raise PageError(f"line {step.line}: {text.count(step.old)} times in {step.name}")
+        path.write_text(text.replace(step.old, step.new), encoding="utf-8")
+
+    def _type(self, step: Typed) -> None:
+        printed, status = "", 0
+        for words in _commands(step.commands):
+            done = subprocess.run(
+                words,
+                cwd=self._folder,
+                env=self._environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                timeout=PAGE_READER_PATIENCE,
+                check=False,
+            )
+            printed, status = printed + _PROGRESS.sub("", done.stdout), done.returncode
+            if status:
+                break
+        if status != step.status:
+            raise PageError(f"line {step.line}: exit status {status}\n{printed}")
+        _compare(step.line, step.shown, printed)
+
+    def _begin(self, step: Typed) -> None:
+        assert step.terminal is not None
+        output = self._folder.parent / f"{step.terminal}.txt"
+        commands = _commands(step.commands)
+        with output.open("wb") as file:
+            process = subprocess.Popen(
+                commands[0] if len(commands) == 1 else ["bash", "-e", "-c", step.commands],
+                cwd=self._folder,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self._terminals[step.terminal] = process, output
+        self._wait_for(step.line, step.terminal, step.shown or "")
+
+    def _wait_for(self, line: int, terminal: str, shown: str) -> None:
+        process, output = self._terminals[terminal]
+        latest = time.monotonic() + PAGE_READER_PATIENCE
+        while True:
+            ended = process.poll() is not None or time.monotonic() > latest
+            printed = output.read_text(encoding="utf-8")
+            wanted = self._with_its_terminal(shown.rstrip("\n") + "\n...", printed)
+            if difference(wanted, printed) is None:
+                return
+            if ended:  # and whatever it has printed until then has been read since
+                _compare(line, wanted, printed)
+            time.sleep(LOOK_AGAIN)
+
+    def _with_its_terminal(self, shown: str, printed: str) -> str:
+        """What is shown, with the pseudo-terminal that a program has got, from here on known."""
+        theirs, ours = _TERMINAL.search(shown), _TERMINAL.search(printed)
+        if theirs is None or ours is None:
+            return shown
+        if theirs[0] not in self._swaps:
+            # While it is held open, the system does not reuse its name.
+            self._held.append(os.open(ours[0], os.O_RDWR | os.O_NOCTTY))
+        self._swaps[theirs[0]] = ours[0]
+        return shown.replace(theirs[0], ours[0])
+
+    def _interrupt(self, step: Interrupted) -> None:
+        process, output = self._terminals[step.terminal]
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            process.wait(PAGE_READER_PATIENCE)
+        except subprocess.TimeoutExpired:
+            raise PageError(f"line {step.line}: goes on\n{output.read_text('utf-8')}") from None
+
+
+def _commands(fence: str) -> list[list[str]]:
+    """What runs a fence: each line by itself where all are plain commands, else a shell.
+
+    A daemon waits for a busy machine, see `patient_daemon`.
+    """
+    plain = re.fullmatch(r"((era|pip|python|cp) [^|&;<>$`*?~#\\\n]+\n)+", fence)
+    if plain is None:
+        return [["bash", "-e", "-c", fence]]
+    lines = [shlex.split(line) for line in fence.splitlines()]
+    era = {"daemon": RESTING}
+    return [
+        [*era.get(words[1], (ERA,)), *words[1:]] if words[0] == "era" else words for words in lines
+    ]
+
+
+def _compare(line: int, shown: str | None, printed: str) -> None:
+    if shown is not None and (what := difference(shown, printed)) is not None:
+        raise PageError(f"line {line}: {what}\n\n{printed}")

@@ -23,15 +23,15 @@ import pytest
 
 from controller.sources import udp_source
 from controller.sources.touch import Touch, TouchFrame
-from daemon_bench import daemon_table, ready_daemon
+from courses import ROOT, Recorder, Way
+from daemons import daemon_table, ready_daemon
 from era_haptics import query
 from examples.make_touches import tuio_datagram
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
-from own_calls import ROOT, Recorder, Way
 from registry import threads
 from stop_path import stop_path
-from virtual_loop import VirtualLoop, run_virtual
+from virtual_lines import VirtualLoop, run_virtual
 
 PAGE = ROOT / "docs" / "architecture.md"
 WRITER = "tests/support/ways.py"

@@ -24,8 +24,8 @@ from controller.api.connection import (
 )
 from controller.api.schema import MAX_RATE, Message
 from controller.api.server import ContactsEvent, Hub, LogEvent
+from daemons import ServedApi, Wire, feed, request, serving
 from registry.threads import no_long_collections
-from served_api import ServedApi, Wire, feed, request, serving
 
 
 async def iterate() -> None:

@@ -32,18 +32,18 @@ from controller.api.link import (
 )
 from controller.api.registered import METHODS
 from controller.api.server import LogEvent
-from daemon_bench import (
+from daemons import (
     PLACE,
     daemon_at,
     far_end,
     next_event,
     ready_daemon,
+    request,
     running_daemon,
     until_state,
 )
 from model.errors import InputError
-from served_api import request
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 PAGE = Path(controller.__file__).parent.parent / "docs" / "reference" / "api.md"
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"

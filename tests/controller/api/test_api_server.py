@@ -12,8 +12,7 @@ from controller.api import connection
 from controller.api.jsonrpc import ErrorCode
 from controller.api.methods import StatusResult, TouchParams
 from controller.api.server import ApiServer
-from daemon_bench import PATIENCE
-from served_api import ServedApi, feed, request, serving
+from daemons import PATIENCE, ServedApi, feed, request, serving
 
 ARM = '{"owner":"me","lease_s":5}'
 

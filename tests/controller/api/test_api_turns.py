@@ -5,8 +5,8 @@ import asyncio
 import pytest
 
 from controller.api import connection
-from served_api import ServedApi, feed, request
-from virtual_loop import in_virtual_time
+from daemons import ServedApi, feed, request
+from virtual_lines import in_virtual_time
 
 REQUEST = request("renew", '{"lease":"a"}')
 TOUCH = request("touch", '{"source":"a","touches":[]}', id=1)

@@ -13,8 +13,8 @@ from controller.api.connection import Connection
 from controller.api.registered import METHODS
 from controller.api.server import TOPICS, EventParams
 from controller.gateway.field import DrawnField
-from daemon_bench import PLACE, holding, running_daemon, until_state
-from virtual_loop import in_virtual_time
+from daemons import PLACE, holding, running_daemon, until_state
+from virtual_lines import in_virtual_time
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep

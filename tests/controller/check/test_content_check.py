@@ -26,7 +26,7 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.shaping import SAMPLE_RATE, Transients
-from paper_table import smooth_rig
+from plates import smooth_rig
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 

@@ -26,7 +26,7 @@ from model.config.file_kinds import KINDS
 from model.rig.rig import Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
-from paper_table import smooth_rig
+from plates import smooth_rig
 from several_fingers import WIRES, Felt, Pressed
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")

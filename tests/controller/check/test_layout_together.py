@@ -20,7 +20,7 @@ from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks import layout_picture
 from era_haptics.lab.checks.layout_picture import Together, check_together, close_pairs, matrix_of
 from model.config.fields import Rectangle
-from only import phased, wants
+from set_table import phased, wants
 from several_fingers import playable, table
 
 SIZE = 0.03

@@ -25,7 +25,7 @@ from controller.operation.operation_states import (
     Trigger,
     step,
 )
-from daemon_bench import (
+from daemons import (
     ENABLED,
     PATIENCE,
     READY,
@@ -39,7 +39,7 @@ from daemon_bench import (
     until_state,
 )
 from drivers.errors import LinkError
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 def delay_arming(

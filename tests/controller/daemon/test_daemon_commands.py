@@ -18,7 +18,7 @@ from controller.cli.daemon_cli import show_event
 from controller.cli.main import run
 from controller.daemon.daemon import run_daemon
 from controller.process.log import LogThread
-from daemon_bench import write_daemon
+from daemons import write_daemon
 from drivers.errors import CommandError
 from gateway_bench import UNCONFIRMED, ScriptedDaemon
 from model.errors import InputError

@@ -13,7 +13,7 @@ from controller.sources.touch import Touch
 from model.commands.config_cli import config_app
 from model.config.document import ConfigError
 from model.rig.rig_file import example_rig_path, load_rig
-from rig_files import TWO_AMPLIFIERS, write_rig
+from plates import TWO_AMPLIFIERS, write_rig
 from sim.memory_line import SimulationUrl
 
 RUNNER = CliRunner()

@@ -19,9 +19,9 @@ from controller.operation.operator import (
     write_dump,
 )
 from courses import Planted
-from daemon_bench import PLACE, DaemonBench, error_code, holding, ready_daemon, until
+from daemons import PLACE, DaemonBench, error_code, holding, ready_daemon, until
 from sim.faults import FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 def dumped(folder: Path, kind: str) -> list[str]:

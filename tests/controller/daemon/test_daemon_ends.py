@@ -14,23 +14,25 @@ from controller.api.client import AsyncClient
 from controller.play.intent import NO_CONTACTS
 from controller.play.layer_contents import BEING_CHOSEN
 from controller.play.selection import GIVEN_UP
-from daemon_bench import (
+from daemons import (
     ENABLED,
     READY,
+    Journal,
     daemon_at,
+    energised,
     far_end,
     holding,
     ready_daemon,
+    silent_from,
     until,
     until_state,
 )
-from daemon_process import Journal, energised, silent_from
 from drivers.host.amplifier import WATCHDOG
+from plates import TWO_AMPLIFIERS
 from registry import threads
-from rig_files import TWO_AMPLIFIERS
 from several_fingers import answers_take
 from sim.faults import FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)
 """How far [s] the wall clock is from the real one: days, less than a lease, decades."""

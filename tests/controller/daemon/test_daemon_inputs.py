@@ -27,14 +27,13 @@ from controller.sources.touch import (
     TouchSource,
     turned,
 )
-from daemon_bench import ready_daemon, until
-from daemon_process import Journal
+from daemons import Journal, ready_daemon, until
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
+from plate_witness import tell_first
 from registry import threads
-from tuio_messages import bundle, free_port, message, panel
-from virtual_loop import in_virtual_time
-from witness_config import tell_first
+from several_fingers import bundle, free_port, message, panel
+from virtual_lines import in_virtual_time
 
 
 @in_virtual_time

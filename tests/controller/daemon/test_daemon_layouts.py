@@ -8,10 +8,10 @@ import pytest
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.cli.main import BAD_INPUT, run
-from daemon_bench import holding, next_event, ready_daemon, until
+from daemons import holding, next_event, ready_daemon, until
 from gateway_bench import real_daemon
 from registry import threads
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 LAYOUTS = "layouts: {home: home.yaml, climate: climate.yaml}\n"
 WEST, EAST = (0.08, 0.1), (0.22, 0.1)

@@ -12,7 +12,7 @@ from controller.daemon.children import gateway_options
 from controller.effects.layout import default_effects
 from controller.gateway.settings import read_token
 from controller.play.planner import SilenceReport
-from daemon_bench import (
+from daemons import (
     ENABLED,
     READY,
     daemon_at,
@@ -24,9 +24,9 @@ from daemon_bench import (
     until,
     until_state,
 )
-from rig_files import TWO_AMPLIFIERS
+from plates import TWO_AMPLIFIERS
 from sim.faults import FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 @in_virtual_time

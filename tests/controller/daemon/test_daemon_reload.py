@@ -15,10 +15,10 @@ from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.layouts import config_change
 from controller.process.child import child_command
-from daemon_bench import ENABLED, ready_daemon
+from daemons import ENABLED, ready_daemon
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FREQUENCIES = np.arange(60.0, 301.0, 20.0)  # Hz; of a table
 

@@ -16,16 +16,16 @@ from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.demo.demonstration import layout_of_people
 from controller.effects.player import MAX_NAMES
-from daemon_bench import DaemonBench, ready_daemon
+from daemons import DaemonBench, ready_daemon
 from drivers.protocol.definition import QUANTITIES
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 from registry import threads
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 PLACES = {"left": (0.03, 0.11), "right": (0.216, 0.0572)}
 FADE, WINDOW, STEP = 0.100, 0.050, 0.001  # s

@@ -25,13 +25,12 @@ from controller.api.server import TOPICS
 from controller.effects.kinds import File
 from controller.play.selection import Chooser
 from controller.sources import udp_source
-from daemon_bench import ENABLED, DaemonBench, daemon_table, holding, ready_daemon
-from memory_machine import MemoryMachine
+from daemons import ENABLED, DaemonBench, daemon_table, holding, ready_daemon
 from model.answer.answer_report import Timing
 from registry import threads
+from several_fingers import frame
 from sim.transport.far_end import FarEnd
-from tuio_messages import frame
-from virtual_loop import VirtualLoop, in_virtual_time
+from virtual_lines import MemoryMachine, VirtualLoop, in_virtual_time
 
 LONGEST, STOPPED_WITHIN = 0.005, 0.020  # s of processor time
 ROUNDS = 2  # of which the quickest counts: the first of anything may be slower

@@ -27,13 +27,13 @@ from controller.demo.recorder import (
 from controller.play.layer_contents import Prediction, not_served
 from controller.play.planner import Observers, PlayReport, SilenceReport
 from controller.sources.touch import Change, Contact, ContactKey
-from daemon_bench import ENABLED, ready_daemon, until, until_state
+from daemons import ENABLED, ready_daemon, until, until_state
 from drivers.errors import LinkError
 from model.finger import detection_threshold
 from model.rig.rig_file import example_rig_path
 from registry import threads
 from sim.faults import FaultWindow
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FIGURES = ("contrast_db", "transient_contrast_db", "level_db_sl")
 PROMISED = ("promised_contrast_db",)

@@ -30,12 +30,12 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
 from model.table.table_file import build_table
-from rig_on_wire import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
+from real_wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
 from sim.far_ends.wire_assignment import Wire
 from sim.plant.fingers import Accelerometer
 from sim.sensors import Accelerometers
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 TONES = np.arange(60.0, 480.0, 35.0)
 FINGERS = (

@@ -26,7 +26,7 @@ from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
 from controller.gateway.settings import Access, Settings
-from daemon_bench import PATIENCE, ready_daemon, until
+from daemons import PATIENCE, ready_daemon, until
 from gateway_bench import ScriptedDaemon
 from model.arrays import ComplexArray
 from model.rig.rig_file import example_rig_path, load_rig

@@ -17,7 +17,7 @@ from controller.demo.demonstration import check_page
 from controller.gateway.app import Gateway, listen, load_certificate, serve
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
 from controller.gateway.settings import Settings, read_token
-from daemon_bench import PATIENCE, until
+from daemons import PATIENCE, until
 from gateway_attacks import make_certificate
 from gateway_bench import (
     TOKEN,
@@ -32,8 +32,8 @@ from gateway_bench import (
     wait_for,
     wait_for_daemon,
 )
-from installed_program import installed_program
 from model.errors import InputError
+from typed_page import installed_program
 
 
 def openssl() -> str:

@@ -15,7 +15,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
 from controller.api.schema import API_VERSION
 from controller.gateway import connections
-from daemon_bench import PATIENCE
+from daemons import PATIENCE
 from gateway_bench import TOKEN, GatewayProcess, ScriptedDaemon, gateway_process, wait_for_daemon
 
 

@@ -38,9 +38,8 @@ from model.identification.forward import Sensor
 from model.identification.learned_plate import LearnedTable
 from model.identification.settled_patterns import SettledPattern
 from model.table.table import LocalizationTable
-from paper_plate import make_paper_rig
-from small_table import small_table
-from virtual_loop import in_virtual_time
+from plates import make_paper_rig, small_table
+from virtual_lines import in_virtual_time
 
 
 class Taking:

@@ -15,8 +15,8 @@ from drivers.host.dialogue import Stopped
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
 from registry import threads
-from virtual_loop import in_virtual_time
-from watched_supervisor import Watched, watched
+from several_fingers import Watched, watched
+from virtual_lines import in_virtual_time
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 ENABLED = DaemonState.OPERATION_ENABLED

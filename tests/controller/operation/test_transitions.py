@@ -18,9 +18,9 @@ from controller.operation.operation_states import (
 )
 from courses import Planted
 from drivers.errors import DriverError
+from several_fingers import Watched, watched
 from stop_path import stop_path
-from virtual_loop import in_virtual_time
-from watched_supervisor import Watched, watched
+from virtual_lines import in_virtual_time
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
 SILENCING = (Trigger.STOP, Trigger.DISARM, Trigger.FAULT, Trigger.LINK_LOST)

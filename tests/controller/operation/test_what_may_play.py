@@ -11,8 +11,8 @@ from courses import Step
 from drivers.errors import DriverError
 from long_form import shortly
 from registry import threads
-from virtual_loop import in_virtual_time, run_virtual
-from watched_supervisor import Watched, watched
+from several_fingers import Watched, watched
+from virtual_lines import in_virtual_time, run_virtual
 
 STEPS: Sequence[Step] = (
     *("ARM", "ARM", "DISARM", "CLEAR", "STOP", {"touch": ["finger"]}),

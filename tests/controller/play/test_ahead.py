@@ -20,7 +20,7 @@ from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
 from model.answer.plan import answer
 from model.answer.stimulus import Finger, Stimulus
 from several_fingers import LAYOUT, LEFT, RIGHT, fingers_on, playable, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 MOVER, OTHER = (0.10, 0.08), (0.22, 0.12)
 NOW = 5.0

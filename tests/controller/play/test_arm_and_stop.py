@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from chain import Chain
+from chain import FINGER, OTHER, Chain, set_chain, set_running
 from controller.play.loop import Controller
 from drivers.errors import LinkError
 from drivers.host.group import GroupState
@@ -16,12 +16,10 @@ from drivers.protocol.records import Refusal, Values
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.rig.rig import Channel
-from newest_contact import BuzzNewestContact
-from set_chain import FINGER, OTHER, set_chain, set_running
-from set_table import SetTiming
+from plates import small_problem, small_table
+from set_table import BuzzNewestContact, SetTiming
 from sim.far_ends.wire_assignment import Wire
-from small_table import small_problem, small_table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
 

@@ -22,12 +22,12 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from paper_table import contact_sets, smooth_rig
-from rig_on_wire import on_two_amplifiers
+from plates import contact_sets, smooth_rig
+from real_wires import on_two_amplifiers
 from several_fingers import LEFT, RIGHT
 from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import in_virtual_time, run_virtual
+from virtual_lines import in_virtual_time, run_virtual
 
 BUS = Wire("serial", speed=921_600, shared=True, line_kind="prompt")
 LINES = Wire("serial", speed=921_600, unpluggable=True)

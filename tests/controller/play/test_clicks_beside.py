@@ -15,7 +15,7 @@ from controller.play.planner import PlayReport
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Contact, ContactKey
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, fingers_on, playable, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, elsewhere=None)
 """Contents of 14 dB SL, and a click without a level of its own."""

@@ -34,7 +34,7 @@ from several_fingers import (
     playable,
     table,
 )
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 def answering_after(seconds: float, monkeypatch: pytest.MonkeyPatch) -> asyncio.AbstractEventLoop:

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from chain import FINGER, set_running
 from controller.play.planner import Observers
 from controller.sources.touch import Touch, TouchFrame
 from courses import Acted, courses, follow
-from set_chain import FINGER, set_running
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 COURSES = courses(Path(__file__).with_name("courses.yaml"))
 

@@ -9,7 +9,7 @@ import pytest
 from controller.play.routing import CountedClocks
 from model.ensemble.draws import EXACT_CLOCKS
 from model.rig.rig import Channel
-from paper_table import smooth_rig, smooth_table
+from plates import smooth_rig, smooth_table
 from registry import threads
 
 RIG = smooth_rig()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from chain import Chain
+from chain import FINGER, OTHER, Chain, set_running
 from controller.content.pattern import Pattern, Transient
 from controller.effects.kinds import File
 from controller.effects.layout import SurfaceLayout
@@ -16,9 +16,8 @@ from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.sources.touch import Contact
 from model.answer.stimulus import Course
 from model.vibration import Tone
-from set_chain import FINGER, OTHER, set_running
 from several_fingers import LEFT, fingers_on, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FULL = 0.2  # the level that the table's pattern has
 ROUNDING = 1.5e-4  # of a knot and of a status, in full levels

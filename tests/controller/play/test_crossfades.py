@@ -22,7 +22,7 @@ from model.answer.answer import Limits
 from model.config.fields import Rectangle
 from model.study.contrast_maps import random_contacts
 from several_fingers import LAYOUT, Fingers, chosen_for, fingers_on, playable, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FIRST, SECOND = (0.2133, 0.0366), (0.1206, 0.1132)
 

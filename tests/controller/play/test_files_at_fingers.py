@@ -19,7 +19,7 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from several_fingers import LEFT, Fingers, fingers_on, table
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))
 SHARPER = Pattern(1.5, SWELL.intensity, ((0.0, 0.7),))

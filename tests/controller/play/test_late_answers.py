@@ -16,7 +16,7 @@ from controller.play.selection import BLOCKED, GIVEN_UP
 from drivers.protocol.definition import HEARTBEAT
 from model.config.fields import Rectangle
 from several_fingers import ABOVE, LAYOUT, LEFT, RIGHT, Fingers, answers_take, fingers_on, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 def said(fingers: Fingers) -> dict[int, str | None]:

@@ -19,8 +19,8 @@ from controller.effects.effect import Effect, Region
 from controller.effects.kinds import Buzz, Click, File, Texture
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
+from exciters import Magnets, Outputs
 from long_form import shortly
-from magnets import Magnets, Outputs
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray
 from model.config.fields import Circle
@@ -29,7 +29,7 @@ from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 _logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from controller.play.routing import RAMPS_ONLY, PlaybackCapabilities
-from magnets import STEP, Magnets
+from exciters import STEP, Magnets
 from model.answer.answer import Answer, Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import answer

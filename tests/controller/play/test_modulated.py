@@ -19,9 +19,9 @@ from model.answer.answer_report import Timing
 from model.answer.stimulus import Placement
 from model.config.fields import Rectangle
 from model.vibration import Tone
-from paper_table import smooth_rig
+from plates import smooth_rig
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, playable, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 LAYOUT = SurfaceLayout(
     (

@@ -12,7 +12,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.sources.touch import Contact, ContactKey
 from model.config.fields import Rectangle
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on, table
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 UPPER = Rectangle(0.0, 0.13, 0.3, 0.09)
 LAYOUT = SurfaceLayout(

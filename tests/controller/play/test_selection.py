@@ -19,8 +19,8 @@ from model.errors import InputError
 from model.structure.plate import Material, Plate
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, Tone
+from plates import small_table
 from set_table import set_answer
-from small_table import small_table
 
 CAPABILITIES = PlaybackCapabilities(
     "phased", ("switched", "phased"), Limits((45.0, 300.0), {"SW": 1e-4}), RAMPS_ONLY

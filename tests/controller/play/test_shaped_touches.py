@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-from chain import Chain, Sent
+from chain import FINGER, OTHER, Chain, Sent, set_running
 from controller.effects.kinds import Click
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
@@ -21,9 +21,8 @@ from drivers.protocol.sets import Envelope
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement
 from model.transients.base_motion import BaseEnvelope
-from set_chain import FINGER, OTHER, set_running
 from set_table import SetTiming
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 class Shapes(SetTiming):

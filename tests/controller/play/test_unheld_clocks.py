@@ -21,12 +21,12 @@ from model.ensemble.attached_plate import AttachedPlate, PlateOnEras
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from paper_table import smooth_rig
+from plates import smooth_rig
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.readings import Crystal
 from sim.far_ends.wire_assignment import Wire
 from sim.plant.imperfections import draw_imperfections
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 CRYSTALS = {"a": Crystal(), "b": Crystal(error=40e-6)}

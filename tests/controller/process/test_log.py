@@ -15,6 +15,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from chain import set_chain
 from controller.daemon.messages import LatencyStatistics
 from controller.operation.operation_states import DaemonState, Operation
 from controller.operation.operator import (
@@ -26,11 +27,10 @@ from controller.operation.operator import (
 from controller.process.daemon_process import ServiceManager
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
-from full_disk import full_disk
 from gateway_bench import wait_for
+from long_form import full_disk
 from registry import threads
-from set_chain import set_chain
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FAULT = Operation(DaemonState.FAULT, "arc")
 

@@ -9,7 +9,7 @@ import pytest
 
 from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
-from full_disk import full_disk
+from long_form import full_disk
 from model.errors import InputError
 
 

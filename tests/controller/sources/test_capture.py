@@ -19,7 +19,7 @@ from controller.sources.tuio import (
 from drivers.errors import LinkError
 from examples.make_touches import write_capture
 from model.errors import InputError
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 @given(

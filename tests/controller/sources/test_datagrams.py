@@ -18,8 +18,8 @@ from controller.sources.tuio import TuioReader, without_superseded
 from controller.sources.udp_source import BACKLOG_THRESHOLD, Datagram, Datagrams, Peer, listen
 from examples.make_touches import tuio_datagram
 from model.structure.plate import Plate
-from paper_plate import make_paper_rig
-from tuio_messages import bundle, cursor, message
+from plates import make_paper_rig
+from several_fingers import bundle, cursor, message
 
 Place = tuple[float, float]
 INTERVAL = 1.0  # s

@@ -27,7 +27,7 @@ from controller.sources.evdev import (
 )
 from controller.sources.touch import TouchFrame, open_source
 from model.errors import InputError
-from virtual_loop import run_virtual
+from virtual_lines import run_virtual
 
 EMPTY = SlotState(-1, 0, 0)
 KINDS = {

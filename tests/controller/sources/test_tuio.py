@@ -18,8 +18,8 @@ from controller.sources.touch import RejectCounter, Touch, TouchFrame
 from controller.sources.tuio import TuioReader, TuioSource
 from examples.make_touches import tuio_datagram
 from model.errors import InputError
-from tuio_messages import bundle, cursor, frame, free_port, message
-from virtual_loop import in_virtual_time
+from several_fingers import bundle, cursor, frame, free_port, message
+from virtual_lines import in_virtual_time
 
 PEER = ("192.0.2.7", 50000)
 

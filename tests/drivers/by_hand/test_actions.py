@@ -14,8 +14,8 @@ from drivers.playing import Layer, Tone
 from drivers.protocol.definition import FEATURES
 from drivers.trace import tracing
 from drivers.urls import with_address
+from real_wires import WORD_WIRES, WordWiresFarSide
 from registry.limits import GuardLimits
-from word_wires import WORD_WIRES, FarSide
 
 pytestmark = pytest.mark.real_time
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -24,7 +24,7 @@ ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(OF_CONNECTIONS)]
 """Wires whose far end lasts: the others have one for each connection, at the first addresses."""
 
 
-async def leave_playing(far: FarSide, number: int = 1) -> None:
+async def leave_playing(far: WordWiresFarSide, number: int = 1) -> None:
     """Play at half level, as a host that then ends without a word."""
     lines = Lines()
     amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)

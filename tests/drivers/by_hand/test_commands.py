@@ -19,8 +19,8 @@ from drivers.protocol.definition import READINGS, STATUS_FLAGS
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.contract import Report
 from model.rig.rig_file import example_rig_path
+from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
-from word_wires import WORD_WIRES
 
 LIMITS = GuardLimits(40.0, 500.0, 0.5)
 DRAWN = f"sim://{example_rig_path()}"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from words_line import KINDS
+from virtual_lines import KINDS
 
 
 @pytest.fixture(params=KINDS)

@@ -17,8 +17,7 @@ from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO
 from drivers.wires.serial_line import SerialWire
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.transport.simulated_line import LINE_KINDS, LineDelays
-from virtual_loop import run_virtual
-from words_line import MemoryLine, group_of, unaltered
+from virtual_lines import MemoryLine, group_of, run_virtual, unaltered
 
 MARK = 1 << FEATURES["mark"]
 

@@ -10,8 +10,7 @@ from drivers.playing import Layer, Tone
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
 from sim.amplifier.readings import capabilities
-from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, group_of
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time
 
 SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))
 CAN = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}

@@ -22,8 +22,16 @@ from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet
 from drivers.wires.wire import Broken
-from virtual_loop import in_virtual_time
-from words_line import MemoryLine, group_of, grouped, layer, tone, unaltered, with_group
+from virtual_lines import (
+    MemoryLine,
+    group_of,
+    grouped,
+    in_virtual_time,
+    layer,
+    tone,
+    unaltered,
+    with_group,
+)
 
 LINES = {"alone": (("a",),), "each its own": (("a",), ("b",)), "shared": (("a", "b"),)}
 

@@ -15,7 +15,7 @@ from drivers.protocol.definition import MESSAGES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
 from sim.amplifier.simulated_amplifier import Amplifier as FarEnd
-from words_line import MemoryLine, grouped, layer, losing, tone
+from virtual_lines import MemoryLine, grouped, layer, losing, tone
 
 
 def altered(

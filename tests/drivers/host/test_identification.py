@@ -14,8 +14,15 @@ from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import Amplifier
-from virtual_loop import in_virtual_time, run_virtual
-from words_line import KINDS, LIMITS, MemoryLine, group_of, unaltered
+from virtual_lines import (
+    KINDS,
+    LIMITS,
+    MemoryLine,
+    group_of,
+    in_virtual_time,
+    run_virtual,
+    unaltered,
+)
 
 
 def loud(level: float) -> Layer:

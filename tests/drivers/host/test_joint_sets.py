@@ -24,8 +24,7 @@ from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
 from sim.amplifier.readings import AmplifierClock, Crystal
-from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, group_of, unaltered
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 
 LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
 # By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at

@@ -8,8 +8,16 @@ import pytest
 from drivers.errors import CommandRefused, LinkDegraded
 from drivers.host.group import Group
 from drivers.protocol.sets import Envelope
-from virtual_loop import in_virtual_time
-from words_line import MemoryLine, group_of, grouped, layer, losing, tone, unaltered
+from virtual_lines import (
+    MemoryLine,
+    group_of,
+    grouped,
+    in_virtual_time,
+    layer,
+    losing,
+    tone,
+    unaltered,
+)
 
 LATEST = 0.014  # s, each way
 PULSE = tone(level=0.0, onset=Envelope(100, ((3000, 0), (3000, 0))))  # over after 30 ms

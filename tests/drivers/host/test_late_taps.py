@@ -4,10 +4,10 @@ from collections import Counter
 
 import pytest
 
+from chain import set_running
 from courses import Acted
 from late_taps import AMPLIFIERS, WIRES, play
-from set_chain import set_running
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 _ROWS = [(wire, amplifiers, 1) for wire in WIRES for amplifiers in AMPLIFIERS]
 

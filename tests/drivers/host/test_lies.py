@@ -19,8 +19,15 @@ from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.far_ends import serial_amplifiers
-from virtual_loop import in_virtual_time, run_virtual
-from words_line import KINDS, Alter, MemoryLine, group_of, unaltered
+from virtual_lines import (
+    KINDS,
+    Alter,
+    MemoryLine,
+    group_of,
+    in_virtual_time,
+    run_virtual,
+    unaltered,
+)
 
 PACKED = len(pack_frames([CanFrame(0, b"")]))
 LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)

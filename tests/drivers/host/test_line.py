@@ -16,8 +16,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames
 from drivers.wires.serial_frames import Frame, encode_frame
 from drivers.wires.serial_line import SerialWire
-from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, grouped, unaltered
+from virtual_lines import KINDS, MemoryLine, grouped, in_virtual_time, unaltered
 
 
 @pytest.mark.parametrize("wire", KINDS)

@@ -13,8 +13,7 @@ from drivers.protocol.sets import Envelope
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
-from virtual_loop import in_virtual_time
-from words_line import KINDS, MemoryLine, group_of, grouped, layer, tone
+from virtual_lines import KINDS, MemoryLine, group_of, grouped, in_virtual_time, layer, tone
 
 REACTION = 0.0099  # s; a reply may begin 10 ms after its request (decision 0088)
 

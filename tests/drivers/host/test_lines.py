@@ -19,7 +19,7 @@ from drivers.host.group import Group
 from drivers.playing import Layer, Tone
 from drivers.protocol.definition import STATES
 from drivers.protocol.records import Values
-from words_line import KINDS, MemoryLine, group_of, losing
+from virtual_lines import KINDS, MemoryLine, group_of, losing
 
 
 def _layer(number: float, channel: float = 0, level: float = 0, frequency: float = 0) -> Layer:

@@ -13,8 +13,17 @@ from drivers.playing import Layer
 from drivers.protocol.definition import MESSAGES
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words
-from virtual_loop import run_virtual
-from words_line import KINDS, Alter, MemoryLine, group_of, grouped, layer, tone, unaltered
+from virtual_lines import (
+    KINDS,
+    Alter,
+    MemoryLine,
+    group_of,
+    grouped,
+    layer,
+    run_virtual,
+    tone,
+    unaltered,
+)
 
 LOST = 0.1  # of the frames, either way
 LINES = {

@@ -13,9 +13,9 @@ from drivers.opening import Lines
 from drivers.playing import Layer, Tone
 from drivers.ports import PORT_OPENER, Port
 from drivers.wires.can_frames import unpack_frames
+from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
-from virtual_loop import in_virtual_time
-from word_wires import WORD_WIRES
+from virtual_lines import in_virtual_time
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server", "socketcand"))]

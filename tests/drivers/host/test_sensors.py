@@ -10,8 +10,7 @@ from drivers.errors import CommandError, CommandRefused, FrameError
 from drivers.host.amplifier import Sensor, measure_tones, read_sensors, start_reading
 from drivers.protocol.definition import READING_STATES, UNKNOWN_PLACE, sensor_reading
 from drivers.protocol.records import Values
-from virtual_loop import in_virtual_time
-from words_line import MemoryLine
+from virtual_lines import MemoryLine, in_virtual_time
 
 FREQUENCIES = [110.0, 173.5]
 ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}

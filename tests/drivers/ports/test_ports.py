@@ -20,7 +20,7 @@ from drivers import ports
 from drivers.errors import LinkError, LinkTimeout
 from drivers.ports import Port, SerialPort, open_connection
 from drivers.urls import Place
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 
 @pytest.mark.parametrize(

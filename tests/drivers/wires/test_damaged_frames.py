@@ -10,9 +10,9 @@ from drivers.protocol.definition import IDENTITY, MESSAGES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers, parts
 from drivers.wires.wire import Arrival, Broken, More, Nak, Reply
-from mutation import damage
+from real_wires import damage
 from sim.amplifier.simulated_amplifier import Amplifier
-from words_line import KINDS
+from virtual_lines import KINDS
 
 DEFAULT_COUNT = 4000
 COUNT = int(os.environ.get("FRAMES", DEFAULT_COUNT))  # `make fuzz` has a million

@@ -21,9 +21,9 @@ from model.finger import detection_threshold
 from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
 from model.table.table import read_fingertips
 from model.table.table_file import build_table, save_table
-from only import drives, only, wants
-from only import phased as answer
-from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from plates import PAPER_TABLE_FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from set_table import drives, only, wants
+from set_table import phased as answer
 
 NEAR, FAR, THIRD, FOURTH = (0.09, 0.07), (0.25, 0.18), (0.05, 0.19), (0.24, 0.06)
 QUIET = (0.16, 0.20)
@@ -150,7 +150,7 @@ def test_what_plays_already_is_kept_away_from(duration):
     (layer,) = answer(table, [own], [FAR]).layers
     avoided = layer.frequency
     found = answer(table, [own], [FAR], avoided_hz=[avoided])
-    left = FREQUENCIES[np.abs(FREQUENCIES - avoided) >= 30]
+    left = PAPER_TABLE_FREQUENCIES[np.abs(PAPER_TABLE_FREQUENCIES - avoided) >= 30]
     expected = answer(build_table(smooth_rig(), frequencies=left), [own], [FAR])
     f = found.layers[0].frequency
     assert f == expected.layers[0].frequency

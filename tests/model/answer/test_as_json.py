@@ -14,8 +14,8 @@ from model.cli import app
 from model.commands.table_cli import query
 from model.errors import InputError
 from model.table.table_file import save_table
-from only import only
-from paper_table import smooth_table
+from plates import smooth_table
+from set_table import only
 
 RUNNER = CliRunner()
 

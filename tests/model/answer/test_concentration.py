@@ -11,7 +11,7 @@ from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import lattice
 from model.finger import fingertip_points, is_beyond
-from paper_table import smooth_rig, smooth_table
+from plates import smooth_rig, smooth_table
 
 TARGET = (0.15, 0.12)
 PLATE = smooth_rig().plate

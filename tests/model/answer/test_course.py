@@ -16,8 +16,7 @@ from model.finger import detection_threshold, fingertip_points, fingertip_weight
 from model.transients.base_motion import BaseEnvelope, rise, shaped
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone, base_amplitudes
-from paper_table import contact_sets, smooth_rig, smooth_table
-from small_table import small_table
+from plates import contact_sets, small_table, smooth_rig, smooth_table
 
 TARGET, QUIET, STROKE = (0.09, 0.07), (0.24, 0.17), 100e-6
 

@@ -6,9 +6,9 @@ import pytest
 from model.answer.answer_report import exposures, hand_weighting
 from model.answer.stimulus import Finger
 from model.finger import detection_threshold
-from only import phased as answer
-from only import wants
-from paper_table import smooth_table
+from plates import smooth_table
+from set_table import phased as answer
+from set_table import wants
 
 PUBLISHED = {
     6.3: 0.727, 8: 0.873, 10: 0.951, 12.5: 0.958, 16: 0.896, 20: 0.782, 25: 0.647, 31.5: 0.519,

@@ -12,8 +12,8 @@ from model.answer.stimulus import Finger, Placement, Stimulus, check_fingers, to
 from model.ensemble.draws import ClockErrors
 from model.errors import InputError
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
-from only import only
-from paper_table import FREQUENCIES, contact_sets, smooth_table
+from plates import PAPER_TABLE_FREQUENCIES, contact_sets, smooth_table
+from set_table import only
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18),)
 
@@ -161,7 +161,7 @@ def test_frequencies_are_those_of_the_band():
             smooth_table(), Placement((TARGET,), QUIET), drive_mode=mode, band_hz=(150.0, 250.0)
         )
         assert all(150 <= tone.frequency <= 250 for tone in layer.excitation.values())
-    end = float(FREQUENCIES[9])
+    end = float(PAPER_TABLE_FREQUENCIES[9])
     layer, _ = only(smooth_table(), Placement((TARGET,), QUIET), band_hz=(end, end))
     assert layer.frequency == end
 

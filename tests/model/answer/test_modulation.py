@@ -13,9 +13,9 @@ from model.finger import detection_threshold
 from model.study.verification import draw_plates, powers_on
 from model.table.table import read_fingertips
 from model.table.table_file import build_table
-from only import phased as answer
-from only import wants
-from paper_table import contact_sets, smooth_rig
+from plates import contact_sets, smooth_rig
+from set_table import phased as answer
+from set_table import wants
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from model.answer.answer import MIN_CONTRAST_DB
 from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Stimulus
 from model.rig.rig_file import load_rig
 from model.table.table_file import build_table
-from only import drives
-from only import phased as answer
+from set_table import drives
+from set_table import phased as answer
 
 PAPER_PLATE = Path(__file__).parents[3] / "examples" / "paper_plate.yaml"
 APART, AWAY, EDGE = 0.021, 0.09, 0.02

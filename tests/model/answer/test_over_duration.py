@@ -24,8 +24,7 @@ from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset, ramped_pulse
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Excitation, Tone, base_amplitudes
-from paper_table import contact_sets, smooth_rig, smooth_table
-from small_table import small_table
+from plates import contact_sets, small_table, smooth_rig, smooth_table
 
 TARGET, QUIET = (0.09, 0.07), (0.24, 0.17)
 ALONE = Placement((TARGET,))

@@ -18,8 +18,8 @@ from model.rig.rig import Uncertainty
 from model.structure.attachments import PointLoad
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from only import only
-from paper_table import contact_sets, forms_of, smooth_rig
+from plates import contact_sets, forms_of, smooth_rig
+from set_table import only
 
 RNG = np.random.default_rng(5)
 PLACES = [(float(x), float(y)) for x, y in RNG.uniform([0.02, 0.02], [0.29, 0.21], (8, 2))]

@@ -13,9 +13,9 @@ from model.rig.rig import Uncertainty
 from model.study.verification import draw_plates, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
-from only import phased as answer
-from only import wants
-from paper_table import contact_sets, smooth_rig
+from plates import contact_sets, smooth_rig
+from set_table import phased as answer
+from set_table import wants
 
 PROBE, PRESSING = "vibrotactile-probe", "pressing-fingertip"
 ONE_EACH = [wants((0.09, 0.07)), wants((0.25, 0.18))]

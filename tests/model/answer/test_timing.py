@@ -15,8 +15,8 @@ from model.table.table_file import build_table
 from model.transients.base_motion import ramped_ending, ramped_onset, shaped
 from model.transients.shaping import Shaper, Transients
 from model.transients.time_response import plate_in_time
-from only import only
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
+from set_table import only
 
 PLACED = Placement(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)))
 

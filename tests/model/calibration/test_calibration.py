@@ -6,18 +6,17 @@ from functools import partial
 import numpy as np
 import pytest
 
-import perturbed_plate
+import plates
 from benchmarks.calibration.hidden_plates import gains_of, true_values
 from model.calibration.calibrate import Calibration, calibrate
 from model.calibration.responses import Responses
 from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
 from model.rig.rig import Rig
-from paper_plate import make_paper_rig
-from perturbed_plate import NAMES, POINTS, perturbed
+from plates import NAMES, POINTS, make_paper_rig, perturbed
 
 FREQUENCIES = np.arange(40.0, 501.0, 40.0)
-measured = partial(perturbed_plate.measured, frequencies=FREQUENCIES)
+measured = partial(plates.measured, frequencies=FREQUENCIES)
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import pytest
 from model.calibration.calibrate import as_json, calibrate, change_rows, finding_rows
 from model.diagnosis.verdict import check_consistency
 from model.structure.attachments import PointLoad
-from paper_plate import make_paper_rig
-from perturbed_plate import measured, perturbed
+from plates import make_paper_rig, measured, perturbed
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)
 STIFF, SOFT = 30e3, 10.0  # N/m; the latter is 3e-4 of an ERA's

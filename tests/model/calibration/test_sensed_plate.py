@@ -9,7 +9,7 @@ from model.calibration.fit import SensedPlate, sensed_plate
 from model.rig.rig import Rig
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import PointLoad
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 FINGER = PointLoad(0.1, 0.08, stiffness=500.0, damping=2.0, mass=0.003)
 PAPER = make_paper_rig(12, 9)

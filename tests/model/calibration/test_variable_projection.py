@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from extrapolated import extrapolated_slopes
 from model.arrays import ComplexArray, FloatArray
 from model.calibration import fit
 from model.calibration.fit import sensed_plate
 from model.diagnosis import plate_match
 from model.identification import least_squares
 from model.rig.rig import Rig
-from paper_plate import make_paper_rig
+from plates import extrapolated_slopes, make_paper_rig
 
 RIG = make_paper_rig(12, 9)
 POINTS = np.random.default_rng(0).uniform(0.02, 0.2, (5, 2))

@@ -16,7 +16,7 @@ from model.commands.options import next_line, progress_bar
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig
 from model.vibration import study_convergence
-from rig_files import write_rig
+from plates import write_rig
 
 RIG = str(example_rig_path())
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -9,11 +9,10 @@ import pytest
 
 from era_haptics.lab.design.design_run import Design, Runner, judge, layout_keys, rank_layouts
 from era_haptics.lab.design.problem import DesignProblem, anywhere, area_of, layouts_of
-from exciter_rig import exciter_rig_text
 from model.config.document import parse_document
 from model.processes import on_cluster, on_processes
 from model.rig.rig_file import parse_rig
-from paper_plate import make_paper_rig
+from plates import exciter_rig_text, make_paper_rig
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from distorted_responses import DISTORTIONS
 from long_form import shortly
 from model.calibration.responses import Responses
 from model.diagnosis import causes
@@ -16,8 +15,7 @@ from model.diagnosis.verdict import Verdict, check_consistency, diagnose, judged
 from model.errors import InputError
 from model.fem import Mesh
 from model.rig.rig import Rig
-from paper_plate import make_paper_rig
-from perturbed_plate import measured, perturbed
+from plates import DISTORTIONS, make_paper_rig, measured, perturbed
 
 FREQUENCIES = np.arange(60.0, 421.0, 40.0)
 

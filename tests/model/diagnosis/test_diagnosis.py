@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import perturbed_plate
-from distorted_responses import DISTORTIONS
+import plates
 from long_form import shortly
 from model.calibration.calibrate import MAX_OUTLIERS
 from model.calibration.fit import sensed_plate, without_outliers
@@ -26,7 +25,7 @@ from model.errors import InputError
 from model.fem import Mesh
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from perturbed_plate import noise_like, random_gains
+from plates import DISTORTIONS, noise_like, random_gains
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 FREQUENCIES = np.linspace(57.0, 487.0, 10)
@@ -59,7 +58,7 @@ def measured(truth: Rig, rng: np.random.Generator) -> Responses:
         replace(era, gains=random_gains(rng, FREQUENCIES, size=0.05, phase=np.radians(5)))
         for era in truth.eras
     )
-    return perturbed_plate.measured(replace(truth, eras=eras), frequencies=FREQUENCIES, noise=0.02)
+    return plates.measured(replace(truth, eras=eras), frequencies=FREQUENCIES, noise=0.02)
 
 
 def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.mistakes import on_glue
-from exciter_rig import exciter_rig
 from model.arrays import FloatArray
 from model.calibration.responses import Responses
 from model.diagnosis.diagnosis_report import verdict_rows
@@ -15,6 +14,7 @@ from model.rig.rig import Rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.exciter import Exciter
+from plates import exciter_rig
 
 TONES = np.arange(41.0, 300.0, 20.0)
 PLACES = np.array([(0.3 * x, 0.23 * y) for x in (0.1, 0.4, 0.88) for y in (0.15, 0.5, 0.85)])

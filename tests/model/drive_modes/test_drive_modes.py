@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from drives import by_hand
 from model import drive_modes
 from model import drive_modes as switched_mode
 from model.answer.stimulus import Placement
@@ -15,7 +14,7 @@ from model.arrays import NEARLY, Complex64Array
 from model.drive_modes import Forms, playable_drive_modes
 from model.finger import fingertip_points
 from model.rig.rig import Uncertainty
-from paper_table import contact_sets, forms_of, smooth_table
+from plates import by_hand, contact_sets, forms_of, smooth_table
 
 SIGMA = 0.1
 """Relative error of each ERA's contribution."""

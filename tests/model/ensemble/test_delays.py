@@ -19,7 +19,7 @@ from model.rig.rig import Channel, Uncertainty
 from model.study.verification import draw_plates, powers_on
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
-from paper_table import contact_sets, smooth_rig
+from plates import contact_sets, smooth_rig
 
 CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0}
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)

@@ -17,7 +17,7 @@ from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.verification import draw_plates, felt_on
 from model.table.table_file import build_table
-from only import only
+from set_table import only
 
 _logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from paper_table import smooth_rig
+from plates import smooth_rig
 
 PLACES = ((0.09, 0.07), (0.25, 0.18))
 LOADS = (1.0, 2.5)

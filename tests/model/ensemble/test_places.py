@@ -14,8 +14,8 @@ from model.rig.rig import Uncertainty
 from model.rig.rig_file import load_rig
 from model.study.verification import draw_plates, felt_on
 from model.table.table_file import build_table
-from only import only
-from paper_table import smooth_rig
+from plates import smooth_rig
+from set_table import only
 
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 FREQUENCIES = np.array([60.0, 145.0, 260.0])

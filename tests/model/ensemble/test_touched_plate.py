@@ -17,8 +17,7 @@ from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Uncertainty
 from model.structure.attachments import FingertipLoad, PointLoad, footprints_of
 from model.structure.exciter import Exciter
-from paper_plate import LENGTH, WIDTH
-from paper_table import smooth_rig
+from plates import LENGTH, WIDTH, smooth_rig
 
 PLACES = np.array([[0.09, 0.07], [0.25, 0.18], [0.03, 0.19]])
 FREQUENCIES = np.array([60.0, 145.0, 260.0, 430.0])

@@ -15,7 +15,7 @@ from model.rig.rig_file import parse_mesh
 from model.structure.attachments import Era
 from model.structure.plate import Plate
 from model.vibration import natural_modes
-from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
+from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Converged Reissner-Mindlin frequencies [Hz] of the same plate: NGSolve 6.2, order 5; scikit-fem of
 # order 4 agrees to 0.0013 %.

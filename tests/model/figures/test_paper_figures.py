@@ -20,8 +20,7 @@ from model.rig.rig import FOUR_ERA_LAYOUTS, alike
 from model.spectral.modes import SpectralMesh
 from model.study.contrast_maps import WeakCells
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
-from small_table import small_table
+from plates import make_paper_rig, small_table
 
 
 @pytest.fixture(scope="module")

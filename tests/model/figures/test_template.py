@@ -11,7 +11,7 @@ import pytest
 from controller.cli.main import run
 from model.figures import Template, _pages
 from model.rig.rig_file import load_rig
-from rig_files import write_rig
+from plates import write_rig
 
 POINT = 25.4 / 72  # mm
 SVG = "{http://www.w3.org/2000/svg}"

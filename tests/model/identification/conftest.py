@@ -9,7 +9,7 @@ from model.identification.identify import Identification, identify
 from model.identification.learned_plate import PlateEstimate
 from model.identification.least_squares import Measurement
 from model.rig.rig_file import example_rig_path, load_rig
-from settled_patterns import FREQUENCIES
+from plates import SETTLED_PATTERNS_FREQUENCIES
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +23,8 @@ def found(hidden: Hidden) -> Identification:
     """The paper's rig identified on it."""
     rig = load_rig(example_rig_path())
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
-    return identify(rig, Measurement.of(sensors, FREQUENCIES, values))
+    values = hidden.measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
+    return identify(rig, Measurement.of(sensors, SETTLED_PATTERNS_FREQUENCIES, values))
 
 
 @pytest.fixture(scope="session")

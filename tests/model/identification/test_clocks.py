@@ -20,7 +20,7 @@ from model.identification.parameters import space_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from settled_patterns import FREQUENCIES
+from plates import SETTLED_PATTERNS_FREQUENCIES
 
 LATE = 30e-6
 """Delay of amplifier b [s]."""
@@ -41,10 +41,10 @@ def halves() -> tuple[Rig, list[Sensor]]:
 def found() -> Identification:
     """Identified by tones that b plays late and, with the same clock, hears as early."""
     rig, sensors = halves()
-    values = draw("form", 1).measured(FREQUENCIES, np.random.default_rng(1))
+    values = draw("form", 1).measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
     late = LATE * (OF[None, :] - OF[:, None])
-    values = values * np.exp(-2j * math.pi * FREQUENCIES[:, None, None] * late)
-    measurement = Measurement.of(sensors, FREQUENCIES, values)
+    values = values * np.exp(-2j * math.pi * SETTLED_PATTERNS_FREQUENCIES[:, None, None] * late)
+    measurement = Measurement.of(sensors, SETTLED_PATTERNS_FREQUENCIES, values)
     return identify(rig, replace(measurement, clock_errors={"a": 4e-6, "b": 4e-6}))
 
 

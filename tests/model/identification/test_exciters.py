@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from exciter_rig import exciter_rig, exciter_rig_text
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.fem import ELEMENTS, Mesh, assemble
@@ -23,6 +22,7 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import PointLoad
 from model.structure.exciter import Exciter
+from plates import exciter_rig, exciter_rig_text
 
 KEYS = "type: DAEX25FHE-4, power: 1 W"
 PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"

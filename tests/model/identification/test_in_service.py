@@ -9,7 +9,7 @@ import pytest
 from benchmarks.identification.hidden import Hidden, finger_stiffness
 from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from model.identification.learned_plate import LivePlate, PlateEstimate
-from settled_patterns import played, settled_patterns
+from plates import played, settled_patterns
 
 NE = 2  # number of that ERA
 HAND = np.array([0.25, 0.05])  # m

@@ -13,7 +13,7 @@ from model.identification.learned_plate import LearnedTable, PlateEstimate
 from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
-from settled_patterns import played, settled_patterns
+from plates import played, settled_patterns
 
 TONES = np.array([85.0, 150.0, 215.0, 330.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])

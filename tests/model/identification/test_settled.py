@@ -22,7 +22,7 @@ from model.identification.settled_patterns import (
     update,
 )
 from model.rig.rig_file import example_rig_path, load_rig
-from settled_patterns import settled_patterns
+from plates import settled_patterns
 
 
 @pytest.fixture(scope="module")

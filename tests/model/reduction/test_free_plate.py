@@ -15,7 +15,7 @@ from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Laminate, LaminateLayer, Plate
 from model.vibration import natural_modes
-from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
+from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 # Even and odd counts of elements, low and high order, with strips along the edges and without.
 MESHES = {

@@ -17,7 +17,7 @@ from model.structure.attachments import footprints_of
 from model.structure.plate import LOSS_FREQUENCY
 from model.study.verification import verify_table
 from model.table.table_file import build_table
-from paper_plate import LENGTH, WIDTH, make_paper_rig
+from plates import LENGTH, WIDTH, make_paper_rig
 
 FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))

@@ -18,7 +18,7 @@ from model.reduction.reduced_plate import (
 from model.rig.rig import Rig
 from model.structure.attachments import Era, damping_from_ratio, footprints_of
 from model.structure.plate import Plate
-from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
+from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 PLATE = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
 MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)

@@ -19,7 +19,7 @@ from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import PointLoad
 from model.structure.plate import Plate
 from model.table.table_file import TableProblem, build_table, table_following
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 FRAME = 0.053  # kg
 FREQUENCIES = np.arange(60.0, 301.0, 20.0)

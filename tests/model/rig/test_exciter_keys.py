@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import era_haptics
-from exciter_rig import exciter_rig, exciter_rig_text
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, parse_document
 from model.errors import InputError
@@ -20,6 +19,7 @@ from model.rig.rig_writing import rewritten_text
 from model.structure.exciter import Exciter
 from model.structure.materials import EXCITER_TYPES
 from model.table.table_file import build_table, table_following
+from plates import exciter_rig, exciter_rig_text
 
 OWN = (
     "coil_mass: 1.61 g, weight: 109.29 g, q: 3, force_factor: 3.63 T m, resistance: 4.3 ohm, "

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from exciter_rig import exciter_rig, exciter_rig_text
 from model.answer.stimulus import Placement
 from model.config.document import ConfigError
 from model.fem import assemble
@@ -26,8 +25,8 @@ from model.structure.attachments import footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseMotions, Term
 from model.transients.time_response import plate_in_time
-from only import only
-from paper_plate import make_paper_rig
+from plates import exciter_rig, exciter_rig_text, make_paper_rig
+from set_table import only
 
 DESK = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
 RIG_TEXT = """

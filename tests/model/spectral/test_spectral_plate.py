@@ -18,7 +18,7 @@ from model.spectral.polynomials import CLASSES
 from model.structure.attachments import Era, PointLoad
 from model.structure.plate import Material, Plate
 from model.vibration import natural_modes
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 RIG = make_paper_rig(12, 9)
 PAPER = RIG.plate

@@ -10,7 +10,7 @@ from scipy.integrate import trapezoid
 from model.reduction.free_plate import solve_free_plate
 from model.spectral.modes import SpectralMesh
 from model.spectral.polynomials import EVEN, EdgedFunctions
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 PLATE = make_paper_rig(12, 9).plate
 SIDES = (PLATE.length, PLATE.width)

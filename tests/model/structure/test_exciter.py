@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
-from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, lattice
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import Fingertip, FingertipLoad
 from model.structure.exciter import Actuator, Exciter
 from model.vibration import reference_mesh
+from plates import exciter_rig
 
 # DAEX25FHE-4 of its sheet with Qms 3, R_g 0.1 ohm, 1 W.
 BY_HAND = Exciter(

@@ -10,7 +10,7 @@ from model.structure.attachments import Era, Fingertip, PointLoad
 from model.structure.exciter import Exciter
 from model.structure.materials import material
 from model.structure.plate import AirGap, Bond, Laminate, LaminateLayer, Material, Orthotropy, Plate
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 GLASS = Material("glass", 70e9, 2500.0, 0.2)
 PLATE = Plate(0.3, 0.2, 0.002, GLASS)

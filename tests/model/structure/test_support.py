@@ -21,7 +21,7 @@ from model.structure.attachments import (
     support_problem,
 )
 from model.structure.plate import Material, Plate
-from paper_plate import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
+from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
 PLATE = Plate(0.3, 0.2, 0.002, Material("aluminium", E=70e9, rho=2700.0, nu=0.33))
 

@@ -15,7 +15,7 @@ from model.cli import app
 from model.rig.rig import Channel, Uncertainty
 from model.rig.rig_file import example_rig_path
 from model.study.overview import ClockCost, clock_cost
-from paper_table import smooth_rig
+from plates import smooth_rig
 
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 RIG = """

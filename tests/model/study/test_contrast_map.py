@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import era_haptics as era
 from model.cli import app
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 QUIET = (0.2286, 0.0381)  # m; centre of the fourth cell of the lowest row
 MODES = ("switched", "phased")

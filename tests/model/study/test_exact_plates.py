@@ -17,8 +17,8 @@ from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import Plates, draw_plates, felt_on
 from model.table.table_file import build_table
 from model.vibration import base_amplitudes
-from only import only
-from paper_table import FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from plates import PAPER_TABLE_FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from set_table import only
 
 TARGET, QUIET = (0.09, 0.07), ((0.25, 0.18), (0.03, 0.19))
 ON_FEET = replace(
@@ -34,7 +34,7 @@ ON_FEET = replace(
 @cache
 def table_on_feet():
     """The table of that rig."""
-    return build_table(ON_FEET, frequencies=FREQUENCIES)
+    return build_table(ON_FEET, frequencies=PAPER_TABLE_FREQUENCIES)
 
 
 PLACES_OFF = np.array([[1.0, 0.5], [-1.0, 0.8], [-0.6, -1.2], [0.9, -0.7]])  # inwards
@@ -239,7 +239,9 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
     The optimum climbed the percentile itself on other sets of the same plate, on another model of
     it; medians over so few sets move by a decibel.
     """
-    table = build_table(replace(smooth_rig(), uncertainty=known), frequencies=FREQUENCIES)
+    table = build_table(
+        replace(smooth_rig(), uncertainty=known), frequencies=PAPER_TABLE_FREQUENCIES
+    )
     rng = np.random.default_rng(8)
     for quiet, optimum in zip((1, 2, 3), expected, strict=True):
         found = []

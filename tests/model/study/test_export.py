@@ -17,8 +17,8 @@ from model.structure.plate import AirGap, Laminate, LaminateLayer
 from model.study import overview
 from model.study.overview import export_csv, export_mat
 from model.table.table_file import save_table
-from only import only
-from small_table import FREQUENCIES, small_table, with_strokes
+from plates import FREQUENCIES, small_table, with_strokes
+from set_table import only
 
 
 @pytest.fixture(scope="module")

@@ -29,8 +29,7 @@ from model.study.overview import (
     summarize,
 )
 from model.table.table_file import build_table
-from paper_plate import make_paper_rig
-from small_table import small_table, with_strokes
+from plates import make_paper_rig, small_table, with_strokes
 
 
 @pytest.fixture(scope="module")

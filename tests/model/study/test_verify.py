@@ -13,9 +13,8 @@ from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import AnswerCheck, verify_table
 from model.table.table_file import load_table, save_table, solve_table
 from model.vibration import tone_fields
-from only import only
-from paper_plate import make_paper_rig
-from small_table import small_problem, small_table
+from plates import make_paper_rig, small_problem, small_table
+from set_table import only
 
 
 @pytest.fixture(scope="module")

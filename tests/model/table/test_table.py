@@ -22,10 +22,9 @@ from model.study.verification import Plates, felt_on
 from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
 from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import Tone, tone_fields
-from only import only
-from paper_plate import make_paper_rig
-from paper_table import contact_sets, smooth_rig, smooth_table
+from plates import contact_sets, make_paper_rig, smooth_rig, smooth_table
 from registry.limits import GuardLimits
+from set_table import only
 
 
 def test_all_patterns_are_those_of_the_paper():

@@ -10,7 +10,7 @@ from model import caching
 from model.finger import Grid
 from model.table import table_file
 from model.table.table_file import cached_table
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 
 def quick_rig(nx, ny):

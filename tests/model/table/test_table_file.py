@@ -14,8 +14,7 @@ from model.files.array_file import digest_of
 from model.finger import Grid
 from model.table.table_file import TableProblem, load_table, save_table, solve_table
 from model.vibration import study_convergence
-from paper_plate import make_paper_rig
-from small_table import small_problem, small_table
+from plates import make_paper_rig, small_problem, small_table
 
 REMEDY = "era table build"
 

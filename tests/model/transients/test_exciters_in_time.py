@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from exciter_rig import exciter_rig
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate, supported_modes
 from model.rig.rig import Rig
@@ -18,6 +17,7 @@ from model.structure.attachments import (
 )
 from model.transients.knots import steady_states
 from model.transients.time_response import PlateInTime, enveloped_accelerations, plate_in_time
+from plates import exciter_rig
 
 POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])
 FINGER = FingertipLoad(0.11, 0.09, Fingertip())

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from exciter_rig import exciter_rig
 from model.reduction.free_plate import solve_free_plate
 from model.structure.exciter import Exciter
 from model.transients.excursions import excursions_of, relative_motions
+from plates import exciter_rig
 
 
 def test_magnets_on_a_board_as_light_as_they_are() -> None:

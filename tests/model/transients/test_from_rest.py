@@ -6,7 +6,7 @@ from scipy.signal import StateSpace, lsim
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.structure.attachments import Fingertip, fingertip_loads, footprints_of
 from model.transients.time_response import from_rest, plate_in_time
-from paper_plate import make_paper_rig
+from plates import make_paper_rig
 
 RATE, COUNT, FINER = 5000.0, 400, 64
 

@@ -35,8 +35,7 @@ from model.transients.knots import (
 from model.transients.shaping import Transients, responses_at
 from model.transients.time_response import plate_in_time
 from model.vibration import Tone
-from paper_plate import make_paper_rig
-from plate_in_time import make_plate_in_time
+from plates import make_paper_rig, make_plate_in_time
 
 
 def test_while_ending_is_the_mean_square_of_the_response():

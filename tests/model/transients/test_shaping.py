@@ -14,8 +14,8 @@ from model.transients.base_motion import Envelopes, ramped_ending, ramped_onset,
 from model.transients.knots import ONSET_KNOTS, steady_states
 from model.transients.shaping import Shaper, Transients
 from model.vibration import Excitation, Tone
-from only import only
-from plate_in_time import make_plate_in_time
+from plates import make_plate_in_time
+from set_table import only
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 VARIANCE = 0.05**2 + np.radians(5) ** 2

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from exciter_rig import exciter_rig
 from model.answer.answer import swings_of_pulse
 from model.answer.stimulus import Course
 from model.reduction.free_plate import solve_free_plate
@@ -18,6 +17,7 @@ from model.transients.excursions import (
     magnets_of,
     motions_along,
 )
+from plates import exciter_rig
 
 K, C, M, BL, R, VOLTS = 3189.2, 0.7553, 0.10929, 3.63, 4.4, 3.0008
 """Of the exciter of 25 mm at 1 W, from its sheet: 27 Hz and a quality of 5 on a held coil."""

@@ -10,7 +10,7 @@ from model.transients.base_motion import BaseEnvelope, ramped_ending, ramped_ons
 from model.transients.knots import hat_accelerations
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone
-from plate_in_time import make_plate_in_time, stepped_acceleration
+from plates import make_plate_in_time, stepped_acceleration
 
 STEP = 0.005
 

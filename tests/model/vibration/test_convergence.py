@@ -8,7 +8,7 @@ import pytest
 from model.fem import Mesh
 from model.rig.rig_file import mesh_of
 from model.vibration import default_frequencies, meshes_to_compare, study_convergence
-from paper_plate import LENGTH, WIDTH, make_paper_rig
+from plates import LENGTH, WIDTH, make_paper_rig
 
 # On four corner springs: founding paper, in-house column of Table 2, and converged (NGSolve).
 PAPER = np.array([31.98, 68.50, 76.62, 107.84, 160.77])

@@ -11,7 +11,7 @@ from long_form import shortly
 from model.errors import InputError
 from model.spectral.modes import SpectralMesh
 from model.vibration import Tone, find_nulls, peak_acceleration, plate_map, tone_fields
-from paper_plate import LENGTH, WIDTH
+from plates import LENGTH, WIDTH
 
 FULL = 100e-6
 

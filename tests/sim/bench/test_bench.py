@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_driving import arm, keep_alive, play
 from benchmarks.direct_plate import direct_acceleration
 from drivers.playing import Tone
+from firmware_machine import bench_driving_arm, keep_alive, play
 from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points
 from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad
-from plate_in_time import apart, lock_in
+from plates import apart, lock_in
 from sim.bench.bench import Bench
 from sim.control import SimulationContext, carry_out
 from sim.plant.fingers import Accelerometer
@@ -32,7 +32,7 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        arm(bench, 0.25, now=START)
+        bench_driving_arm(bench, 0.25, now=START)
         play(bench, Tone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
     for step in range(1, 401):
         prompt.advance(START + 0.1 + step * 0.005)
@@ -67,7 +67,7 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
     for is_read in (True, False):
         bench = Bench(coarse_rig, now=START)
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        arm(bench, 2.0, now=START)
+        bench_driving_arm(bench, 2.0, now=START)
         for step in range(1, 101):
             now = START + 0.003 * step
             if step in (20, 45, 70):  # at 20 abruptly
@@ -98,7 +98,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
-    arm(bench, 0.25, now=0.0)
+    bench_driving_arm(bench, 0.25, now=0.0)
     play(bench, Tone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
     bench.advance(86_400.0)
     felt = bench.felt(86_400.0 - 9.9, 86_400.0)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench_driving import SESSION, keep_alive, play
 from drivers.playing import Tone, Transition, Voice
+from firmware_machine import SESSION, keep_alive, play
 from model.rig.rig import Channel, Rig
-from plate_in_time import lock_in
+from plates import lock_in
 from sim.amplifier.readings import AmplifierClock, Crystal
 from sim.bench.bench import WRONG, Bench, StraightClocks
 from sim.plant.imperfections import Imperfections, motion_of

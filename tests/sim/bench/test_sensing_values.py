@@ -13,12 +13,12 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from model.fem import assemble
 from model.rig.rig import Rig
-from plate_in_time import apart
+from plates import apart
+from real_wires import WIRES, layer, on_two_amplifiers, rig_on_wire
 from registry import threads
-from rig_on_wire import WIRES, layer, on_two_amplifiers, rig_on_wire
 from sim.bench.bench import Bench
 from sim.plant.fingers import Accelerometer
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 SESSION = 9
 

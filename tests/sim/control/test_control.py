@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from bench_driving import play
 from drivers.errors import LinkError
 from drivers.playing import Tone
+from firmware_machine import play
 from model.rig.rig import Rig
 from model.structure.attachments import PointLoad
 from sim.bench.bench import Bench

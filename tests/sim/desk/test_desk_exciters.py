@@ -10,7 +10,6 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import as_built, draw_truth
-from desk_card import DeskCard
 from era_haptics.lab.measuring.moved_sensor import PlacesFile, measure_places
 from era_haptics.lab.measuring.sound_card import Desk, Multisine
 from model.calibration.fit import sensed_plate
@@ -20,6 +19,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad
+from sound_cards import DeskCard
 
 BOARD = """
 plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,

@@ -12,7 +12,6 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from benchmarks.direct_plate import direct_responder
-from desk_card import DeskCard
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.sound_card import Desk, Multisine
@@ -24,6 +23,7 @@ from model.identification.identify import identify
 from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.structure.attachments import fingertip_loads
+from sound_cards import DeskCard
 
 RATE = 48_000.0
 POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])

@@ -16,13 +16,13 @@ from benchmarks.desk_plate.jack_plate import JackPlate
 from era_haptics.lab.measuring.impedance import read_impedance
 from era_haptics.lab.measuring.measure_cli import app
 from era_haptics.lab.measuring.sound_card import SoundCard
-from exciter_circuit import ExciterCircuit
-from exciter_rig import exciter_rig_text
-from installed_program import ERA
+from exciters import ExciterCircuit
 from model.arrays import Float32Array, FloatArray
 from model.errors import InputError
 from model.rig.rig_file import parse_rig
-from sound_card import jack_server
+from plates import exciter_rig_text
+from sound_cards import jack_server
+from typed_page import ERA
 
 RATE = 48_000
 WEIGHT = 1e3 * (ExciterCircuit.COIL + ExciterCircuit.MAGNET)  # g

@@ -15,11 +15,11 @@ import pytest
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import SoundCard, open_card
 from gateway_bench import wait_for
-from installed_program import ERA
 from model.errors import InputError
 from sim.soft_amp.engine import Protocol, Settings
 from sim.soft_amp.output import open_output
-from sound_card import JackServer, capture_on, jack_server
+from sound_cards import JackServer, capture_on, jack_server
+from typed_page import ERA
 
 pytestmark = [
     pytest.mark.real_time,

@@ -11,7 +11,6 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
-from desk_card import DeskCard
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.loopback import check_wiring, latency
 from era_haptics.lab.measuring.measure import STEPS, Measured, check_by_steps, measure, plot
@@ -28,6 +27,7 @@ from model.processes import unseen
 from model.rig.rig import Rig
 from model.rig.rig_file import parse_rig
 from sim.soft_amp.engine import address_of
+from sound_cards import DeskCard
 
 RATE = 8_000.0
 DELAY = 73

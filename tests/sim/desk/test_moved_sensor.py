@@ -15,7 +15,6 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from controller.cli.main import run
-from desk_card import DeskCard
 from era_haptics.lab.measuring.sound_card import DeviceLost
 from model.arrays import Float32Array, FloatArray
 from model.calibration.responses import read_measured, read_sensors, responses_of
@@ -23,6 +22,7 @@ from model.errors import InputError
 from model.identification.identify import identify
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
+from sound_cards import DeskCard
 
 RATE, GRAMS = 8_000.0, 5.0
 Places = Mapping[str, tuple[float, float]]

@@ -12,11 +12,9 @@ from typer.testing import CliRunner
 from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
-from desk_card import DeskCard
 from era_haptics.lab.cli import app
 from era_haptics.lab.measuring.outputs import Heard, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk
-from exciter_rig import exciter_rig
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.responses import WiredSensor
 from model.config.document import read_document
@@ -24,6 +22,8 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
+from plates import exciter_rig
+from sound_cards import DeskCard
 
 RATE = 8000.0
 EXAMPLE = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"

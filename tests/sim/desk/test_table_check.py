@@ -14,7 +14,6 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
-from desk_card import DeskCard
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
@@ -32,6 +31,7 @@ from model.study.promise_at_sensors import CheckSettings, Promise, promises
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table, save_table
 from model.vibration import tone_fields
+from sound_cards import DeskCard
 
 RATE = 8_000.0
 LEVEL = 0.5

@@ -16,7 +16,7 @@ from drivers.errors import LinkError
 from drivers.protocol.definition import REFUSALS
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
-from rig_on_wire import make_bench
+from real_wires import make_bench
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers

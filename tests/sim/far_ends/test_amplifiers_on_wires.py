@@ -13,8 +13,7 @@ from drivers.urls import ADDRESS
 from drivers.wires.serial_frames import Frame, encode_frame
 from model.errors import InputError
 from model.rig.rig import Rig
-from registry import threads
-from rig_on_wire import (
+from real_wires import (
     SHARED_WIRES,
     WIRES,
     after_each,
@@ -23,9 +22,10 @@ from rig_on_wire import (
     on_two_amplifiers,
     rig_on_wire,
 )
+from registry import threads
 from sim.far_ends.wire_assignment import Wire, assign_wires, choose_lines, links_of
 from sim.faults import FaultKind, FaultWindow
-from virtual_loop import VirtualLoop, in_virtual_time
+from virtual_lines import VirtualLoop, in_virtual_time
 
 DEFAULTS = Wire("serial")
 URLS = {

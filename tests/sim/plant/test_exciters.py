@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from exciter_rig import exciter_rig
 from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.arrays import FloatArray
@@ -14,7 +13,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import Fingertip, FingertipLoad, footprints_of
 from model.table.table_file import build_table
 from model.transients.base_motion import raised_cosine
-from plate_in_time import lock_in
+from plates import exciter_rig, lock_in
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant, SampledPlant
 

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bench_driving import arm, keep_alive, play
-from driven_bases import FINGERTIP
-from driven_bases import motion_of as sampled
 from drivers.playing import Playback, Tone, Transition, Voice
 from drivers.protocol.sets import Command, Envelope, LayerSet
+from firmware_machine import bench_driving_arm, keep_alive, play
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.structure.attachments import Fingertip, PointLoad
-from plate_in_time import lock_in
+from plates import FINGERTIP, lock_in
+from plates import motion_of as sampled
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
 from sim.plant.imperfections import (
@@ -58,7 +57,7 @@ def played(
     bench = Bench(rig, now=0.0, imperfections=imperfections)
     bench.place_fingers({"a": AT}, now=0.0)
     for name, wanted in commands.items():
-        arm(bench, 2.0, now=0.0, name=name)
+        bench_driving_arm(bench, 2.0, now=0.0, name=name)
         play(bench, *wanted, now=0.01, name=name, ramp=0.02)
     if stop is not None:
         for name in commands:
@@ -123,7 +122,7 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
             two_amplifiers, now=0.0, imperfections=Imperfections(delays={"left": latency})
         )
         bench.place_fingers({"a": AT}, now=0.0)
-        arm(bench, 2.0, now=0.0, name="left")
+        bench_driving_arm(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
             play(bench, Tone(0, frequency, 0.5), now=now, name="left", token=token)
         bench.advance(0.4)

@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.signal import lsim
 
-from driven_bases import FINGERTIP, faded_base, resting, shaped_base
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import Placement
@@ -23,8 +22,8 @@ from model.structure.plate import Material, Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term
 from model.transients.shaping import ONSET_WINDOW
-from only import only
-from paper_plate import make_paper_rig
+from plates import FINGERTIP, faded_base, make_paper_rig, resting, shaped_base
+from set_table import only
 from sim.plant.plant import Plant, SampledPlant
 
 PLATE = Plate(0.3048, 0.2286, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33), loss_factor=0.01)

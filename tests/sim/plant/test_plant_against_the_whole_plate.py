@@ -9,7 +9,6 @@ from scipy import linalg, sparse
 from scipy.signal import butter, sosfiltfilt
 
 from benchmarks.direct_plate import direct_acceleration
-from driven_bases import BASES, STROKE, Base, resting
 from model.arrays import ComplexArray, FloatArray
 from model.fem import Mesh, PlateMatrices, assemble
 from model.reduction.reduced_plate import ReducedPlate, reduce_plate
@@ -17,8 +16,7 @@ from model.rig.rig import Rig
 from model.structure.attachments import Era, FingertipLoad, footprints_of
 from model.structure.plate import Plate
 from model.transients.base_motion import Term
-from paper_plate import make_paper_rig
-from plate_in_time import apart, lock_in
+from plates import BASES, STROKE, Base, apart, lock_in, make_paper_rig, resting
 from sim.plant.plant import Plant
 
 Motion = Callable[[float], tuple[float, float]]

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bench_driving import play
 from controller.cli.main import run
+from daemons import SESSION, far_end_process, playing
 from drivers.playing import Tone
 from drivers.protocol.definition import QUANTITIES, STATES
-from far_end_process import SESSION, far_end_process, playing
+from firmware_machine import play
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
+from plates import write_rig
 from recordings import read_recording
-from rig_files import write_rig
 from sim.bench.bench import Bench
 from sim.control import SimulationContext
 from sim.process.simulation import PlateView, draw

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench_driving import play
 from drivers.playing import Tone
-from full_disk import full_disk
+from firmware_machine import play
+from long_form import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from recordings import read_recording

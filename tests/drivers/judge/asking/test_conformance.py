@@ -31,7 +31,6 @@ from era_haptics.lab.conformance.checks import state_checks
 from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
 from era_haptics.lab.conformance.judge_client import Judge, Late, Violation, When, layer
 from era_haptics.lab.conformance.subject import Subject
-from judged_line import KINDS, JudgedLine, judged, plain, results_of, varied
 from long_form import shortly
 from model.rig.rig import Rig
 from registry import threads
@@ -39,7 +38,16 @@ from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from virtual_loop import VirtualLoop, in_virtual_time
+from virtual_lines import (
+    JUDGED_LINE_KINDS,
+    JudgedLine,
+    VirtualLoop,
+    in_virtual_time,
+    judged,
+    plain,
+    results_of,
+    varied,
+)
 
 SKIPPED = {
     "serial": {"sensors", "steps_as_stated", "limited", "readings"},
@@ -67,7 +75,7 @@ def expect_passed(results: list[CheckResult], skipped: set[str], *, within: floa
     assert sum(each.seconds for each in results) < within
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_simulated_amplifier_passes(kind: str) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind)
@@ -609,7 +617,7 @@ def altered_reply(
     monkeypatch.setattr(JudgedLine, "_send", sent)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_malformed_reply_fails_one_check_with_its_bytes(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -716,7 +724,7 @@ def garbled(kind: str, rng: random.Random, data: bytes) -> bytes:
     return rng.randbytes(rng.randrange(300))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 @pytest.mark.parametrize("share", shortly([0.003, 0.03, 0.3, 1.0], [0.3]))
 def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of a share of all replies: every check has a result, and the whole has failed."""

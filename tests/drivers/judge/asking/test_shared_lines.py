@@ -7,10 +7,10 @@ import pytest
 
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import unpack_frames
-from judged_line import KINDS, JudgedLine, judged, varied
 from long_form import shortly
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
+from virtual_lines import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 
 SKIPPED = {"sensors", "steps_as_stated", "limited", "readings"}
 FOR_ALL = {
@@ -55,7 +55,7 @@ REACHING_OTHERS = [
 
 
 @pytest.mark.parametrize("names", shortly([[], REACHING_OTHERS], [REACHING_OTHERS]))
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_conforming_amplifier_passes_on_a_shared_line(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

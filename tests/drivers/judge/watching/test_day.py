@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
+from chain import SCENARIOS, WITNESSED, play
+from group_stops import RandomGroup
 from long_form import in_turn, shortly
 from plate_witness import RULES
-from random_group import RandomGroup
 from sim.far_ends.wire_assignment import Wire
-from virtual_loop import run_virtual
-from witnessed_chain import SCENARIOS, WITNESSED, play
+from virtual_lines import run_virtual
 
 KINDS = {
     "can": Wire("slcan", 500_000),

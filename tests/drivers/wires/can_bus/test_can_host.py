@@ -12,8 +12,7 @@ from drivers.protocol.definition import MESSAGES
 from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import CanFrame, pack_frames, segments, unpack_frames
 from drivers.wires.wire import Arrival, Broken, Event, Nak, OtherHost, Reply, Several
-from virtual_loop import in_virtual_time, run_virtual
-from words_line import MemoryLine, group_of
+from virtual_lines import MemoryLine, group_of, in_virtual_time, run_virtual
 
 NODE = 5
 PING, GET_STATUS, STOP = 12, 9, 8

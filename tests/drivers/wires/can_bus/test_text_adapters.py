@@ -15,7 +15,7 @@ from drivers.wires.can_bus import SlcanAddress, TextPort
 from drivers.wires.can_frames import SLCAN, CanFrame, pack_frames, unpack_frames
 from drivers.wires.known import address_of
 from registry.limits import GuardLimits
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"

@@ -11,8 +11,7 @@ from drivers.wires.modbus_frames import HEAD
 from drivers.wires.wire import Broken, More, Nak, Reply
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
-from virtual_loop import in_virtual_time
-from words_line import MemoryLine, unaltered
+from virtual_lines import MemoryLine, in_virtual_time, unaltered
 
 
 class Peer:

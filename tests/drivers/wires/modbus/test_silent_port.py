@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from drivers.wires.modbus import ModbusWire, SilentPort
-from virtual_loop import in_virtual_time
+from virtual_lines import in_virtual_time
 
 BYTE = 11 / 19_200  # s
 SILENCE = 3.5 * BYTE  # Modbus over serial line V1.02, 2.5.1.1

@@ -17,7 +17,7 @@ from gateway_bench import wait_for
 from model.errors import InputError
 from sim.soft_amp.engine import Protocol, Settings
 from sim.soft_amp.output import open_output
-from sound_card import BLOCK, RATE, SoftAmp, capture_on, host, jack_server
+from sound_cards import BLOCK, RATE, SoftAmp, capture_on, host, jack_server
 from steady_host import WATCHDOG, linear_amplifier
 
 pytestmark = [

@@ -12,9 +12,9 @@ import pytest
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from gateway_bench import wait_for
-from installed_program import ERA
-from sound_card import BLOCK, SoftAmp, capture_on, host, jack_server
+from sound_cards import BLOCK, SoftAmp, capture_on, host, jack_server
 from steady_host import linear_amplifier
+from typed_page import ERA
 
 pytestmark = [
     pytest.mark.real_time,

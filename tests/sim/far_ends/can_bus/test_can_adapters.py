@@ -9,7 +9,7 @@ import pytest
 
 from drivers.wires.can_frames import CanFrame
 from model.rig.rig import Rig
-from rig_on_wire import make_bench
+from real_wires import make_bench
 from sim.far_ends.can_amplifiers import CanBus, SlcanAdapter, SocketcandClient
 from sim.faults import Faults
 from sim.transport.far_end import TcpEnd, TerminalEnd

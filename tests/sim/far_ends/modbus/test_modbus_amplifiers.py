@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager, closing
 
 import pytest
 
-from foreign_masters import MASTERS, drive
+from real_wires import MASTERS, drive
 from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers

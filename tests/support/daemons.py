@@ -1,0 +1,760 @@
+"""A daemon within the test's event loop, over a line to simulated amplifiers.
+
+In virtual time the line is memory, and a witness that reads every byte is the judge; in real time
+it is a pseudo-terminal.
+
+`era daemon` as a process over real wires, and clients whose fingers are felt.
+
+The far end runs in the test's own process, so that its amplifier's clock can be read: it is
+time.monotonic(), the same for all processes.
+
+The far end as users start it, a process of its own, with its control socket at hand.
+
+The API's server in memory: its methods only record their calls, its clients read nothing.
+"""
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+import virtual_lines
+from chain import Chain
+from controller.api.client import AsyncClient
+from controller.api.connection import Connection
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.link import Notification
+from controller.api.registered import METHODS
+from controller.api.schema import Empty, Message
+from controller.api.server import ApiServer
+from controller.daemon.config import load_daemon_config
+from controller.daemon.daemon import Daemon
+from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.log import LogThread
+from drivers.host.amplifier import WATCHDOG as AMPLIFIER_WATCHDOG
+from drivers.host.amplifier import Amplifier as AmplifierAmplifier
+from drivers.opening import Lines
+from drivers.playing import Layer, Tone
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import unpack_layers
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
+from model.table.table import LocalizationTable
+from model.table.table_file import save_table
+from patient_daemon import PROGRAM
+from plate_witness import LoopWitness, PlateJudge, tell_first
+from plates import small_table, write_rig
+from real_wires import WIRES, FarSide, far_side
+from registry import threads
+from registry.limits import GuardLimits
+from sim.amplifier.simulated_amplifier import Amplifier
+from typed_page import ERA
+from virtual_lines import VirtualLoop
+
+PATIENCE = 180.0  # s; generous, for a loaded machine
+PLACE = (0.1, 0.1)
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
+
+
+@dataclass
+class DaemonBench:
+    """A serving daemon, its far end, and the task that runs it."""
+
+    daemon: Daemon
+    far: FarSide
+    socket: Path
+    running: "asyncio.Task[None]"
+
+    async def client(self, name: str = "test") -> AsyncClient:
+        """Connect a client."""
+        return await AsyncClient.connect(self.socket, name=name, timeout=PATIENCE)
+
+
+@cache
+def daemon_table() -> LocalizationTable:
+    """A small table of the example's plate."""
+    return small_table()
+
+
+def write_daemon(
+    folder: Path,
+    urls: dict[str, str],
+    more: str = "",
+    *,
+    changes: Sequence[tuple[str, str]] = (),
+) -> Path:
+    """Write a rig with these URLs and a daemon's file beside it.
+
+    more: further lines of the daemon's file; changes: replacements in the rig's text.
+    """
+    write_rig(
+        folder / "rig.yaml",
+        *changes,
+        *(
+            (f'{name}: {{url: "sim://"}}', f'{name}: {{url: "{url}"}}')
+            for name, url in urls.items()
+        ),
+    )
+    path = folder / "daemon.yaml"
+    path.write_text(f"rig: rig.yaml\nsocket: era.sock\n{more}", encoding="utf-8")
+    return path
+
+
+@asynccontextmanager
+async def ready_daemon(
+    folder: Path, more: str = "", **options: Any
+) -> AsyncIterator[tuple[DaemonBench, AsyncClient]]:
+    """A daemon that is ready to be armed, and a client of it; options: as for `daemon_at`."""
+    async with running_daemon(folder, more, **options) as bench, await bench.client() as era:
+        await ready(era)
+        yield bench, era
+
+
+@asynccontextmanager
+async def running_daemon(
+    folder: Path, more: str = "", **options: Any
+) -> AsyncIterator[DaemonBench]:
+    """A serving daemon; more: further lines of its file; options: as for `daemon_at`."""
+    async with far_end(folder) as far, daemon_at(far, folder, more, **options) as bench:
+        yield bench
+
+
+@asynccontextmanager
+async def far_end(
+    folder: Path, *, changes: Sequence[tuple[str, str]] = ()
+) -> AsyncIterator[FarSide]:
+    """The example's amplifier on a serial line; changes: replacements in the rig's text."""
+    rig = load_rig(write_rig(folder / "bench.yaml", *changes))
+    async with far_side(WIRES["serial"], rig) as far:
+        yield far
+
+
+@asynccontextmanager
+async def daemon_at(
+    far: FarSide,
+    folder: Path,
+    more: str = "",
+    *,
+    changes: Sequence[tuple[str, str]] = (),
+    environment: Mapping[str, str] | None = None,
+    table: Callable[[Rig], LocalizationTable] = lambda rig: daemon_table(),
+) -> AsyncIterator[DaemonBench]:
+    """A serving daemon at an existing far end.
+
+    changes: replacements in the rig's text; environment: that its service manager gives it; table:
+    that of its rig.
+    """
+    config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
+    lock, log = SocketLock(config.socket), LogThread(folder / "log")
+    manager = ServiceManager(environment or {})
+    loop = asyncio.get_running_loop()
+    is_virtual = isinstance(loop, VirtualLoop)
+    # Daemon, amplifier and test share a process, which a busy machine delays; in real time the
+    # watchdog is the longest of the protocol, since no test of this bench lets it expire.
+    daemon = Daemon(
+        config,
+        table(config.rig),
+        log=log,
+        manager=manager,
+        dashboard=None,
+        watchdog=AMPLIFIER_WATCHDOG if is_virtual else 2.0,
+    )
+    chain = chain_of(daemon, far) if is_virtual else None
+    task = asyncio.create_task(daemon.run(lock))
+    logging.getLogger().addHandler(log)
+    try:
+        await until(lambda: config.socket.is_socket() or task.done())
+        if task.done():
+            task.result()
+        yield DaemonBench(daemon, far, config.socket, task)
+    finally:
+        daemon.shut_down("end of the test")
+        try:
+            await asyncio.wait_for(task, None if is_virtual else PATIENCE)
+        finally:
+            logging.getLogger().removeHandler(log)
+            log.close()
+            manager.close()
+            lock.release()
+    if chain is not None:
+        chain.plate_judge.close()
+        chain.judge()
+
+
+def chain_of(daemon: Daemon, far: FarSide) -> Chain:
+    """The chain of a daemon in virtual time, which hears of its fingers and faults."""
+    assert far.machine is not None
+    witness = LoopWitness(far.urls)
+    chain = Chain(far, far.machine, witness, PlateJudge(far, witness), lambda: daemon._controller)
+    touched = partial(chain.plate_judge.touched, must_be_felt=False)
+    for owner, method in ((daemon._controller.cycle, "deliver"), (daemon._inputs, "_deliver")):
+        tell_first(owner, method, touched)
+    for device in far.devices.values():
+        tell_first(device, "inject_fault", lambda *_: witness.disturb())
+    return chain
+
+
+@asynccontextmanager
+async def holding(
+    era: AsyncClient, *places: tuple[float, float], far: FarSide | None = None
+) -> AsyncIterator[None]:
+    """Hold fingers down while the connection lasts; far: wait until its amplifier plays."""
+
+    async def repeat() -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await era.touch(places or [PLACE])
+                await asyncio.sleep(0.03)
+
+    task = asyncio.create_task(repeat())
+    try:
+        if far is not None:
+            await until(lambda: any(far.summary().levels))
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def until(holds: Callable[[], object], *, patience: float = PATIENCE) -> None:
+    """Wait until a condition holds; fail after `patience` [s]."""
+    end = threads.now() + patience
+    while not holds():
+        assert threads.now() < end, "condition not met in time"
+        await asyncio.sleep(0.005)
+
+
+async def until_state(client: AsyncClient, *states: str) -> str:
+    """Wait until the daemon is in one of these states; return it."""
+    end = threads.now() + PATIENCE
+    while (state := (await client.status()).state) not in states:
+        assert threads.now() < end, f"daemon stays in {state}: {(await client.status()).cause}"
+        await asyncio.sleep(0.01)
+    return state
+
+
+async def ready(era: AsyncClient) -> None:
+    """Wait until it can be armed; acknowledge any stop, loss or fault, as of a busy machine."""
+    while await until_state(era, READY, "FAULT", "QUICK_STOP_ACTIVE") != READY:
+        with contextlib.suppress(RpcError):  # the cause may persist
+            await era.clear()
+
+
+async def next_event(client: AsyncClient, *topics: str) -> Notification:
+    """Wait for the next notification of one of these topics."""
+    async with asyncio.timeout(PATIENCE):
+        async for event in client.events():
+            if event.topic in topics:
+                return event
+    raise AssertionError("connection closed")
+
+
+async def error_code(request: Awaitable[object]) -> ErrorCode:
+    """Await a request that must be refused; return the code."""
+    with pytest.raises(RpcError) as caught:
+        await request
+    return caught.value.code
+
+
+FEEDING = ("Ping", "Set", "Commit", "Silence", "Arm", "Disarm", "Stop")
+"""What a host that is alive sends while something may play."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request that an amplifier got at a time [s], and its levels thereafter.
+
+    is_refused: whether it refused the request.
+    """
+
+    time: float
+    amplifier: str
+    name: str
+    values: Values
+    is_refused: bool
+    levels: tuple[float, ...]
+
+    @property
+    def raises(self) -> bool:
+        """Whether it is a set, of one part, that asks for more than silence."""
+        if self.name != "Set" or self.values["parts"] > 1:
+            return self.name == "Set"
+        layers = unpack_layers(self.values["stream"])
+        return any(command.is_driven for one in layers for command in one.commands)
+
+
+class Journal:
+    """Listens at a far end from now on."""
+
+    def __init__(self, far: FarSide) -> None:
+        self.entries: list[Asked] = []
+        self._far = far
+        exchange = far.bench.exchange
+
+        def noted(amplifier: str, name: str, values: Values, *, now: float) -> Any:
+            is_refused = False
+            try:
+                return exchange(amplifier, name, values, now=now)
+            except Refusal:
+                is_refused = True
+                raise
+            finally:
+                at = far.bench.time
+                levels = far.bench.amplifiers[amplifier].summary(at).levels
+                self.entries.append(Asked(at, amplifier, name, values, is_refused, levels))
+
+        far.bench.exchange = noted  # type: ignore[method-assign]
+
+    async def hear(self, requests: int) -> None:
+        """Wait until so many more requests have come; a heartbeat comes every 50 ms."""
+        enough = len(self.entries) + requests
+        await until(lambda: len(self.entries) >= enough)
+
+    def since(self, time: float) -> list[Asked]:
+        """What was asked after a time [s]."""
+        return [entry for entry in self.entries if entry.time > time]
+
+    def raising_since(self, time: float) -> list[Asked]:
+        """The sets after a time [s] that ask for more than silence."""
+        return [entry for entry in self.since(time) if entry.raises]
+
+    def last_fed(self, amplifier: str) -> float:
+        """When [s] one of them has taken something that feeds its watchdog, for the last time."""
+        return max(
+            entry.time
+            for entry in self.entries
+            if entry.amplifier == amplifier and entry.name in FEEDING and not entry.is_refused
+        )
+
+    def widest_gap(self, since: float, until: float) -> float:
+        """The longest time [s] between two signs of life in a window."""
+        times = [e.time for e in self.since(since) if e.name in FEEDING]
+        moments = [since, *(time for time in times if time <= until), until]
+        return max(later - earlier for earlier, later in pairwise(moments))
+
+
+def energised(far: FarSide) -> list[str]:
+    """The amplifiers that are enabled now, or on their way out of it, or still audible."""
+    summaries = {name: far.summary(name) for name in far.devices}
+    alive = ("OPERATION_ENABLED", "SWITCHED_ON", "FAULT_REACTION_ACTIVE")
+    return [name for name, one in summaries.items() if one.state in alive or any(one.levels)]
+
+
+def silent_from(far: FarSide) -> float:
+    """When [s] every channel of every amplifier is silent, or was; -inf where none ever played."""
+    return max(silent_from_of(far, name) for name in far.devices)
+
+
+def silent_from_of(far: FarSide, name: str) -> float:
+    """The same of one amplifier; what has faded is no longer among its tones."""
+    far.summary()
+    one = cast(Amplifier, far.bench.amplifiers[name])
+    ends = [tone.silent_from for output in one.outputs for tone in output]
+    return max([one._silent_from, *ends])
+
+
+def loudness(far: FarSide) -> float:
+    """The highest level of any channel now."""
+    return max(max(far.summary(name).levels) for name in far.devices)
+
+
+STARTING = 180.0  # s; for a loaded machine
+WATCHDOG, REACTION = 0.25, 0.005  # s; the longest time of an amplifier to be silent
+
+
+class NotServing(AssertionError):
+    """A daemon exited before it served: a bug, or no reply in time on a loaded machine."""
+
+
+@dataclass
+class DaemonProcess:
+    """A serving or starting daemon."""
+
+    process: asyncio.subprocess.Process
+    socket: Path
+    far: FarSide
+    log: list[dict[str, object]] = field(default_factory=list)
+
+    async def client(self) -> AsyncClient:
+        """Connect a client."""
+        return await AsyncClient.connect(self.socket, name="test", timeout=PATIENCE)
+
+    async def status(self) -> int:
+        """Wait for its exit status."""
+        return await asyncio.wait_for(self.process.wait(), PATIENCE)
+
+    def has_logged(self, text: str) -> bool:
+        """Whether a text is in its log."""
+        return any(text in json.dumps(line) for line in self.log)
+
+    async def serves(self) -> None:
+        """Wait until it serves; raises NotServing if it exits instead."""
+        await until(
+            lambda: self.has_logged("serving at") or self.process.returncode is not None,
+            patience=STARTING,
+        )
+        if self.process.returncode is not None:
+            raise NotServing(str(self.log))
+
+
+@asynccontextmanager
+async def daemon_process(
+    folder: Path,
+    far: FarSide,
+    more: str = "",
+    *,
+    program: Sequence[str | Path] = (ERA,),
+    options: Sequence[str] = (),
+    environment: dict[str, str] | None = None,
+    changes: Sequence[tuple[str, str]] = (),
+    waits: bool = True,
+) -> AsyncIterator[DaemonProcess]:
+    """Run `era daemon` of a file with these further lines, at most until the context ends.
+
+    program: the command before `daemon`; changes: replacements in the rig's text; waits: until it
+    serves.
+    """
+    save_table(daemon_table(), folder / "table.npz")
+    config = write_daemon(folder, dict(far.urls), f"table: table.npz\n{more}", changes=changes)
+    process = await asyncio.create_subprocess_exec(
+        *(*program, "daemon", str(config), *options),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, **(environment or {})},
+    )
+    assert process.stderr is not None
+    made = DaemonProcess(process, folder / "era.sock", far)
+    reading = asyncio.create_task(_read_log(process.stderr, made.log))
+    try:
+        if waits:
+            await made.serves()
+        yield made
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+        await reading
+
+
+async def _read_log(stream: asyncio.StreamReader, log: list[dict[str, object]]) -> None:
+    while line := await stream.readline():
+        try:
+            log.append(json.loads(line))
+        except ValueError:
+            log.append({"no json": line.decode()})
+
+
+async def run_era(*arguments: object) -> tuple[int, str, str]:
+    """Run another `era` command; return exit status, stdout and stderr."""
+    process = await asyncio.create_subprocess_exec(
+        *(ERA, *map(str, arguments)),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    out, err = await asyncio.wait_for(process.communicate(), 3 * PATIENCE)
+    assert process.returncode is not None
+    return process.returncode, out.decode(), err.decode()
+
+
+async def disarmed(era: AsyncClient) -> None:
+    """Disarm and wait until ready; a loss of the link disarms as well."""
+    with contextlib.suppress(RpcError):
+        await era.disarm()
+    await ready(era)
+
+
+async def armed(era: AsyncClient) -> None:
+    """Arm; again after a loss of the link, as may happen on a loaded machine."""
+    end = time.monotonic() + STARTING
+    while (await era.status()).state != ENABLED:
+        assert time.monotonic() < end, "cannot be armed"
+        await ready(era)
+        with contextlib.suppress(RpcError):
+            await era.arm("test", lease_s=60)
+
+
+async def play(era: AsyncClient, far: FarSide) -> None:
+    """Arm and wait until the amplifier plays for a resting finger; again after a loss."""
+    end = time.monotonic() + STARTING
+    while time.monotonic() < end:
+        await armed(era)
+        with contextlib.suppress(AssertionError):
+            await until(lambda: loudness(far) > 0, patience=2.0)
+            return
+    raise AssertionError("nothing is played")
+
+
+@asynccontextmanager
+async def playing_daemon(
+    folder: Path, more: str = "", *, waits: bool = True
+) -> AsyncIterator[tuple[DaemonProcess, AsyncClient, Journal]]:
+    """A daemon that waits for a busy machine, as of `daemon_process`, and plays for a finger.
+
+    With the client that holds it down, and what the amplifier is asked.
+    """
+    async with (
+        far_end(folder) as far,
+        daemon_process(folder, far, more, program=PROGRAM, waits=waits) as daemon,
+    ):
+        journal = Journal(far)
+        await until(daemon.socket.is_socket)
+        async with await daemon.client() as era, holding(era):
+            await play(era, far)
+            yield daemon, era, journal
+
+
+async def plays_on(
+    what: str, daemon: DaemonProcess, era: AsyncClient, journal: Journal, *, seconds: float = 0.6
+) -> None:
+    """Assert that it stays enabled for a period, and tell the widest gap between signs of life.
+
+    By a daemon that waits for a busy machine, see `patient_daemon`. what: the disturbance, for the
+    printed figure.
+    """
+    await play(era, daemon.far)
+    begin = time.monotonic()
+    while time.monotonic() < begin + seconds:
+        assert (await era.status()).state == ENABLED
+        await asyncio.sleep(0.05)
+    tell(f"between signs of life, {what}", journal.widest_gap(begin, time.monotonic()))
+
+
+def tell(what: str, seconds: float) -> None:
+    """Print a measured time; it is not asserted, for other programs on the machine lengthen it."""
+    sys.stdout.write(f"\nmeasured: {what}: {1e3 * seconds:.1f} ms\n")
+
+
+FAR_END_PROCESS_PATIENCE = 180  # s; for a loaded machine, not an expectation
+
+
+@dataclass
+class FarEndProcess:
+    """What was started: the URL by the amplifier's name, and its streams."""
+
+    urls: Mapping[str, str]
+    control: Path
+    process: asyncio.subprocess.Process
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    async def ask(self, op: str, **request: Any) -> dict[str, Any]:
+        """One line of control and the answer to it, errors among them."""
+        self.writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
+        line = await asyncio.wait_for(self.reader.readline(), FAR_END_PROCESS_PATIENCE)
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    async def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int | None, str]:
+        """Tell it to end; its exit status and what it still said on standard output."""
+        self.process.send_signal(number)
+        out, _ = await asyncio.wait_for(self.process.communicate(), FAR_END_PROCESS_PATIENCE)
+        return self.process.returncode, out.decode()
+
+
+@asynccontextmanager
+async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProcess]:
+    """`era sim` of a rig file with these options; it ends with the context at the latest."""
+    with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
+        control = Path(folder) / "control"
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", "sim", str(rig), "--control", str(control), *options),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            cwd=example_rig_path().parent.parent,
+        )
+        try:
+            assert process.stdout is not None
+            line = (
+                await asyncio.wait_for(process.stdout.readline(), FAR_END_PROCESS_PATIENCE)
+            ).decode()
+            name, _, url = line.strip().partition(": ")
+            reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
+            try:
+                yield FarEndProcess({name: url}, control, process, reader, writer)
+            finally:
+                writer.close()
+                with contextlib.suppress(ConnectionError):
+                    await writer.wait_closed()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+
+
+SESSION = 9
+
+
+@asynccontextmanager
+async def playing(url: str, tone: Tone, *, watchdog: float) -> AsyncIterator[AmplifierAmplifier]:
+    """Open, arm and play without a ramp; watchdog [s]: of which it falls silent after this."""
+    lines = Lines()
+    try:
+        amplifier = await lines.amplifier(url, GuardLimits(40, 500, 1), name=url)
+        await amplifier.open()
+        await amplifier.arm(SESSION, watchdog)
+        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.0)], now=True)
+        yield amplifier
+    finally:
+        await lines.close()
+
+
+class Wire(asyncio.Transport):
+    """Transport of a client that reads nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waiting = b""
+        self.is_aborted = False
+        self.is_read = True
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Take the lines that were written, as JSON."""
+        lines, self.waiting = self.waiting.splitlines(), b""
+        return [json.loads(line) for line in lines]
+
+    def is_closing(self) -> bool:
+        """Whether it was closed."""
+        return self.is_aborted
+
+    def resume_reading(self) -> None:
+        """Note it."""
+        self.is_read = True
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Keep the data as unread."""
+        self.waiting += bytes(data)
+
+    def get_write_buffer_size(self) -> int:
+        """Size of the unread data."""
+        return len(self.waiting)
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """Do nothing."""
+
+    def pause_reading(self) -> None:
+        """Note it."""
+        self.is_read = False
+
+    def abort(self) -> None:
+        """Close."""
+        self.is_aborted = True
+
+    close = abort
+
+
+def request(method: str, params: str = "{}", *, id: str | int | None = None) -> bytes:
+    """A line with a request, without an id unless one is given."""
+    head = "" if id is None else f'"id":{id},'
+    return f'{{"jsonrpc":"2.0",{head}"method":"{method}","params":{params}}}\n'.encode()
+
+
+def feed(client: Connection, data: bytes) -> None:
+    """Let a client send bytes, whose reading takes no processor time."""
+    virtual_lines.feed(client, data)
+    client.reading_time = 0.0
+
+
+class ServedApi:
+    """A server whose methods take a processor time [s] each, as does a reading of it; clock [s].
+
+    calls: name, parameters and time of each; is_busy: whether a touch is on its way to the wire;
+    may_arm: what arming waits for; called: called with each name, and its exceptions are those of
+    the method; stops: how often the server itself has stopped all.
+    """
+
+    def __init__(
+        self,
+        *,
+        clock: Callable[[], float] = lambda: 0.0,
+        costs: float = 0.0,
+        reading_costs: float = 0.0,
+    ) -> None:
+        self.calls: list[tuple[str, Message, float]] = []
+        self.is_busy = False
+        self.may_arm = asyncio.Event()
+        self.stops = 0
+        self.called: Callable[[str], object] = lambda name: None
+        self._processor_time = 0.0
+        self.clock = clock
+        self._costs, self._reading_costs = costs, reading_costs
+        self._clients: list[Connection] = []
+        self._server = ApiServer(
+            {name: partial(self._handle, name) for name in METHODS},
+            on_disconnect=lambda client: None,
+            holds_lease=lambda client: False,
+            is_busy=lambda: self.is_busy,
+            stop_all=self._stop_all,
+            clock=clock,
+            processor_time=self._read_processor_time,
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the methods called."""
+        return [name for name, _, _ in self.calls]
+
+    def times(self, method: str) -> list[float]:
+        """When a method was called [s]."""
+        return [time for name, _, time in self.calls if name == method]
+
+    def client(self, *, process: int = 1) -> tuple[Connection, Wire]:
+        """A client of a process."""
+        client, wire = self._server._make_connection(process), Wire()
+        client.connection_made(wire)
+        self._clients.append(client)
+        return client, wire
+
+    async def takes(self, client: Connection, data: bytes) -> None:
+        """Let a client send bytes, and serve what is to be served at once."""
+        feed(client, data)
+        await self.settle()
+
+    async def settle(self) -> None:
+        """Run the event loop until nothing is left to be served at once, and a little longer."""
+        left = 8
+        while left:
+            await asyncio.sleep(0)
+            left = 8 if any(client.has_lines for client in self._clients) else left - 1
+
+    def _read_processor_time(self) -> float:
+        self._processor_time += self._reading_costs
+        return self._processor_time
+
+    def _stop_all(self) -> None:
+        self.stops += 1
+
+    def _handle(
+        self, name: str, client: Connection, params: Message
+    ) -> Message | Awaitable[Message]:
+        self._processor_time += self._costs
+        self.calls.append((name, params, self.clock()))
+        self.called(name)
+        if name == "play":
+            raise KeyError("a bug, with /a/path in it")
+        return self._arm() if name == "arm" else METHODS[name].result.model_construct(state="FAULT")
+
+    async def _arm(self) -> Message:
+        await self.may_arm.wait()
+        return Empty()
+
+
+def serving() -> tuple[ServedApi, Connection, Wire]:
+    """A server with one client."""
+    served = ServedApi()
+    return served, *served.client()

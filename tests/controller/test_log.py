@@ -18,12 +18,7 @@ import pytest
 from chain import set_chain
 from controller.daemon.messages import LatencyStatistics
 from controller.operation.operation_states import DaemonState, Operation
-from controller.operation.operator import (
-    DUMP_PATTERN,
-    MAX_DUMPS,
-    FaultDumps,
-    write_dump,
-)
+from controller.operation.operator import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
 from controller.process.daemon_process import ServiceManager
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply

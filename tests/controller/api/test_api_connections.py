@@ -1,4 +1,9 @@
-"""Bounds of one connection, to the byte and the request, in virtual time."""
+"""Clients and the drawn field with a daemon of a later version.
+
+Turns of the API's clients, by counting requests, in virtual time.
+
+Bounds of one connection, to the byte and the request, in virtual time.
+"""
 
 import asyncio
 import contextlib
@@ -9,11 +14,13 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
+from controller.api import connection
 from controller.api import connection as turns
+from controller.api.client import AsyncClient, Client
 from controller.api.connection import (
     MAX_CONNECTIONS,
     MAX_REQUEST_RATE,
@@ -22,10 +29,276 @@ from controller.api.connection import (
     Admission,
     Connection,
 )
+from controller.api.registered import METHODS
 from controller.api.schema import MAX_RATE, Message
-from controller.api.server import ContactsEvent, Hub, LogEvent
-from daemons import ServedApi, Wire, feed, request, serving
+from controller.api.server import TOPICS, ContactsEvent, EventParams, Hub, LogEvent
+from controller.gateway.field import DrawnField
+from daemons import (
+    PLACE,
+    ServedApi,
+    Wire,
+    feed,
+    holding,
+    request,
+    running_daemon,
+    serving,
+    until_state,
+)
 from registry.threads import no_long_collections
+from virtual_lines import in_virtual_time
+
+READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
+# keyed by name, not messages: so many levels deep
+MAPPINGS = {"drive": 1, "layers": 2, "parameters": 1, "layout": 1}
+MAPPINGS |= {"strengths": 1, "rejected_touches": 1, "rejected_examples": 1, "lost_events": 1}
+
+
+def with_extra_keys(content: Any, mapping_depth: int = 0) -> Any:
+    """A message of a later minor version: every object has a further key."""
+    if isinstance(content, list):
+        return [with_extra_keys(each) for each in content]
+    if not isinstance(content, dict):
+        return content
+    if mapping_depth:
+        return {key: with_extra_keys(each, mapping_depth - 1) for key, each in content.items()}
+    later = {key: with_extra_keys(each, MAPPINGS.get(key, 0)) for key, each in content.items()}
+    return later | {"extra": [{"of": "later"}]}
+
+
+async def test_extra_keys_of_a_later_minor_version_are_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In results and notifications at every depth: by both clients and by the gateway."""
+    made = Connection.connection_made
+
+    def speak_later(connection: Connection, transport: Any) -> None:
+        write = transport.write
+        transport.write = lambda line: write(
+            json.dumps(with_extra_keys(json.loads(line))).encode() + b"\n"
+        )
+        made(connection, transport)
+
+    def use(path: Path) -> list[str]:
+        with Client.connect(path) as era:
+            era.subscribe("state")
+            seen = [era.status().state, *(event.topic for event in era.events(timeout=0.2))]
+            era.effects()
+            return seen
+
+    monkeypatch.setattr(Connection, "connection_made", speak_later)
+    async with running_daemon(tmp_path) as bench:
+        async with await AsyncClient.connect(bench.socket) as era:
+            await until_state(era, READY)
+            assert await asyncio.to_thread(use, bench.socket) == [READY, "state"]
+            field = DrawnField(bench.socket)
+            drawing = asyncio.create_task(field.run())
+            frames = field.frames()
+            empty = await anext(frames)
+            await era.subscribe("pattern")
+            async with era.armed("me"), holding(era, PLACE), asyncio.timeout(60):
+                async for event in era.events():
+                    assert "extra" in event.data["contacts"][0]
+                    drives = [event.data["drive"], *event.data["layers"].values()]
+                    assert all("extra" in tone for drive in drives for tone in drive.values())
+                    if event.data["layers"]:
+                        break
+                drawn = empty
+                while len(drawn) == len(empty):
+                    drawn = await anext(frames)
+        drawing.cancel()
+        await asyncio.wait({drawing})
+
+
+@in_virtual_time
+async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
+    """Results and notifications read strictly by the models of the reference page."""
+    down = [{"id": 1, "x_m": PLACE[0], "y_m": PLACE[1]}]
+    topics = sorted(TOPICS.keys() - {"link", "log"})
+    received: set[str] = set()
+
+    async with contextlib.AsyncExitStack() as stack:
+        bench = await stack.enter_async_context(running_daemon(tmp_path, "learn: l.npz\n"))
+        async with await bench.client() as era:
+            await until_state(era, READY)
+        reader, writer = await asyncio.open_unix_connection(bench.socket, limit=1 << 20)
+        stack.callback(writer.close)
+
+        async def next_response() -> dict[str, Any]:
+            """The next response; notifications before it are read strictly."""
+            while True:
+                content: dict[str, Any] = json.loads(await reader.readline())
+                if "method" not in content:
+                    return content
+                event = EventParams.model_validate(content["params"])
+                TOPICS[event.topic].data.model_validate_json(json.dumps(event.data))
+                received.add(event.topic)
+
+        async def call(method: str, **params: object) -> None:
+            request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+            writer.write(json.dumps(request).encode() + b"\n")
+            response = await next_response()
+            assert response.keys() == {"jsonrpc", "id", "result"}, response
+            METHODS[method].result.model_validate_json(json.dumps(response["result"]))
+
+        async with asyncio.timeout(60):
+            await call("hello", client="me")
+            await call("subscribe", topics=topics, rate_hz=60.0)
+            assert received == set()  # the reply comes before the first event
+            await call("effects")
+            await call("arm", owner="me", lease_s=5.0)
+            for touches, awaited in ((down, "pattern"), ([], "silence")):
+                while awaited not in received:
+                    await call("touch", source="me", touches=touches)
+                    await call("status")
+                    await asyncio.sleep(0.01)
+            await call("stop")
+            await call("clear")
+            while received != set(topics):
+                await call("status")
+                await asyncio.sleep(0.01)
+
+
+REQUEST = request("renew", '{"lease":"a"}')
+TOUCH = request("touch", '{"source":"a","touches":[]}', id=1)
+TOUCH_DOWN = TOUCH.replace(b"[]", b'[{"id":1,"x_m":0.1,"y_m":0.1}]')
+LOOKALIKE = request("renew", '{"lease":"stop"}')
+STOP = request("stop")
+
+
+def serve(**costs: float) -> ServedApi:
+    """A server that counts time from now on; costs: as for `ServedApi`."""
+    loop = asyncio.get_running_loop()
+    began_at = loop.time()
+    return ServedApi(clock=lambda: loop.time() - began_at, **costs)
+
+
+@pytest.fixture(autouse=True)
+def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End turns by the number of lines, as virtual time stands still meanwhile."""
+    monkeypatch.setattr(connection, "MAX_TURN", 0.0)
+
+
+@in_virtual_time
+async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whose lines take 30 us each: four of ten."""
+    lines = 0
+
+    def count(name: str) -> None:
+        nonlocal lines
+        lines += 1
+
+    monkeypatch.undo()
+    monkeypatch.setattr(connection.time, "perf_counter", lambda: 30e-6 * lines)
+    served = serve()
+    served.called = count
+    feed(served.client()[0], REQUEST * 10)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert lines == 4
+
+
+@in_virtual_time
+async def test_clients_take_a_burst_then_a_quarter_of_the_time() -> None:
+    """Of requests of 1 ms each: 20 at once, then 250 in a second, each overdrawn by at most one."""
+    served = serve(costs=0.001)
+    client, _ = served.client()
+    feed(client, TOUCH * 700)
+    await asyncio.sleep(1.0)
+    times = served.times("touch")
+    assert sum(time == 0 for time in times) == pytest.approx(20, abs=1)
+    assert len(times) == pytest.approx(20 + 250, abs=3)
+
+
+@in_virtual_time
+async def test_client_that_touches_waits_for_no_other_client() -> None:
+    """Beside 30 that ask without end, whose requests of 1 ms each take all of their own share."""
+    served = serve(costs=0.001)
+    touching, _ = served.client()
+    feed(touching, TOUCH_DOWN)
+    for _ in range(30):
+        feed(served.client()[0], REQUEST * 100)
+    for number in range(1, 6):
+        await asyncio.sleep(0.1 * number - served.clock())
+        feed(touching, TOUCH_DOWN)
+    await asyncio.sleep(0.05)
+    assert len(served.times("renew")) < 250
+    assert served.times("touch") == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=0.002)
+
+
+@in_virtual_time
+async def test_client_whose_fingers_were_never_lifted_is_one_of_the_others() -> None:
+    """150 ms after its last frame, as its contacts: it and the others have one share."""
+    served = serve(costs=0.001)
+    silent, _ = served.client()
+    feed(silent, TOUCH_DOWN)
+    feed(served.client()[0], REQUEST * 400)
+    await asyncio.sleep(0.3)
+    feed(silent, REQUEST * 400)
+    await asyncio.sleep(1.0 - served.clock())
+    assert len(served.calls) == pytest.approx(1 + 20 + 250, abs=3)
+
+
+@in_virtual_time
+async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
+    """Until it is sent, and for 3 ms at most if touches follow each other without a gap."""
+    served = serve()
+    client, _ = served.client()
+    served.is_busy = True
+    feed(client, REQUEST * 4)
+    await asyncio.sleep(0.0029)
+    assert served.calls == []
+    await asyncio.sleep(0.0049)
+    assert served.times("renew") == pytest.approx([0.003, 0.0065], abs=0.001)
+    served.is_busy = False
+    await asyncio.sleep(0.0006)
+    assert len(served.times("renew")) == 4
+
+
+@in_virtual_time
+async def test_a_turn_that_is_deferred_costs_its_clients_nothing() -> None:
+    """Else what was saved until it is due may be spent by finding that it is not due yet."""
+    served = serve(costs=0.015, reading_costs=3e-6)
+    client, _ = served.client()
+    feed(client, REQUEST * 3)
+    await asyncio.sleep(0.1)
+    assert served.times("renew") == pytest.approx([0.0, 0.0, 0.04], abs=0.001)
+
+
+@in_virtual_time
+async def test_stop_is_served_at_once_though_touches_come_first_and_time_is_overdrawn() -> None:
+    """Also behind other requests of its client, and in two parts."""
+    served = serve(costs=0.001)
+    client, _ = served.client()
+    feed(client, TOUCH * 100)
+    await asyncio.sleep(0.01)
+    assert len(served.times("touch")) < 30
+    served.is_busy = True
+    feed(client, STOP[:-5])
+    feed(client, STOP[-5:])
+    await asyncio.sleep(0.001)
+    assert served.times("stop") == [pytest.approx(0.01)]
+    assert len(served.times("touch")) == 100
+
+
+@in_virtual_time
+async def test_lines_that_only_look_like_a_stop_are_served_in_turn() -> None:
+    """The first of them is served at once, the next one so only a tenth of a second later."""
+    served = serve()
+    client, _ = served.client()
+    served.is_busy = True
+    for pause in (0.0, 0.001, 0.05, 0.06):
+        await asyncio.sleep(pause)
+        feed(client, LOOKALIKE)
+        for _ in range(4):
+            await asyncio.sleep(0)
+    delays = [
+        time - sent
+        for time, sent in zip(served.times("renew"), (0.0, 0.001, 0.051, 0.111), strict=True)
+    ]
+    assert delays == pytest.approx([0.0, 0.003, 0.003, 0.0], abs=0.0006)
 
 
 async def iterate() -> None:
@@ -125,7 +398,7 @@ async def test_refused_requests_count_in_the_rate() -> None:
         assert wire.lines()[-1]["error"]["code"] == 1005
 
 
-TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
+API_BOUNDS_TOUCH = '{"id":1,"x_m":0.1,"y_m":0.1}'
 WRONG = '{"id":"a","x_m":"b","y_m":[],"z":0,"t":0}'
 HEAVY = {
     "newlines": b"\n" * (1 << 18),
@@ -135,9 +408,10 @@ HEAVY = {
     "members": b"{" + b",".join(b'"%d":1' % n for n in range(240)) + b"}\n",
     "depth": b'{"a":' * 5000 + b"\n",
     "depth within the bound": b"[" * 79 + b"]" * 79 + b"\n",
-    "touches": request("touch", f'{{"source":"a","touches":[{",".join([TOUCH] * 64)}]}}') * 30,
+    "touches": request("touch", f'{{"source":"a","touches":[{",".join([API_BOUNDS_TOUCH] * 64)}]}}')
+    * 30,
     "touches in turn": b"".join(
-        request("touch", f'{{"source":"{n}","touches":[{",".join([TOUCH] * 64)}]}}')
+        request("touch", f'{{"source":"{n}","touches":[{",".join([API_BOUNDS_TOUCH] * 64)}]}}')
         for n in range(30)
     ),
     "wrong touches": request("touch", f'{{"source":"a","touches":[{",".join([WRONG] * 70)}]}}'),

@@ -1,18 +1,31 @@
-"""Attacks on the gateway: each is refused, and the daemon receives no call.
+"""A stop is passed on or answered, whatever other browsers and the daemon do.
+
+Attacks on the gateway: each is refused, and the daemon receives no call.
 
 An attack is a request to arm that would be granted but for one thing, or an invalid frame. The
 gateway is a process connected to a daemon that records its calls.
 """
 
+import asyncio
 import json
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
 from typing import Any, TypeAlias
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import pytest
+from aiohttp import WSMessage, WSMsgType
 
+from controller.api import link
+from controller.api.client import AsyncClient
+from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
+from controller.api.schema import API_VERSION
+from controller.gateway import connections
 from controller.gateway.connections import MAX_FRAGMENTS, FrameHeads
+from daemons import PATIENCE
 from gateway_bench import (
     ARM,
     TOKEN,
@@ -28,8 +41,245 @@ from gateway_bench import (
 )
 
 
+@pytest.fixture
+def gateway(daemon: ScriptedDaemon, tmp_path: Path) -> Iterator[GatewayProcess]:
+    """A gateway from which no host has had a connection to the daemon yet, but ours."""
+    with gateway_process(tmp_path, daemon.socket) as made:
+        wait_for_daemon(made)
+        yield made
+
+
+def sent(gateway: GatewayProcess, method: str, host: str) -> socket.socket:
+    """A connection of a host over which one request was sent."""
+    made = socket.create_connection(
+        ("127.0.0.1", gateway.port), timeout=PATIENCE, source_address=(host, 0)
+    )
+    made.sendall(
+        f"POST /api/v1/{method} HTTP/1.1\r\nHost: {gateway.host}\r\nConnection: close\r\n"
+        f"Authorization: Bearer {TOKEN}\r\nContent-Length: 0\r\n\r\n".encode()
+    )
+    return made
+
+
+def status(connection: socket.socket) -> int:
+    """The status of the response."""
+    with connection:
+        return int(connection.recv(1 << 16)[9:12])
+
+
+def test_stops_are_passed_on_although_other_hosts_connect_often(
+    gateway: GatewayProcess, daemon: ScriptedDaemon
+) -> None:
+    """After the bursts of two hosts; the daemon accepts 64 connections at once of one process."""
+    daemon.calls.clear()
+    others = [sent(gateway, "status", f"127.0.0.{host}") for _ in range(45) for host in (2, 3)]
+    stops = [sent(gateway, "stop", "127.0.0.4") for _ in range(70)]
+    disarms = [sent(gateway, "disarm", "127.0.0.4") for _ in range(20)]
+    assert [status(each) for each in stops] == [200] * 70
+    assert [status(each) for each in disarms] == [200] * 20
+    assert daemon.methods.count("stop") == 70
+    for each in others:
+        each.close()
+
+
+@pytest.fixture
+def full_queue(tmp_path: Path) -> Iterator[Path]:
+    """The socket of a daemon that hangs: no further connection is queued."""
+    path = tmp_path / "era.sock"
+    waiting: list[socket.socket] = []
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+        bound.listen(0)
+        while True:
+            waiting.append(socket.socket(socket.AF_UNIX))
+            waiting[-1].setblocking(False)
+            try:
+                waiting[-1].connect(str(path))
+            except BlockingIOError:
+                break
+        yield path
+        for each in waiting:
+            each.close()
+
+
+async def test_stop_is_answered_although_the_daemon_hangs(
+    full_queue: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise nobody is told to switch the amplifiers off by hand."""
+    monkeypatch.setattr(link, "RESPONSE_TIMEOUT", 0.05)
+    async with asyncio.timeout(100 * link.RESPONSE_TIMEOUT):
+        with pytest.raises(Unreachable, match="does not respond"):
+            await link.DaemonLink.open(full_queue, "browser")
+        with pytest.raises(Unreachable, match="does not respond"):
+            await AsyncClient(full_queue, name="gateway", timeout=0.05).stop()
+
+
+async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
+    full_queue: Path,
+) -> None:
+    """Until their connections have failed: else any number of them would wait for the daemon."""
+    kept: set[connections.KeptLink] = set()
+
+    def request() -> "asyncio.Task[bytes]":
+        connection = connections.KeptLink(kept)
+        may_open = Mock(return_value=True)
+        call = connection.request(full_queue, "http", "status", b"{}", may_open=may_open)
+        task = asyncio.create_task(call)
+        asyncio.get_running_loop().call_soon(connection.close)
+        return task
+
+    waiting = [request() for _ in range(connections.MAX_KEPT)]
+    await asyncio.sleep(0)
+    with pytest.raises(RpcError, match="too many connections"):
+        await request()
+    for each in waiting:
+        each.cancel()
+    await asyncio.wait(waiting)
+    assert not kept
+
+
+LEFT = WSMessage(WSMsgType.CLOSED, None, None)
+
+
+class DeafBrowser:
+    """A WebSocket of a browser that reads the first frame only, and has sent others."""
+
+    close_code = None
+
+    def __init__(self) -> None:
+        self.frames: asyncio.Queue[WSMessage] = asyncio.Queue()
+        self.sent = 0
+
+    def __aiter__(self) -> "DeafBrowser":
+        return self
+
+    async def __anext__(self) -> WSMessage:
+        """The next frame."""
+        message = await self.frames.get()
+        if message is LEFT:
+            raise StopAsyncIteration
+        return message
+
+    async def send_str(self, _: str) -> None:
+        """Send the first frame."""
+
+    async def send_frame(self, _: bytes, opcode: WSMsgType) -> None:
+        """Send none of the others: they wait."""
+        await asyncio.Event().wait()
+
+    async def close(self, *, code: int, drain: bool) -> None:
+        """Answer that it has left."""
+
+
+@pytest.fixture
+async def busy_daemon(tmp_path: Path) -> AsyncIterator[tuple[Path, asyncio.Future[list[bytes]]]]:
+    """The socket of a daemon that sends an event, and reads only later; what it read."""
+    path = tmp_path / "era.sock"
+    read: asyncio.Future[list[bytes]] = asyncio.get_running_loop().create_future()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        hello = b'{"jsonrpc":"2.0","id":"web","result":{"api_version":"%s"}}\n{}\n'
+        writer.write(hello % API_VERSION.encode())
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        await given_up.wait()
+        writer.transport.resume_reading()  # type: ignore[attr-defined]
+        read.set_result((await reader.read()).splitlines())
+        writer.close()
+
+    given_up = asyncio.Event()
+    asyncio.get_running_loop().call_later(0.3, given_up.set)
+    async with await asyncio.start_unix_server(serve, path, limit=1 << 12):
+        yield path, read
+
+
+async def test_stop_of_a_browser_that_is_given_up_is_passed_on(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits behind touches that a busy daemon has not read, and the browser does not read.
+
+    However its name is written; what only looks like it is not passed on.
+    """
+    path, read = busy_daemon
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.05)
+    opened = await link.DaemonLink.open(path, "browser")
+    monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+    browser = DeafBrowser()
+    touch = (
+        '{"jsonrpc":"2.0","method":"touch","params":{"source":"page","touches":[]}}' + " " * 4000
+    )
+    stop = '{"jsonrpc":"2.0","id":9,"method":"st\\u006fp"}'
+    play = '{"jsonrpc":"2.0","id":8,"method":"play","params":{"effect":"stop","x_m":0,"y_m":0}}'
+    for text in [touch] * 1000 + [stop, play]:
+        browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, text, ""))
+    async with asyncio.timeout(PATIENCE):
+        await connections.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+        lines = await read
+    opened.abort()
+    await asyncio.sleep(0)
+    assert len(lines) < 900
+    assert lines[-1] == stop.encode()
+
+
+async def test_others_have_a_turn_after_each_frame(
+    busy_daemon: tuple[Path, "asyncio.Future[list[bytes]]"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many frames of a browser wait."""
+    path, read = busy_daemon
+    monkeypatch.setattr(connections, "SEND_TIMEOUT", 0.5)
+    opened = await link.DaemonLink.open(path, "browser")
+    monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+    browser = DeafBrowser()
+    for _ in range(100):
+        browser.frames.put_nowait(WSMessage(WSMsgType.TEXT, "{}", ""))
+    bridging = asyncio.create_task(connections.bridge(browser, "", path, None))  # type: ignore[arg-type]
+    turns = 0
+    async with asyncio.timeout(PATIENCE):
+        while not browser.frames.empty():
+            await asyncio.sleep(0)
+            turns += 1
+        browser.frames.put_nowait(LEFT)
+        await bridging
+        await read
+    opened.abort()
+    await asyncio.sleep(0)
+    assert turns >= 100
+
+
+class LeavingBrowser(DeafBrowser):
+    """A WebSocket of a browser that leaves when it is sent its second frame."""
+
+    async def send_frame(self, _: bytes, opcode: WSMsgType) -> None:
+        """Send a frame without waiting; the event loop sees next that the browser has left."""
+        self.sent += 1
+        if self.sent == 1:
+            asyncio.get_running_loop().call_soon(self.frames.put_nowait, LEFT)
+
+
+async def test_lines_that_came_together_are_not_sent_to_a_browser_that_has_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them would be a warning in the log."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        hello = b'{"jsonrpc":"2.0","id":"web","result":{"api_version":"%s"}}\n'
+        writer.write(hello % API_VERSION.encode() + 1000 * b"{}\n")
+        await reader.read()
+        writer.close()
+
+    path, browser = tmp_path / "era.sock", LeavingBrowser()
+    async with await asyncio.start_unix_server(serve, path), asyncio.timeout(PATIENCE):
+        opened = await link.DaemonLink.open(path, "browser")
+        monkeypatch.setattr(link.DaemonLink, "open", AsyncMock(return_value=opened))
+        await connections.bridge(browser, "192.0.2.1:1", path, None)  # type: ignore[arg-type]
+    opened.abort()
+    await asyncio.sleep(0)
+    assert 1 <= browser.sent < 10
+
+
 @pytest.fixture(scope="module")
-def gateway(
+def gateway_attacks_gateway(
     daemon: ScriptedDaemon, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[GatewayProcess]:
     """One gateway, which survives all attacks."""
@@ -39,38 +289,38 @@ def gateway(
 
 
 @pytest.fixture(scope="module")
-def friend(gateway: GatewayProcess) -> Iterator[httpx.Client]:
+def friend(gateway_attacks_gateway: GatewayProcess) -> Iterator[httpx.Client]:
     """A client that keeps its connection between its requests."""
     headers = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "application/json"}
-    with httpx.Client(base_url=gateway.url, headers=headers) as client:
+    with httpx.Client(base_url=gateway_attacks_gateway.url, headers=headers) as client:
         yield client
 
 
 @pytest.fixture(autouse=True)
 def unaffected(
-    daemon: ScriptedDaemon, gateway: GatewayProcess, friend: httpx.Client
+    daemon: ScriptedDaemon, gateway_attacks_gateway: GatewayProcess, friend: httpx.Client
 ) -> Iterator[None]:
     """After each attack: no call of the daemon, no log record, and a valid request is granted."""
     daemon.calls.clear()
-    log = gateway.log()
+    log = gateway_attacks_gateway.log()
     yield
     assert daemon.calls == []
     assert friend.post("api/v1/arm", content=ARM).status_code == 200
     assert daemon.methods == ["arm"]
-    assert gateway.log() == log
+    assert gateway_attacks_gateway.log() == log
 
 
-def filled(value: Any, gateway: GatewayProcess) -> Any:
+def filled(value: Any, gateway_attacks_gateway: GatewayProcess) -> Any:
     """A value with the gateway's host in place of HOST."""
     match value:
         case str():
-            return value.replace("HOST", gateway.host)
+            return value.replace("HOST", gateway_attacks_gateway.host)
         case bytes():
-            return value.replace(b"HOST", gateway.host.encode())
+            return value.replace(b"HOST", gateway_attacks_gateway.host.encode())
         case list():
-            return [filled(each, gateway) for each in value]
+            return [filled(each, gateway_attacks_gateway) for each in value]
         case dict():
-            return {key: filled(each, gateway) for key, each in value.items()}
+            return {key: filled(each, gateway_attacks_gateway) for key, each in value.items()}
     return value
 
 
@@ -172,10 +422,10 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-def test_http_request_is_refused(gateway: GatewayProcess, name: str) -> None:
+def test_http_request_is_refused(gateway_attacks_gateway: GatewayProcess, name: str) -> None:
     """With the right status, and without the content of a file."""
     changes, statuses = ATTACKS[name]
-    response = http(gateway, **filled(changes, gateway))
+    response = http(gateway_attacks_gateway, **filled(changes, gateway_attacks_gateway))
     assert response.status in statuses, response
     assert b"root:" not in response.body
     assert b"import" not in response.body
@@ -208,20 +458,24 @@ GRANTED += ARM
         pytest.param(bytes(range(256)) * 40 + b"\r\n\r\n", {400}, id="noise"),
     ],
 )
-def test_http_bytes_are_refused(gateway: GatewayProcess, data: bytes, statuses: set[int]) -> None:
+def test_http_bytes_are_refused(
+    gateway_attacks_gateway: GatewayProcess, data: bytes, statuses: set[int]
+) -> None:
     """Without Host, bodies without a length, other versions of HTTP, and no HTTP at all."""
-    response = raw(gateway, filled(data, gateway))
+    response = raw(gateway_attacks_gateway, filled(data, gateway_attacks_gateway))
     assert response.status in statuses
     assert response.headers.startswith("HTTP/1.")
 
 
 @pytest.mark.parametrize("body", [b" " * 5_000_000, b"1\r\n \r\n" * 500_000])
-def test_refusal_is_read_after_the_whole_body_is_sent(gateway: GatewayProcess, body: bytes) -> None:
+def test_refusal_is_read_after_the_whole_body_is_sent(
+    gateway_attacks_gateway: GatewayProcess, body: bytes
+) -> None:
     """By a client that reads only then: sized or in chunks, the body is discarded meanwhile."""
-    head = filled(CHUNKED, gateway)
+    head = filled(CHUNKED, gateway_attacks_gateway)
     if body.startswith(b" "):
         head = head.replace(b"Transfer-Encoding: chunked", b"Content-Length: 5000001")
-    with gateway.connect() as connection:
+    with gateway_attacks_gateway.connect() as connection:
         connection.sendall(head + body)
         assert connection.recv(1 << 16)[9:12] in (b"411", b"413")
 
@@ -245,18 +499,22 @@ AMBIGUOUS = {
 
 
 @pytest.mark.parametrize("name", AMBIGUOUS)
-def test_head_that_a_proxy_may_misread_is_refused(gateway: GatewayProcess, name: str) -> None:
+def test_head_that_a_proxy_may_misread_is_refused(
+    gateway_attacks_gateway: GatewayProcess, name: str
+) -> None:
     """After a request that is served, and in pieces; without the client's text or a server's name.
 
     With the security headers, as all responses, and in JSON.
     """
-    head, _, body = filled(AMBIGUOUS[name], gateway).partition(b"\r\n\r\n")
-    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
-    with gateway.connect() as connection:
+    head, _, body = filled(AMBIGUOUS[name], gateway_attacks_gateway).partition(b"\r\n\r\n")
+    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway_attacks_gateway.host}\r\n\r\n".encode()
+    with gateway_attacks_gateway.connect() as connection:
         connection.sendall(first)
         assert b"</svg>" in connection.recv(1 << 16)
         connection.sendall(head[:-1])
-        assert http(gateway, target="/api/v1/openapi.json", method="GET").status == 200
+        assert (
+            http(gateway_attacks_gateway, target="/api/v1/openapi.json", method="GET").status == 200
+        )
         connection.sendall(head[-1:] + b"\r\n\r\n" + body)
         received = b""
         while part := connection.recv(1 << 16):
@@ -270,9 +528,9 @@ def test_head_that_a_proxy_may_misread_is_refused(gateway: GatewayProcess, name:
         assert text not in received.lower()
 
 
-def test_body_is_asked_for_only_with_the_token(gateway: GatewayProcess) -> None:
+def test_body_is_asked_for_only_with_the_token(gateway_attacks_gateway: GatewayProcess) -> None:
     """Before its 100 Continue everything of the head is checked; then the request is granted."""
-    head, body = filled(GRANTED, gateway).split(b"\r\n\r\n")
+    head, body = filled(GRANTED, gateway_attacks_gateway).split(b"\r\n\r\n")
     for sent, status in (
         (head.replace(TOKEN.encode(), b"x" * len(TOKEN)), b"401"),
         (head.replace(b"application/json", b"text/plain"), b"415"),
@@ -280,10 +538,10 @@ def test_body_is_asked_for_only_with_the_token(gateway: GatewayProcess) -> None:
         (head.replace(b"/arm", b"/arm/arm"), b"4"),
         (head.replace(b"POST /api/v1/arm", b"GET /icon.svg"), b"200"),
     ):
-        with gateway.connect() as connection:
+        with gateway_attacks_gateway.connect() as connection:
             connection.sendall(sent + b"\r\nExpect: 100-continue\r\n\r\n")
             assert connection.recv(1 << 16)[9:12].startswith(status)
-    with gateway.connect() as connection:
+    with gateway_attacks_gateway.connect() as connection:
         connection.sendall(head.replace(b"arm", b"forget") + b"\r\nExpect: 100-continue\r\n\r\n")
         assert connection.recv(1 << 16) == b"HTTP/1.1 100 Continue\r\n\r\n"
         connection.sendall(body.replace(b"owner", b"elsee"))
@@ -309,17 +567,22 @@ OWN = f"era-haptics.token.{TOKEN}"
     ],
     ids=str,
 )
-def test_websocket_is_refused(gateway: GatewayProcess, changes: dict[str, Any]) -> None:
+def test_websocket_is_refused(
+    gateway_attacks_gateway: GatewayProcess, changes: dict[str, Any]
+) -> None:
     """A foreign origin or host, a missing, wrong or repeated token, no subprotocol, other paths."""
-    assert raw(gateway, upgrade(gateway, **changes)).status == 403
+    assert raw(gateway_attacks_gateway, upgrade(gateway_attacks_gateway, **changes)).status == 403
 
 
 @pytest.mark.parametrize("changed", [(b"HTTP/1.1", b"HTTP/1.0"), (b"GET", b"HEAD")])
 def test_websocket_needs_a_get_of_http_1_1(
-    gateway: GatewayProcess, changed: tuple[bytes, bytes]
+    gateway_attacks_gateway: GatewayProcess, changed: tuple[bytes, bytes]
 ) -> None:
     """RFC 6455 4.1."""
-    assert raw(gateway, upgrade(gateway).replace(*changed)).status == 403
+    assert (
+        raw(gateway_attacks_gateway, upgrade(gateway_attacks_gateway).replace(*changed)).status
+        == 403
+    )
 
 
 Misuse: TypeAlias = Callable[[RawWebSocket], None]
@@ -364,10 +627,12 @@ async def test_heads_of_frames_are_checked_however_the_bytes_are_divided() -> No
 
 
 @pytest.mark.parametrize("name", MISUSES)
-def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: str) -> None:
+def test_websocket_closes_after_an_invalid_frame(
+    gateway_attacks_gateway: GatewayProcess, name: str
+) -> None:
     """With the close code of RFC 6455, or 0: without a close frame."""
     misuse, codes = MISUSES[name]
-    with RawWebSocket(gateway) as ws:
+    with RawWebSocket(gateway_attacks_gateway) as ws:
         misuse(ws)
         assert ws.close_code() in codes
 
@@ -381,43 +646,45 @@ def test_websocket_closes_after_an_invalid_frame(gateway: GatewayProcess, name: 
     ],
 )
 def test_websocket_with_frames_before_its_acceptance_is_refused(
-    gateway: GatewayProcess, early: bytes
+    gateway_attacks_gateway: GatewayProcess, early: bytes
 ) -> None:
     """Which would not be checked; from the rest of one begun all others would be misread."""
-    assert raw(gateway, upgrade(gateway) + early).status == 403
+    assert raw(gateway_attacks_gateway, upgrade(gateway_attacks_gateway) + early).status == 403
 
 
 @pytest.mark.parametrize(
     "more", [["Content-Length: 100"], ["Transfer-Encoding: chunked"], ["Sec-WebSocket-Key: \xe9"]]
 )
 def test_websocket_with_a_body_or_a_key_that_is_not_ascii_is_refused(
-    gateway: GatewayProcess, more: list[str]
+    gateway_attacks_gateway: GatewayProcess, more: list[str]
 ) -> None:
     """Without a record in the log."""
-    lines = upgrade(gateway).decode().split("\r\n")
+    lines = upgrade(gateway_attacks_gateway).decode().split("\r\n")
     kept = [each for each in lines if not each.startswith(more[0].partition(":")[0])]
-    with gateway.connect() as connection:
+    with gateway_attacks_gateway.connect() as connection:
         connection.sendall("\r\n".join([*kept[:-2], *more, "", ""]).encode())
         assert connection.recv(1 << 16)[9:12] == b"403"
 
 
-def test_websocket_is_accepted_byte_by_byte_after_a_page(gateway: GatewayProcess) -> None:
+def test_websocket_is_accepted_byte_by_byte_after_a_page(
+    gateway_attacks_gateway: GatewayProcess,
+) -> None:
     """Its head ends with its last byte, wherever the bytes were divided."""
-    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
-    with gateway.connect() as connection:
+    first = f"GET /icon.svg HTTP/1.1\r\nHost: {gateway_attacks_gateway.host}\r\n\r\n".encode()
+    with gateway_attacks_gateway.connect() as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.sendall(first)
         assert b"</svg>" in connection.recv(1 << 16)
-        for byte in upgrade(gateway):
+        for byte in upgrade(gateway_attacks_gateway):
             connection.sendall(bytes([byte]))
         assert connection.recv(1 << 16)[9:12] == b"101"
 
 
-def test_websocket_has_no_compression(gateway: GatewayProcess) -> None:
+def test_websocket_has_no_compression(gateway_attacks_gateway: GatewayProcess) -> None:
     """The offer of permessage-deflate is declined."""
-    with gateway.connect() as connection:
+    with gateway_attacks_gateway.connect() as connection:
         offer = ["Sec-WebSocket-Extensions: permessage-deflate"]
-        connection.sendall(upgrade(gateway, more=offer))
+        connection.sendall(upgrade(gateway_attacks_gateway, more=offer))
         head = connection.recv(1 << 16)
     assert head.startswith(b"HTTP/1.1 101 ")
     assert b"deflate" not in head

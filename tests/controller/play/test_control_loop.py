@@ -1,14 +1,65 @@
-"""The control loop, in virtual time, with amplifiers that record their requests."""
+"""The control loop, in virtual time, with amplifiers that record their requests.
+
+Clicks at fingers that feel what lasts: a layer beside it, and figures of that moment.
+
+As many fingers as there may be, and answers that come too late: said, and never played.
+
+Opening, arming, stopping, closing, losing, and what several amplifiers do together.
+"""
 
 import asyncio
+import logging
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from chain import FINGER, set_running
-from controller.play.planner import Observers
-from controller.sources.touch import Touch, TouchFrame
+from chain import FINGER, OTHER, Chain, Position, set_chain, set_running
+from controller.daemon.messages import PlateView
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, Click
+from controller.effects.layout import SurfaceLayout, default_effects
+from controller.play.intent import CLICK, HapticIntent, Pulse, Target
+from controller.play.layer_contents import (
+    BEING_CHOSEN,
+    LayerContent,
+    Prediction,
+    Selection,
+    sums_db,
+)
+from controller.play.loop import Controller
+from controller.play.planner import Observers, PlayReport
+from controller.play.selection import BLOCKED, GIVEN_UP, Chooser, Selector
+from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from courses import Acted, courses, follow
+from drivers.errors import LinkError
+from drivers.host.group import GroupState
+from drivers.opening import Lines
+from drivers.protocol.definition import HEARTBEAT
+from drivers.protocol.records import Refusal, Values
+from model.answer.answer_report import Timing
+from model.config.fields import Rectangle
+from model.errors import InputError
+from model.rig.rig import Channel
+from plates import small_problem, small_table
+from set_table import BuzzNewestContact, SetTiming
+from several_fingers import (
+    ABOVE,
+    LAYOUT,
+    LEFT,
+    RIGHT,
+    Fingers,
+    answers_take,
+    fingers_on,
+    playable,
+    table,
+)
+from sim.far_ends.wire_assignment import Wire
 from virtual_lines import in_virtual_time
 
 COURSES = courses(Path(__file__).with_name("courses.yaml"))
@@ -95,3 +146,484 @@ async def test_latency_counts_from_the_touch_though_its_first_set_is_lost() -> N
         assert applied.is_touch
         assert applied.latency == pytest.approx(applied.time - begin)
         assert applied.latency >= 0.08
+
+
+PLAYED = SurfaceLayout(LAYOUT.regions, {**default_effects(), **LAYOUT.effects}, elsewhere=None)
+"""Contents of 14 dB SL, and a click without a level of its own."""
+
+
+async def clicked(fingers: Fingers, name: str = "click") -> tuple[PlayReport, PlayReport, int]:
+    """Play a click at finger 1: what was reported before it, of it, and how often in all."""
+    count, before = len(fingers.applied), fingers.applied[-1]
+    fingers.play(name)
+    await fingers.hold(0.3)
+    return before, fingers.applied[count], len(fingers.applied) - count
+
+
+def by_finger(report: PlayReport) -> dict[int, Prediction]:
+    """What each finger is predicted to feel."""
+    return {each.contact.key.id: each for each in report.targets}
+
+
+def short(report: PlayReport) -> list[LayerContent]:
+    """The clicks that play."""
+    return [one for one in report.contents.values() if one.content.key[1] == CLICK]
+
+
+@in_virtual_time
+async def test_a_click_beside_its_own_buzz_is_6_db_above_it_and_30_hz_from_all() -> None:
+    """As modelled, in 2 sets of its own layer; what lasts of both fingers is not touched."""
+    async with fingers_on(table(), PLAYED, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        sent = len(fingers.committed)
+        before, during, _ = await clicked(fingers)
+        (click,) = short(during)
+        (number,) = [n for n, one in during.contents.items() if one is click]
+        layers = [[one.layer for one in each] for _, _, each in fingers.committed[sent:]]
+        assert layers == [[number]] * 2
+        felt, buzz = by_finger(during)[1], by_finger(before)[1]
+        assert felt.content == "click"
+        assert buzz.nominal_db_sl is not None
+        least = max(20.0, buzz.nominal_db_sl + 6)  # what the layout's default is, or more
+        assert felt.nominal_db_sl == pytest.approx(least, abs=0.1)
+        for one in before.contents.values():
+            assert abs((one.content.frequency or 0) - (click.content.frequency or 0)) >= 30
+
+
+@in_virtual_time
+async def test_a_click_restates_what_its_neighbour_feels_and_only_meanwhile() -> None:
+    """Foreign level: none of 40 ms is above it on this plate; contrast: by powers, by hand."""
+    async with fingers_on(table(), PLAYED, at={1: LEFT, 2: RIGHT}, held=0.6) as fingers:
+        before, during, count = await clicked(fingers)
+        old, new, again = (by_finger(each)[2] for each in (before, during, fingers.applied[-1]))
+        assert count == 2
+        assert again == old
+        figures = old.level_db_sl, old.promised_contrast_db, old.foreign_level_db_sl
+        level, contrast, foreign = (10 ** ((each or 0.0) / 10) for each in figures)
+        total = 10 ** ((new.foreign_level_db_sl or 0.0) / 10)
+        assert total > 2 * foreign
+        expected = level / (level / contrast + total - foreign)
+        assert new.promised_contrast_db == pytest.approx(10 * math.log10(expected), abs=1e-6)
+        assert new.verdict == ("own" if new.promised_contrast_db >= 12 else "mixed")
+        assert (new.level_db_sl, new.frequency) == (old.level_db_sl, old.frequency)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "foreign", "expected", "total", "verdict"),
+    [
+        (14.0, 5.0, 20 - 10 * math.log10(10**0.6 + 10**0.6), 8.539, "mixed"),
+        (None, None, 14.0, 6.0, "own"),
+        (11.0, None, 11.0, 6.0, "mixed"),
+    ],
+)
+def test_powers_of_contents_add(
+    contrast: float | None, foreign: float | None, expected: float, total: float, verdict: str
+) -> None:
+    """6 dB SL beside 20: on 6 dB SL that its contrast of 14 dB is to, on 5 dB SL, on nothing."""
+    contact = Contact(ContactKey("a", 1), 0.1, 0.1, 0.0)
+    was = "mixed" if contrast == 11 else "own"
+    felt = Prediction(
+        contact, 20.0, None, was, promised_contrast_db=contrast, foreign_level_db_sl=foreign
+    ).beside([6.0], sums_db([[6.0], [-math.inf if foreign is None else foreign]]))
+    assert felt.promised_contrast_db == pytest.approx(expected, abs=1e-3)
+    assert felt.foreign_level_db_sl == pytest.approx(total, abs=1e-3)
+    assert felt.verdict == verdict
+
+
+@in_virtual_time
+async def test_a_click_without_a_free_layer_is_refused_and_the_buzz_plays_on() -> None:
+    """Of two layers none is left, and its finger's row says why; what lasts is as before."""
+    contacts = [Contact(ContactKey("a", n), *at, 0.0) for n, at in enumerate((LEFT, RIGHT))]
+    lasting = [Target(each.key, 14.0, content="buzz") for each in contacts]
+    click = Target(contacts[0].key, 20.0, Pulse(0.04, 1.0), content="click", priority=9)
+    selector, found = Selector(Chooser(table())), list[Selection]()
+    for targets in (lasting, lasting, [*lasting, click]):
+        intent = HapticIntent(tuple(targets))
+        found.append(selector.select(contacts, intent, playable(2), now=1.0))
+        await asyncio.sleep(0.1)
+    assert found[2].contents == found[1].contents
+    old, new = (each.predictions[0] for each in found[1:])
+    assert replace(new, held_back=None) == old
+    assert "no layer is free" in (new.held_back or "")
+
+
+@in_virtual_time
+async def test_a_click_has_what_the_buzz_of_its_finger_leaves_of_the_stroke() -> None:
+    """It asks for more: one ERA is at full stroke then, none above; what lasts stays."""
+    effects = {**PLAYED.effects, "low": Buzz(level=36.0), "loud": Click(level=60.0)}
+    async with fingers_on(table(), replace(PLAYED, effects=effects), at={1: LEFT}, held=0.6) as on:
+        before, during, _ = await clicked(on, "loud")
+        levels = Counter[str]()
+        for one in during.contents.values():
+            levels.update({era: tone.level for era, tone in one.drive.items()})
+        assert 0.97 < max(levels.values()) <= 1.0
+        lasting = [one.content for one in before.contents.values()]
+        assert [one.content for one in during.contents.values()][:1] == lasting
+        assert not on.refused
+
+
+@in_virtual_time
+async def test_what_ends_beside_a_click_ends_along_100_ms() -> None:
+    """A finger slides out of its region amid the onset: its click starts as its buzz ends."""
+    first = replace(LAYOUT.regions[0], on_release="click")
+    layout = replace(PLAYED, regions=(first, *PLAYED.regions[1:]))
+    async with fingers_on(table(), layout, at={1: (0.148, 0.08)}, held=0.03) as fingers:
+        sent = len(fingers.committed)
+        fingers.at[1] = (0.1515, 0.08)
+        await fingers.hold(0.02)
+        ((_, _, layers),) = fingers.committed[sent:]
+        ramps = {any(command.level for command in one.commands): one.ramp for one in layers}
+        assert ramps == {True: 10, False: 100}
+
+
+def said(fingers: Fingers) -> dict[int, str | None]:
+    """What the status says of each finger that does not feel its own."""
+    applied = fingers.applied[-1] if fingers.applied else None
+    silenced = fingers.silenced[-1] if fingers.silenced else None
+    if applied and silenced and silenced.time > applied.time:
+        applied = None
+    contacts = fingers.controller.cycle.tracker.contacts
+    view = PlateView(lambda key: None, contacts, applied or silenced)
+    return {each.id: each.held_back for each in view.contact_statuses()}
+
+
+@in_virtual_time
+async def test_an_answer_given_up_holds_up_nothing_and_is_never_played(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It takes 5 s: silent after one, at once asked anew for a finger that moves, and no sooner."""
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
+        asked, began = answers_take(monkeypatch, 5.0, 0.02), asyncio.get_running_loop().time()
+        fingers.at[2] = RIGHT
+        await fingers.hold(0.9)
+        assert said(fingers) == {1: None, 2: BEING_CHOSEN}
+        await fingers.hold(0.6)
+        assert said(fingers) == {1: GIVEN_UP, 2: GIVEN_UP}
+        assert 1.0 <= fingers.silenced[-1].time - began <= 1.01
+        assert fingers.levels() == {"main": (0.0,) * 4}
+        assert len(asked) == 1
+        fingers.at[2], count = (RIGHT[0] + 0.01, RIGHT[1]), len(fingers.applied)
+        moved = asyncio.get_running_loop().time()
+        await fingers.hold(0.4)
+        assert fingers.applied[count].time - moved <= 0.035
+        assert said(fingers) == {1: None, 2: None}
+        before = len(asked), len(fingers.applied)
+        await fingers.hold(5.0)
+        assert (len(asked), len(fingers.applied)) == before
+
+
+@in_virtual_time
+async def test_answers_that_hang_are_bounded_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two hang: with a third set of fingers none is begun until one of them has ended."""
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
+        asked = answers_take(monkeypatch, 4.0, 4.0, 0.02)
+        fingers.at[2] = RIGHT
+        await fingers.hold(1.2)
+        fingers.at[3] = ABOVE
+        await fingers.hold(1.2)
+        for number in range(1, 6):
+            fingers.at[3] = (ABOVE[0] + 0.01 * number, ABOVE[1])
+            await fingers.hold(0.1)
+            assert said(fingers) == dict.fromkeys((1, 2, 3), BLOCKED)
+        assert len(asked) == 2
+        fingers.at = {1: LEFT}
+        await fingers.hold(0.1)
+        assert said(fingers) == {1: None}  # one finger needs no thread
+        fingers.at[2] = RIGHT
+        await fingers.hold(1.2)
+        assert asked[2] - asked[0] == pytest.approx(4.0, abs=0.001)
+        assert said(fingers) == {1: None, 2: None}
+
+
+WHOLE = Region("all", Rectangle(0.0, 0.0, 0.31, 0.23), on_press="buzz")
+ONE_REGION = SurfaceLayout((WHOLE,), {"buzz": Buzz(level=14.0)}, elsewhere=None)
+
+
+def spread(count: int, *, above: int = 0) -> Mapping[int, Position]:
+    """Fingers 4 cm apart or more, numbered from one on."""
+    places = [(0.04 + 0.055 * (n % 5), 0.035 + 0.05 * (n // 5)) for n in range(count)]
+    return {above + number: at for number, at in enumerate(places, start=1)}
+
+
+@pytest.mark.parametrize("count", [10, 20])
+@in_virtual_time
+async def test_all_fingers_of_a_region_feel_its_effect(count: int) -> None:
+    """In one layer of eight, within the time of an answer; a further one is refused and counted."""
+    async with fingers_on(table(), ONE_REGION) as fingers:
+        fingers.at = {**spread(count)}
+        await fingers.hold(0.4)
+        applied = fingers.applied[-1]
+        assert {each.contact.key.id for each in applied.targets} == fingers.at.keys()
+        assert {each.content for each in applied.targets} == {"buzz"}
+        assert {each.verdict for each in applied.targets} <= {"own", "mixed", "shared"}
+        assert len(applied.contents) == 1
+        levels = fingers.levels_db_sl()
+        assert levels.keys() == fingers.at.keys()
+        assert min(levels.values()) > 5
+        assert applied.targets[0].level_db_sl is not None
+        if count == 20:
+            fingers.must_be_felt = False
+            fingers.at[21] = (0.15, 0.21)
+            await fingers.hold(0.1)
+            assert fingers.controller.cycle.rejects.counts["too_many"] >= 1
+            assert len(fingers.applied[-1].contacts) == 20
+
+
+@pytest.mark.parametrize("what", ["stop", "lift"])
+@in_virtual_time
+async def test_ten_moving_fingers_with_slow_answers_starve_nothing(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 0.4 s each: heartbeats as ever, and silence as soon as at rest; nothing plays after it."""
+    loop = asyncio.get_running_loop()
+    async with fingers_on(table(), ONE_REGION, breaks="touch") as fingers:
+        asked, rest = answers_take(monkeypatch, 0.4), spread(10)
+
+        def move(since: float) -> None:
+            fingers.at = {id: (x + 0.03 * since, y) for id, (x, y) in rest.items()}
+
+        await fingers.hold(1.5, move)
+        assert len(asked) >= 3
+        assert fingers.applied
+        feeding = fingers.far_end.times("Ping", "Set", "Commit")
+        assert max(later - sooner for sooner, later in pairwise(feeding)) <= HEARTBEAT + 0.01
+        begin, count = loop.time(), len(fingers.committed)
+        if what == "stop":
+            fingers.witness.operator_command(begin, "stop")
+            stopped = await fingers.controller.stop()
+            assert all(each.is_confirmed for each in stopped.values())
+            assert loop.time() - begin < 0.02
+        else:
+            fingers.at = {}
+            await fingers.hold(0.02)
+            assert fingers.committed[count][2] == ()
+            assert fingers.committed[count][0] - begin < 0.005
+        await fingers.hold(1.0)
+        assert fingers.levels() == {"main": (0.0,) * 4}
+        assert len(fingers.committed) <= count + 1
+
+
+@in_virtual_time
+async def test_a_thread_that_cannot_start_is_asked_for_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the system has no thread left all is silent, and felt again once there is one."""
+    async with fingers_on(table(), LAYOUT, breaks="touch", at={1: LEFT}, held=0.3) as fingers:
+
+        def exhausted(*_: object) -> None:
+            raise RuntimeError("can't start new thread")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(type(asyncio.get_running_loop()), "run_in_executor", exhausted)
+            fingers.at[2] = RIGHT
+            await fingers.hold(0.3)
+            assert fingers.levels() == {"main": (0.0,) * 4}
+        await fingers.hold(0.4)
+        assert said(fingers) == {1: None, 2: None}
+
+
+ENABLED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
+
+
+def states(chain: Chain) -> set[str]:
+    """The states of all amplifiers."""
+    return {end.state for end in chain.far_ends}
+
+
+@in_virtual_time
+async def test_a_touch_while_arming_ends_is_felt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its set may be on the wire when the amplifiers are armed and what played is forgotten."""
+    async with set_running() as chain:
+        await chain.controller.disarm()
+        arm = chain.controller.group.arm
+
+        async def armed_late() -> None:
+            await arm()
+            await chain.leave(0, FINGER)
+
+        monkeypatch.setattr(chain.controller.group, "arm", armed_late)
+        await chain.controller.arm()
+        await chain.hold(0.1, down=[FINGER])
+        assert states(chain) == {ENABLED}
+        assert chain.applied[-1].contents
+
+
+@pytest.mark.parametrize("kind", ["Set", "Commit", "Ping"])
+@in_virtual_time
+async def test_unexpected_exception_stops_all(kind: str) -> None:
+    """A bug anywhere, between stage and commit too, leaves nothing vibrating."""
+    async with set_running("a", "b") as chain:
+        wire = chain.controller.amplifiers["b"].line.wire
+        request = wire.request
+
+        def fail(address: int, name: str, values: Values, **more: bool) -> bytes:
+            if name == kind:
+                raise ZeroDivisionError("a bug")
+            return request(address, name, values, **more)
+
+        wire.request = fail  # type: ignore[method-assign]
+        await chain.hold(0.1, down=[FINGER])
+        running, chain.running = chain.running, None
+        with pytest.raises(ZeroDivisionError):
+            await running  # type: ignore[misc]
+        assert states(chain) == {STOPPED}
+        assert chain.controller.group.state is GroupState.STOPPED
+
+
+@in_virtual_time
+async def test_arm_arms_all_anew_when_one_no_longer_is() -> None:
+    """One that another program has disarmed plays again, in sessions of which none was held."""
+    async with set_running("a", "b", breaks="state") as chain:
+        held = {end.amplifier.session for end in chain.far_ends}
+        chain.far_ends[0].obey("Disarm", {"ramp": 0}, asyncio.get_running_loop().time())
+        await chain.controller.arm()
+        assert states(chain) == {ENABLED}
+        assert held.isdisjoint({end.amplifier.session for end in chain.far_ends})
+
+
+@in_virtual_time
+async def test_incomplete_set_is_silenced_before_the_next() -> None:
+    """A lift aborts the wait for commits, and a finger comes before silence: silence goes first.
+
+    Some amplifiers may play the aborted set and others not, which is another pattern. The heartbeat
+    that is due meanwhile waits for this silence.
+    """
+    async with set_running("a", "b") as chain:
+        await asyncio.sleep(0.02)  # the heartbeat is due 50 ms after the first
+        for end in chain.far_ends:
+            end.delay(0.02)
+        chain.put(FINGER)
+        await asyncio.sleep(0.025)  # staged after 20 ms, and the commits wait for their replies
+        assert [len(end.requests("Commit")) for end in chain.far_ends] == [1, 1]
+        chain.put()
+        chain.put(OTHER)
+        await chain.hold(0.2, down=[OTHER])
+        for end in chain.far_ends:
+            after_arming, *sent = [
+                name for name in end.names() if name in ("Set", "Commit", "Silence")
+            ]
+            assert after_arming == "Silence"
+            assert sent == ["Set", "Commit", "Silence", "Set", "Commit"]
+            commit, silence = end.times("Commit")[0], end.times("Silence")[1]
+            assert not [time for time in end.times("Ping") if commit <= time <= silence]
+
+
+@in_virtual_time
+async def test_no_plan_fails_while_an_amplifier_is_identified_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A stop finds all closed, one by a lost line, and the other tells no capabilities any more.
+
+    The finger that rests is planned for meanwhile, and felt once both are open again and armed.
+    """
+    async with set_running("a", "b") as chain:
+        chain.far_ends[1].fault("unplug")
+        await chain.hold(0.5)
+        with pytest.raises(LinkError):
+            await chain.controller.open()
+        known, other = chain.far_ends
+
+        def refuse(name: str, values: Values) -> None:
+            if name == "GetCaps":
+                raise Refusal("as told", "WRONG_STATE")
+
+        known.lie(refuse)
+        await chain.controller.stop_all()
+        await chain.hold(0.5, down=[FINGER])
+        assert not [each for each in caplog.records if "plan failed" in each.getMessage()]
+        known.answer = lambda name, values: None
+        other.recover()
+        await chain.controller.open()
+        await chain.controller.clear()
+        await chain.controller.arm()
+        await chain.hold(0.1)
+        assert any(known.levels)
+
+
+@pytest.mark.parametrize(
+    ("count", "is_stopped", "logged"), [(2, False, []), (1000, True, ["ERROR"])]
+)
+@in_virtual_time
+async def test_close_waits_for_zero_then_stops(
+    caplog: pytest.LogCaptureFixture, count: int, is_stopped: bool, logged: list[str]
+) -> None:
+    """Delayed levels are read again; an amplifier that keeps one is stopped, which is logged."""
+    left = count
+
+    def lag(name: str, values: Values) -> Values | None:
+        nonlocal left
+        if name == "Disarm":
+            chain.far_end.obey(name, values, asyncio.get_running_loop().time())
+        if left <= 0 or "Disarm" not in chain.far_end.names() or name == "Stop":
+            return None
+        left -= 1
+        return {**chain.far_end.status(), "levels": [3000, 0, 0]}
+
+    caplog.set_level(logging.INFO)
+    async with set_running(breaks="silent") as chain:
+        chain.far_end.answer = lag
+    assert bool(chain.far_end.requests("Stop")) is is_stopped
+    assert not chain.far_end.is_open
+    assert [record.levelname for record in caplog.records] == logged
+
+
+@in_virtual_time
+async def test_error_of_opening_names_the_amplifier_that_cannot_be_reached() -> None:
+    """By a line that cannot be opened, or by no reply; not those that were open before."""
+    async with set_chain("a", "b") as chain:
+        await chain.controller.open()
+        chain.far_ends[1].fault("drop", toward="amplifier")
+        await chain.controller.release()
+        with pytest.raises(LinkError) as mute:
+            await chain.controller.open()
+        chain.far_ends[1].fault("unplug")
+        with pytest.raises(LinkError) as gone:
+            await chain.controller.open()
+    assert (mute.value.lost, gone.value.lost) == (("b",), ("b",))
+
+
+@in_virtual_time
+async def test_error_of_opening_names_the_amplifiers_of_a_line() -> None:
+    """All that share a line which cannot be opened, as a CAN bus; not one on another line."""
+    async with set_chain("a", "b", "c") as chain:
+        line = chain.controller.urls["b"]
+        chain.far_ends[1].fault("unplug")
+        chain.controller.urls["c"] = f"{line}&address=2"
+        with pytest.raises(LinkError) as gone:
+            await chain.controller.open()
+    assert gone.value.lost == ("b", "c")
+
+
+@in_virtual_time
+async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
+    """Other names, or fewer channels; nothing stays open."""
+    async with set_chain() as chain:
+        rig, urls = chain.far.bench.rig, chain.far.urls
+        wiring = {**rig.wiring, "NE": Channel("main", 3)}
+        for changed, given, problem in (
+            (rig, {"other": "sim://"}, r"main.*other"),
+            (replace(rig, wiring=wiring), urls, r"ERA NE .*0 to 2 on amplifier main, got 3; .*rig"),
+        ):
+            with pytest.raises(InputError, match=problem):
+                await Controller(
+                    changed,
+                    chain.table,
+                    lines=Lines,
+                    intent_source=BuzzNewestContact(),
+                    timing=SetTiming(),
+                    urls=given,
+                ).open()
+            assert not chain.far_end.is_open
+
+
+@in_virtual_time
+async def test_open_refuses_a_table_without_playable_frequencies() -> None:
+    """With the bands of amplifier and table; nothing stays open."""
+    table, wire = small_table(), Wire("serial")
+    given: dict[str, Any] = {"capabilities": {"frequency_min": 8000}, "timing": Timing(table)}
+    async with Chain.on(wire, small_problem().rig, table, **given) as chain:
+        with pytest.raises(InputError, match=r"60 to 250 Hz.*400-500"):
+            await chain.controller.open()
+        assert chain.controller.group.state is GroupState.CLOSED
+        assert not chain.far_end.is_open

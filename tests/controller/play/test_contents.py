@@ -1,0 +1,612 @@
+"""A modulated content beside a steady one, over the wire at the fingertips.
+
+Limits of amplifiers over several contents: who is lowered, and that the sum is within.
+
+Courses in virtual time: what channels play of them, piece after piece, over the wire.
+"""
+
+import asyncio
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from scipy.signal import hilbert
+
+from chain import FINGER, OTHER, Chain, set_running
+from controller.content.pattern import Pattern, Transient
+from controller.effects.effect import Region
+from controller.effects.kinds import Buzz, Click, File
+from controller.effects.layout import SurfaceLayout
+from controller.play.intent import CLICK, HapticIntent, Pulse, Target
+from controller.play.layer_contents import Content, LayerContent, Selection
+from controller.play.layers import Layers, Sets
+from controller.play.routing import PlaybackCapabilities
+from controller.play.selection import Chooser, Selector
+from controller.sources.touch import Contact, ContactKey
+from model.answer.answer import Layer
+from model.answer.answer_report import Timing
+from model.answer.stimulus import Course, Placement
+from model.config.fields import Rectangle
+from model.vibration import Tone
+from plates import smooth_rig
+from several_fingers import ABOVE, LEFT, RIGHT, Fingers, chosen_for, fingers_on, playable, table
+from virtual_lines import in_virtual_time
+
+LAYOUT = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="rough"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="smooth"),
+    ),
+    {"rough": Buzz(level=14.0, modulation=20.0), "smooth": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+def depth_of(fingers: Fingers, id: str) -> float:
+    """How deep the envelope at a finger comes and goes 20 times a second, 1 for to zero."""
+    now, bench = asyncio.get_running_loop().time(), fingers.far.bench
+    bench.advance(now)
+    record = bench.fingers.felt(now - 0.5, now)
+    envelope = np.abs(hilbert(record[id].accelerations @ record[id].weights))[200:-200]
+    times = np.arange(len(envelope)) / bench.sample_rate
+    part = envelope * np.hanning(len(envelope))
+    return float(2 * abs((part * np.exp(-2j * np.pi * 20.0 * times)).sum()) / part.sum())
+
+
+@in_virtual_time
+async def test_a_modulated_content_beats_at_its_own_finger_and_at_no_other() -> None:
+    """Of its envelope all comes and goes 20 times a second; that of the other hardly does."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5) as fingers:
+        applied = fingers.applied[-1]
+        assert len(applied.contents) == 4
+        first, second = applied.targets
+        voices = [one.content for one in applied.contents.values()]
+        of_first = sorted(each.frequency or 0.0 for each in voices if each.key[0].id == 1)
+        assert first.frequency == of_first[1]
+        assert np.diff(of_first).tolist() == [20.0, 20.0]
+        assert 0.8 < depth_of(fingers, "1") < 1.3
+        assert depth_of(fingers, "2") < 0.35
+        assert second.verdict == "own"
+
+
+@in_virtual_time
+async def test_a_modulated_content_is_steady_where_layers_are_few() -> None:
+    """Two contents of four layers leave one for a click; a lone one takes three."""
+    async with fingers_on(table(), LAYOUT, layers=4, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
+        assert len(fingers.applied[-1].contents) == 2
+        del fingers.at[2]
+        await fingers.hold(0.31)  # after 0.3 s phases would agree by chance
+        fingers.at[1] = (LEFT[0] - 0.02, LEFT[1])
+        await fingers.hold(1.0)
+        assert len(fingers.applied[-1].contents) == 3
+        # Its carrier has played before: side bands join it on the amplifier's clock.
+        assert 0.8 < depth_of(fingers, "1") < 1.3
+
+
+@in_virtual_time
+async def test_a_click_without_a_layer_is_said_until_one_is_free() -> None:
+    """Side bands and a click of 0.15 s take all four: the next click, 60 ms later, waits."""
+    regions = (
+        LAYOUT.regions[0],
+        replace(LAYOUT.regions[1], on_press="click"),
+        Region("above", Rectangle(0.0, 0.13, 0.3, 0.09), on_press="click"),
+    )
+    effects = {**LAYOUT.effects, "click": Click(level=14.0, duration=0.15)}
+    layout = replace(LAYOUT, regions=regions, effects=effects)
+    async with fingers_on(table(), layout, layers=4, at={1: LEFT}, held=0.5) as fingers:
+        fingers.at |= {2: RIGHT, 3: ABOVE}
+        await fingers.hold(0.12)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert (felt[1], felt[2]) == (None, None)
+        assert felt[3] is not None
+        assert "4 contents" in felt[3]
+        await fingers.hold(0.06)
+        felt = {each.contact.key.id: each.held_back for each in fingers.applied[-1].targets}
+        assert felt == {1: None, 3: None}
+
+
+@in_virtual_time
+async def test_a_slide_to_another_band_keeps_the_beat() -> None:
+    """Carrier and side bands change their frequencies together, in one phase at the finger."""
+    west = Region("west", Rectangle(0.0, 0.0, 0.17, 0.12), on_press="rough", on_move="rough")
+    east = Region("east", Rectangle(0.17, 0.0, 0.13, 0.12), on_press="rough", on_move="rough")
+    bands = replace(west, band=(200.0, 300.0)), replace(east, band=(100.0, 160.0))
+    async with fingers_on(
+        table(), replace(LAYOUT, regions=bands), at={1: LEFT}, held=0.5
+    ) as fingers:
+        for x in np.linspace(LEFT[0], RIGHT[0], 8):
+            fingers.at = {1: (float(x), LEFT[1])}
+            await fingers.hold(0.08)
+        await fingers.hold(1.0)
+        assert max(one.content.frequency for one in fingers.applied[-1].contents.values()) < 200
+        assert 0.8 < depth_of(fingers, "1") < 1.3
+
+
+@in_virtual_time
+async def test_voices_of_one_finger_end_together() -> None:
+    """When it lifts, all its layers fall silent, and the other's is not touched."""
+    async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.0) as fingers:
+        contents = fingers.applied[-1].contents
+        (own,) = (number for number, one in contents.items() if one.content.key[0].id == 2)
+        before = len(fingers.committed)
+        del fingers.at[1]
+        await fingers.hold(0.3)
+        sets = [layer for _, _, layers in fingers.committed[before:] for layer in layers]
+        ended = {layer.layer for layer in sets if not layer.renew}
+        assert len(ended) == 3
+        assert own not in ended
+        assert [*fingers.applied[-1].contents] == [own]
+
+
+@in_virtual_time
+async def test_a_refused_voice_takes_the_others_of_its_finger_along() -> None:
+    """A carrier without one side band would be another content: the finger feels none.
+
+    It is tried again 50 ms later, when what the other felt before has faded, and no more; the other
+    plays on.
+    """
+    async with fingers_on(table(), LAYOUT, at={2: RIGHT}, held=0.5) as fingers:
+        refused = fingers.refuse(
+            "no more",
+            lambda layers: sum(any(t.level for t in each.tones) for each in layers) >= 3,
+        )
+        fingers.at[1], count = LEFT, len(fingers.committed)
+        await fingers.hold(0.5)
+        assert refused[-1] - refused[0] == pytest.approx(0.05, abs=0.005)
+        assert all(layers for _, _, layers in fingers.committed[count:])  # no Silence
+        targets = {each.contact.key.id: each for each in fingers.applied[-1].targets}
+        assert targets[1].held_back == "no more"
+        assert len([each for each in fingers.applied[-1].targets if each.contact.key.id == 1]) == 1
+        assert {one.content.key[0].id for one in fingers.applied[-1].contents.values()} == {2}
+
+
+def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_layer() -> None:
+    """The click has begun first: what is decided next restarts neither of the two."""
+    contacts = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+    shared = tuple((each, Target(each.key, 14.0)) for each in contacts)
+    click = Target(contacts[0].key, 14.0, pulse=Pulse(0.04, requested_at=0.0))
+    pattern = Layer({"SW": Tone(100.0, 1e-6)})
+    lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
+    alone = ((contacts[0], click),)
+    clicking = Content((contacts[0].key, 0), alone, Placement((LEFT,)), pattern)
+    playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
+    contents = {
+        number: LayerContent(one, pattern, drive={})
+        for number, one in ((1, clicking), (0, lasting))
+    }
+    playing.start(Sets(started=frozenset({0})), contents, 0.0)
+    numbers = playing.numbered([lasting, clicking])
+    assert numbers == {0: lasting, 1: clicking}
+    assert playing.starting(numbers) == []
+
+
+CONTACTS = [Contact(ContactKey("a", n), *at, since=0.0) for n, at in enumerate((LEFT, RIGHT))]
+FREE = playable()
+
+
+def a_selector() -> Selector:
+    """One that has chosen nothing yet."""
+    return Selector(Chooser(table()))
+
+
+def chosen(capabilities: PlaybackCapabilities, *targets: Target) -> Selection:
+    """What is chosen for both fingers."""
+    served = list(zip(CONTACTS, targets, strict=True))
+    return chosen_for(served, capabilities)
+
+
+def sums(found: Selection) -> np.ndarray:
+    """Sum of the levels of all contents at each ERA (eras,)."""
+    return np.array(
+        [
+            sum(each.layer.excitation[era.name].amplitude for each in found.contents) / era.stroke
+            for era in table().eras
+        ]
+    )
+
+
+def within(*, most: float = 1.0, power: float = np.inf) -> PlaybackCapabilities:
+    """Amplifiers that play so much of each stroke, and of the power."""
+    amplitudes = {era.name: most * era.stroke for era in table().eras}
+    return replace(FREE, limits=replace(FREE.limits, amplitudes=amplitudes, power=power))
+
+
+def limited(found: Selection, what: str) -> PlaybackCapabilities:
+    """Amplifiers with 80 % of the level, or of the power's root, that contents take.
+
+    Those of power play up to half of the level, too.
+    """
+    if what == "power":
+        power = float((sums(found) ** 2).sum()) * 0.8**2  # of levels of full stroke
+        return within(most=0.5, power=power)
+    return within(most=0.8 * sums(found).max())
+
+
+def is_used(found: Selection, capabilities: PlaybackCapabilities) -> bool:
+    """Whether contents are within a limit, and take nearly all of it."""
+    limits = capabilities.limits
+    assert limits.amplitudes is not None
+    (share,) = {limits.amplitudes[each.name] / each.stroke for each in table().eras}
+    of_limit = max(sums(found).max() / share, np.linalg.norm(sums(found)) / np.sqrt(limits.power))
+    return bool(0.95 < of_limit < 1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+@pytest.mark.parametrize("modulation", [None, 20.0])
+def test_a_higher_priority_keeps_its_level_within_a_limit(
+    what: str, modulation: float | None
+) -> None:
+    """The other is lowered alone, modulated or not, and promised with what is left."""
+    first = Target(CONTACTS[0].key, 14.0, priority=1)
+    second = Target(CONTACTS[1].key, 14.0, modulation_hz=modulation)
+    free = chosen(FREE, first, second)
+    capabilities = limited(free, what)
+    found = chosen(capabilities, first, second)
+    kept, lowered = found.predictions
+    assert kept.level_db_sl == pytest.approx(14.0, abs=0.2)
+    assert lowered.level_db_sl is not None
+    assert lowered.level_db_sl < 13.0
+    assert is_used(found, capabilities)
+    before = free.predictions[1].promised_contrast_db
+    assert before is not None
+    assert lowered.promised_contrast_db is not None
+    change = lowered.promised_contrast_db - before
+    assert change == pytest.approx(lowered.level_db_sl - 14.0, abs=1.0)
+
+
+def test_who_is_lowered_too_far_is_held_back_by_the_rule() -> None:
+    """What the first content leaves of the amplifiers' level is not enough for the second."""
+    first, second = Target(CONTACTS[0].key, 14.0, priority=1), Target(CONTACTS[1].key, 14.0)
+    content, _ = chosen(FREE, first, second).contents
+    most = max(content.layer.excitation[each.name].amplitude / each.stroke for each in table().eras)
+    found = chosen(within(most=1.02 * most), first, second)
+    kept, held_back = found.predictions
+    assert kept.level_db_sl == pytest.approx(14.0, abs=0.3)
+    assert held_back.verdict == "held back"
+    assert held_back.held_back
+
+
+def test_contents_that_a_limit_leaves_unfelt_are_held_back() -> None:
+    """With 40 dB less than 14 dB SL takes; a level below 0 dB SL from the start is kept."""
+    wanted = [Target(each.key, 14.0) for each in CONTACTS]
+    most = 0.01 * sums(chosen(FREE, *wanted)).max()
+    found = chosen(within(most=most), *wanted)
+    assert found.contents == ()
+    assert all(
+        "the limits of the amplifiers" in (each.held_back or "") for each in found.not_served
+    )
+    assert len(found.not_served) == 2
+    quiet = chosen(FREE, *(replace(each, level_db_sl=-10.0) for each in wanted))
+    assert len(quiet.contents) == 2
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+def test_of_equal_priority_the_louder_content_is_lowered(what: str) -> None:
+    """Max-min: the softer one keeps its level as long as the louder one is above it."""
+    targets = Target(CONTACTS[0].key, 14.0), Target(CONTACTS[1].key, 8.0)
+    capabilities = limited(chosen(FREE, *targets), what)
+    found = chosen(capabilities, *targets)
+    louder, softer = (each.level_db_sl for each in found.predictions)
+    assert softer == pytest.approx(8.0, abs=0.2)
+    assert louder is not None
+    assert 8.0 < louder < 13.5
+    assert is_used(found, capabilities)
+
+
+def test_a_click_is_within_the_power_that_what_lasts_leaves() -> None:
+    """Both at once take no more than the limit; with hardly any left it is held back."""
+    click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
+    intent = HapticIntent((Target(CONTACTS[0].key, 20.0), click))
+    selector = a_selector()
+    free = selector.select(CONTACTS, intent, FREE)
+    lasting = np.linalg.norm(sums(replace(free, contents=free.contents[:1])))
+    for share, count in ((1.3, 2), (1.001, 1)):
+        capabilities = within(power=(share * lasting) ** 2)
+        found = a_selector().select(CONTACTS, intent, capabilities)
+        assert len(found.contents) == count
+        assert (
+            np.linalg.norm(sums(found)) <= share * lasting * (1 + 1e-6) < np.linalg.norm(sums(free))
+        )
+    (held_back,) = found.not_served
+    assert "lift a finger" in str(held_back.held_back)
+
+
+def test_what_a_click_leaves_nothing_for_says_so_and_is_felt_after_it() -> None:
+    """The limits are no cause: without the click they allow it."""
+    click = Target(CONTACTS[1].key, 20.0, pulse=Pulse(0.04, requested_at=0.0))
+    lasting = Target(CONTACTS[0].key, 20.0)
+    alone = a_selector().select(CONTACTS, HapticIntent((click,)), FREE)
+    hardly = within(power=(1.001 * np.linalg.norm(sums(alone))) ** 2)
+    selector = a_selector()
+    selector.select(CONTACTS, HapticIntent((click,)), hardly, now=0.0)
+    both = HapticIntent((lasting, click))
+    (held_back,) = selector.select(CONTACTS, both, hardly, now=0.01).not_served
+    assert held_back.contact == CONTACTS[0]
+    assert "contents of other fingers" in str(held_back.held_back)
+    after = HapticIntent((lasting,))
+    found = selector.select(CONTACTS, after, hardly, now=selector.due)
+    assert (found.not_served, len(found.contents)) == ((), 1)
+
+
+@pytest.mark.parametrize("what", ["level", "power"])
+def test_a_lone_steady_content_is_within_a_limit(what: str) -> None:
+    """It is lowered to the limit, 0.8 of its amplitude, instead of refused by the amplifiers."""
+    target = Target(CONTACTS[0].key, 14.0)
+    intent = HapticIntent((target,))
+    free = a_selector().select(CONTACTS, intent, FREE)
+    most = 0.8 * sums(free).max()
+    capabilities = within(power=0.8**2 * float((sums(free) ** 2).sum()))
+    if what == "level":
+        capabilities = within(most=most)
+    found = a_selector().select(CONTACTS, intent, capabilities)
+    assert sums(found) == pytest.approx(0.8 * sums(free), rel=1e-6)
+    (before,), (after,) = free.predictions, found.predictions
+    assert before.level_db_sl is not None
+    assert after.level_db_sl == pytest.approx(before.level_db_sl + 20 * np.log10(0.8))
+    assert after.promised_contrast_db == pytest.approx(before.promised_contrast_db)
+
+
+FULL = 0.2  # the level that the table's pattern has
+ROUNDING = 1.5e-4  # of a knot and of a status, in full levels
+WAY = 0.002  # s; by which sets come sooner or later, and looks are a millisecond apart
+
+
+@dataclass
+class FeelsCourse:
+    """The first finger feels a course from when it comes on, once or until it lifts."""
+
+    course: Course
+    loops: bool = False
+    tap: Pulse | None = None
+    pulses: dict[float, Pulse] = field(default_factory=dict)
+
+    def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
+        """Return it until its pulse ends."""
+        if not contacts:
+            return HapticIntent((), "no contact on the plate")
+        first = contacts[0]
+        lasts = math.inf if self.loops else self.course.duration
+        pulse = self.pulses.setdefault(first.since, Pulse(lasts, first.since, is_raised=False))
+        if now >= pulse.end:
+            return HapticIntent((), "the course has ended")
+        target = Target(first.key, 20.0, pulse=pulse, course=self.course)
+        if self.tap is None or now >= self.tap.end:
+            return HapticIntent((target,), until=pulse.end)
+        return HapticIntent((target, Target(first.key, 14.0, pulse=self.tap)), until=self.tap.end)
+
+    @property
+    def started_at(self) -> float:
+        """When [s] the only course has started on the amplifiers."""
+        (pulse,) = self.pulses.values()
+        assert pulse.started_at is not None
+        return pulse.started_at
+
+
+# Up in 0.1 s, down to a quarter in 0.4, up again in 0.3, and to silence in 0.4 s.
+WAVE = Course((0.0, 0.1, 0.5, 0.8, 1.2), (0.0, 1.0, 0.25, 1.0, 0.0))
+
+
+async def looked_at(chain: Chain, seconds: float, *down: tuple[int, float, float]) -> np.ndarray:
+    """Times [s] and levels of the first channel, a millisecond apart, while fingers are down."""
+    looks = []
+    for number in range(round(seconds * 1000)):
+        if number % 10 == 0:
+            chain.put(*down)
+        looks.append((asyncio.get_running_loop().time(), chain.far_end.levels[0]))
+        await asyncio.sleep(0.001)
+    return np.array(looks).T
+
+
+def expected(times: np.ndarray, course: Course = WAVE, full: float = FULL) -> np.ndarray:
+    """Levels by the points of a course alone, at times [s] from its start."""
+    return full * np.interp(times, course.times, course.shares, left=0.0, right=0.0)
+
+
+def furthest(
+    times: np.ndarray,
+    levels: np.ndarray,
+    early: float = WAY,
+    late: float = WAY,
+    course: Course = WAVE,
+) -> float:
+    """How far levels are from all that is due from so early [s] on until so late."""
+    shifts = np.arange(-early, late + 1e-9, 0.0005)
+    due = np.array([expected(times - each, course) for each in shifts])
+    return float(np.maximum(due.min(axis=0) - levels, levels - due.max(axis=0)).max())
+
+
+@in_virtual_time
+async def test_a_course_is_played_as_it_is() -> None:
+    """Within the 2 ms of the wire and a step of it: the points lie on knots, which are 10 ms apart.
+
+    It ends by itself, and nothing is left of it.
+    """
+    felt = FeelsCourse(WAVE)
+    async with set_running(knots=32, intent_source=felt) as chain:
+        times, levels = await looked_at(chain, 1.4, FINGER)
+        assert furthest(times - felt.started_at, levels) < ROUNDING
+        pieces = [one.layer for one in chain.far_end.sent()[1:] if not one.is_silent]
+        assert [each.after for each in pieces] == [False, True, True, True, True]
+        assert not chain.refused
+
+
+@in_virtual_time
+async def test_a_course_has_no_gap_while_the_host_is_late() -> None:
+    """By 0.1 s, whenever it has turned: what was sent before goes on on the amplifier."""
+    felt = FeelsCourse(WAVE)
+    async with set_running(knots=32, intent_source=felt) as chain:
+        chain.put(FINGER)
+        await asyncio.sleep(0.02)
+        looks = []
+        for number in range(1300):
+            if number % 105 == 0:
+                chain.turning.clear()
+            if number % 105 == 100:
+                chain.put(FINGER)
+                chain.turning.set()
+            looks.append((asyncio.get_running_loop().time(), chain.far_end.levels[0]))
+            await asyncio.sleep(0.001)
+        chain.turning.set()
+        times, levels = np.array(looks).T
+        assert furthest(times - felt.started_at, levels) < ROUNDING
+
+
+@in_virtual_time
+async def test_a_course_goes_on_where_its_host_was_late_for_longer() -> None:
+    """By 0.6 s, beyond its end by itself: where it would be, also after a tap beside it."""
+    felt = FeelsCourse(Course((0.0, 0.1, 3.0), (0.0, 1.0, 0.5)))
+    async with set_running(knots=32, intent_source=felt, watchdog=2.0) as chain:
+        await looked_at(chain, 0.7, FINGER)
+        chain.turning.clear()
+        _, levels = await looked_at(chain, 0.6, FINGER)
+        assert levels[-1] == 0
+        chain.turning.set()
+        await looked_at(chain, 0.1, FINGER)
+        for _ in range(2):
+            times, levels = await looked_at(chain, 0.4, FINGER)
+            assert furthest(times - felt.started_at, levels, course=felt.course) < ROUNDING
+            felt.tap = Pulse(0.04, times[-1])
+            chain.controller.cycle.request_update()
+            await looked_at(chain, 0.1, FINGER)
+
+
+@in_virtual_time
+async def test_a_course_ends_by_itself_if_its_host_is_gone() -> None:
+    """0.1 s after the last piece that it has sent, along 20 ms: at 0.48 s, half way to the next."""
+    felt = FeelsCourse(Course((0.0, 0.1, 9.0), (0.0, 1.0, 1.0)))
+    async with set_running(knots=32, intent_source=felt, watchdog=2.0) as chain:
+        await looked_at(chain, 0.3, FINGER)
+        chain.turning.clear()
+        times, levels = await looked_at(chain, 0.5, FINGER)
+        times -= felt.started_at
+        assert levels[times < 0.58 - WAY].min() > FULL - 2e-4
+        assert not levels[times > 0.58 + 0.020 + WAY].any()
+        chain.turning.set()
+
+
+@in_virtual_time
+async def test_a_stop_amid_a_course_is_silence() -> None:
+    """What waits on the amplifier does not start."""
+    felt = FeelsCourse(WAVE)
+    async with set_running(knots=32, intent_source=felt) as chain:
+        await looked_at(chain, 0.41, FINGER)  # the third piece waits for the second
+        await chain.operate("stop")
+        _, levels = await looked_at(chain, 0.6, FINGER)
+        assert levels[0] < 1e-4
+        assert not levels.any()
+
+
+@in_virtual_time
+async def test_a_restart_amid_a_course_is_silence_until_it_is_armed_again() -> None:
+    """Then the resting finger feels what is left, where it would be; no old piece is waited for."""
+    felt = FeelsCourse(Course((0.0, 0.1, 5.0), (0.0, 1.0, 0.5)))
+    async with set_running(knots=32, intent_source=felt) as chain:
+        await looked_at(chain, 0.5, FINGER)
+        chain.far_end.fault("reboot", lasts=0.1)
+        _, levels = await looked_at(chain, 0.6, FINGER)
+        assert not levels.any()
+        (refused,) = chain.refused
+        assert "once the cause is gone, clear and arm again" in refused
+        await chain.operate("clear")
+        await chain.operate("arm")
+        times, levels = await looked_at(chain, 0.8, FINGER)
+        assert furthest(times[50:] - felt.started_at, levels[50:], course=felt.course) < ROUNDING
+
+
+@in_virtual_time
+async def test_a_course_begins_anew_without_a_gap() -> None:
+    """Each of its turns is as the first, the seam included, until the finger lifts."""
+    felt = FeelsCourse(Course((0.0, 0.2, 0.37), (0.5, 1.0, 0.5)), loops=True)
+    async with set_running(knots=32, intent_source=felt) as chain:
+        times, levels = await looked_at(chain, 2.0, FINGER)
+        since = (times - felt.started_at)[20:]
+        due = expected(np.mod(since - WAY / 2, 0.37), felt.course)
+        # By hand: 10 ms change it by 0.6 % of full level, and cut that off at its corners.
+        assert np.abs(levels[20:] - due).max() < 0.006
+        await chain.leave(0.025)
+        assert chain.far_end.levels[0] == 0
+
+
+@in_virtual_time
+async def test_what_is_left_of_a_course_goes_on_where_another_finger_joins() -> None:
+    """At the new weights, half of those before, 20 ms later."""
+    felt = FeelsCourse(WAVE)
+    async with set_running(knots=32, intent_source=felt) as chain:
+        chain.table.shared = {"SW": Tone(110.0, 10e-6, math.pi / 2)}
+        times, levels = await looked_at(chain, 0.43, FINGER)
+        joined = times[-1] - felt.started_at
+        times, levels = await looked_at(chain, 1.0, FINGER, OTHER)
+        times -= felt.started_at
+        is_late = times > joined + 0.03
+        # By hand: straight lines of 20 ms, for a while, cut off 0.0044 of its corner at 0.5 s.
+        assert furthest(times[is_late], 2 * levels[is_late]) < 0.0044 + ROUNDING
+        # In between it is led there without falling silent.
+        assert levels[~is_late].min() > 0.9 * expected(np.array([0.5]))[0] / 2
+
+
+@in_virtual_time
+async def test_an_amplifier_without_knots_follows_along_ramps() -> None:
+    """50 ms each: it is never further off than what the course has within one of them.
+
+    That it is coarse is said once.
+    """
+    felt = FeelsCourse(WAVE)
+    async with set_running(intent_source=felt) as chain:
+        times, levels = await looked_at(chain, 1.4, FINGER)
+        assert furthest(times - felt.started_at, levels, 0.05, 0.06) < ROUNDING
+        assert max(levels) > 0.8 * FULL
+        ramps = [each for each in chain.far_end.sent()[1:] if not each.is_silent]
+        assert len(ramps) == pytest.approx(1.2 / 0.05, abs=2)
+
+
+@in_virtual_time
+async def test_all_actuators_have_one_course_times_their_weights() -> None:
+    """On two amplifiers: the one has half the level of the other at every moment."""
+    felt = FeelsCourse(WAVE)
+    async with set_running("main", "side", knots=32, intent_source=felt) as chain:
+        chain.table.excitation = {"SW": Tone(110.0, 20e-6), "NE": Tone(110.0, 10e-6, 1.0)}
+        chain.put(FINGER)
+        for number in range(1300):
+            if number % 10 == 0:
+                chain.put(FINGER)
+            levels = chain.levels()
+            assert levels["side"][1] == pytest.approx(levels["main"][0] / 2, abs=ROUNDING)
+            await asyncio.sleep(0.001)
+
+
+@in_virtual_time
+async def test_a_click_of_a_file_is_felt_beside_what_lasts_of_it() -> None:
+    """In a layer of its own, 0.3 s after the start of the other, within 10 ms.
+
+    What lasts is silent then: by hand, 30 ms before and after the 40 of the click.
+    """
+    pattern = Pattern(0.8, ((0.0, 1.0), (0.8, 1.0)), ((0.0, 0.5),), (Transient(0.3, 1.0, 0.5),))
+    file = File.of(pattern, name="it", level_db_sl=14.0).for_table(table().frequencies)
+    layout = SurfaceLayout(effects={"it": file}, elsewhere="it")
+    async with fingers_on(table(), layout, at={1: LEFT}, held=1.2) as fingers:
+        began = fingers.applied[0].time
+        (short,) = {
+            one.content.targets[0][1].pulse
+            for report in fingers.applied
+            for one in report.contents.values()
+            if one.content.key[1] == CLICK
+        }
+        assert short is not None
+        assert short.started_at - began == pytest.approx(0.3, abs=0.01)
+        (lasting,) = {
+            layer.layer for _, _, layers in fingers.committed for layer in layers if layer.after
+        }
+        times, levels = list[float](), list[int]()
+        for time, _, layers in fingers.committed:
+            for layer in layers:
+                onset = layer.commands[0].onset if layer.commands else None
+                if layer.layer == lasting and onset is not None:
+                    since = times[-1] if layer.after else time
+                    steps = 1e-4 * onset.step * np.arange(1, len(onset.knots) + 2)
+                    times += (since + steps).tolist()
+                    levels += [each for each, _ in onset.knots] + [layer.commands[0].level]
+        due = {0.20: 1.0, 0.26: 1.0, 0.29: 1 / 3, 0.31: 0.0, 0.33: 0.0, 0.35: 1 / 3, 0.4: 1.0}
+        played = np.interp([*due], np.array(times) - times[0] + 0.01, levels) / max(levels)
+        assert played == pytest.approx([*due.values()], abs=0.01)

@@ -1,0 +1,548 @@
+"""Files at fingers in virtual time: beside other effects and each other, at the edge.
+
+How far programs of content move magnets, and heat coils, by what reaches the simulated plate.
+
+Content that is as strong as rigs allow, at the frequencies at which magnets move most: each program
+is played over a wire in virtual time, and its outputs move the plate of `magnets`.
+
+What reaches fingers that it is not for: regions where others are not noticed, and leaks.
+"""
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chain import Chain
+from controller.content.pattern import Curve, Pattern, Transient, sharpness_of
+from controller.daemon.messages import PlateView
+from controller.effects.effect import Effect, Region
+from controller.effects.kinds import Buzz, Click, File, Texture
+from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
+from controller.sources.touch import Contact, ContactKey
+from exciters import Magnets, Outputs
+from long_form import shortly
+from model.answer.answer_report import Timing
+from model.answer.stimulus import STRONGEST
+from model.arrays import ComplexArray
+from model.config.fields import Circle, Rectangle
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig, parse_rig
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
+from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
+from several_fingers import table as several_fingers_table
+from sim.far_ends.wire_assignment import Wire
+from virtual_lines import in_virtual_time, run_virtual
+
+SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))
+SHARPER = Pattern(1.5, SWELL.intensity, ((0.0, 0.7),))
+FADING = Pattern(1.0, ((0.0, 1.0), (0.2, 0.3), (0.5, 1.0), (1.0, 0.5)), ((0.0, 0.1),))
+
+
+def file_of(pattern: Pattern, of: LocalizationTable, *, loop: bool = False) -> File:
+    """A file at 14 dB SL."""
+    return File.of(pattern, name="it", level_db_sl=14.0, loop=loop).for_table(of.frequencies)
+
+
+@in_virtual_time
+async def test_of_a_buzz_and_a_file_the_later_is_felt_then_what_is_left_of_the_other() -> None:
+    """By hand: 0.4 s into the file it has 12.8 dB SL, after a buzz of half a second 11.6 at 1.3 s.
+
+    The buzz of the finger that rests goes on once both are over.
+    """
+    short, file = Buzz(level=14.0, duration=0.5), file_of(SWELL, several_fingers_table())
+    layout = SurfaceLayout(effects={"it": file, "short": short, "buzz": Buzz()}, elsewhere="buzz")
+    async with fingers_on(several_fingers_table(), layout, at={1: LEFT}, held=0.5) as fingers:
+
+        def felt() -> tuple[str | None, float]:
+            (target,) = fingers.applied[-1].targets
+            return target.content, 20 * np.log10(max(fingers.far_end.levels))
+
+        fingers.play("it")
+        await fingers.hold(0.41)
+        name, before = felt()
+        assert name == "it"
+        await fingers.hold(0.3)
+        fingers.play("short")
+        await fingers.hold(0.3)
+        assert felt()[0] == "short"
+        await fingers.hold(0.3)
+        name, after = felt()
+        assert (name, after - before) == ("it", pytest.approx(11.6 - 12.8, abs=0.15))
+        await fingers.hold(0.5)
+        assert felt()[0] == "buzz"
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.1), (0.01, 0.1), (0.001, 0.001), (0.3048, 0.2286)])
+@in_virtual_time
+async def test_a_file_has_its_level_at_the_edge_and_in_corners(at: tuple[float, float]) -> None:
+    """14 dB SL as a mean over the tip where it has risen slowly; nothing is refused."""
+    pattern = Pattern(2.0, ((0.0, 0.01), (0.3, 1.0), (2.0, 1.0)), ((0.0, 0.5),))
+    layout = SurfaceLayout(
+        effects={"it": file_of(pattern, several_fingers_table())}, elsewhere="it"
+    )
+    async with fingers_on(several_fingers_table(), layout, at={1: at}, held=1.0) as fingers:
+        ((_, weights, own, _),) = fingers.reached()
+        level = 20 * np.log10(own @ weights / weights.sum())
+        assert level == pytest.approx([14.0], abs=0.1)
+        assert not fingers.refused
+
+
+@cache
+def eight() -> LocalizationTable:
+    """Of the example with eight ERAs."""
+    rig = load_rig(Path(__file__).parents[3] / "examples" / "eight_eras.yaml")
+    return build_table(rig, frequencies=np.arange(60.0, 321.0, 20.0), drive_mode="phased")
+
+
+@in_virtual_time
+async def test_three_fingers_feel_three_files_apart() -> None:
+    """Each at its own frequency with the contrast that it is promised, turn after turn.
+
+    The witness finds every piece of each on the wire where the one before ends.
+    """
+    plate, files = eight().plate, (SWELL, SHARPER, FADING)
+    places = [(0.2, 0.25), (0.8, 0.2), (0.4, 0.85)]
+    at = {n: (x * plate.length, y * plate.width) for n, (x, y) in enumerate(places, start=1)}
+    layout = SurfaceLayout(
+        tuple(Region(f"at{n}", Circle(*each, 0.03), on_press=f"f{n}") for n, each in at.items()),
+        {f"f{n}": file_of(each, eight(), loop=True) for n, each in enumerate(files, start=1)},
+        elsewhere=None,
+    )
+    async with Fingers.armed(
+        Wire("serial", speed=921_600, unpluggable=True),
+        load_rig(Path(__file__).parents[3] / "examples" / "eight_eras.yaml"),
+        eight(),
+        intent_source=EffectPlayer(layout),
+        timing=Timing(eight()),
+    ) as fingers:
+        fingers.at = at
+        await fingers.hold(0.6)
+        own, foreign = np.full((2, 3), 1e-9)
+        for _ in range(50):
+            await fingers.hold(0.03)
+            for id, weights, lasting, others in fingers.reached(over=STRONGEST):
+                power = ((lasting @ weights / weights.sum()) ** 2).max(initial=0)
+                own[id - 1] = max(own[id - 1], power)
+                loudest = (others**2).sum(axis=0).max(initial=0)
+                foreign[id - 1] = max(foreign[id - 1], loudest)
+        targets = sorted(fingers.applied[-1].targets, key=lambda each: each.contact.key.id)
+        promised = np.array([each.promised_contrast_db for each in targets])
+        assert len({each.frequency for each in targets}) == len(targets) == 3
+        assert (10 * np.log10(own / foreign) > promised).all()
+        assert not fingers.refused
+
+
+_logger = logging.getLogger(__name__)
+
+ALL = 60.0
+"""More than any rig gives [dB SL]."""
+
+PLACES = ((0.3, 0.2), (0.1, 0.1), (0.3, 0.07))
+
+
+@cache
+def rig(name: str) -> Rig:
+    """The weekend's as it is, down to 60 Hz, or with the larger exciters at all that they bear."""
+    path = Path(__file__).parents[3] / "examples/weekend/rig.yaml"
+    text, reach = path.read_text(), "frequency: [100 Hz, 300 Hz]"
+    assert reach in text
+    if name == "large":
+        text = text.replace("DAEX25CT-4", "DAEX25FHE-4").replace("power: 1 W", "power: 24 W")
+    low = {"weekend": 90, "low": 60, "large": 40}[name]
+    return parse_rig("rig.yaml", text.replace(reach, f"frequency: [{low} Hz, 300 Hz]"))
+
+
+@cache
+def table(name: str, frequencies: tuple[float, ...]) -> LocalizationTable:
+    """Of these frequencies [Hz] alone, so that nothing else is chosen."""
+    return build_table(rig(name), frequencies=np.array(frequencies), drive_mode="phased")
+
+
+@cache
+def magnets(name: str) -> Magnets:
+    """Those of a rig."""
+    return Magnets(rig(name))
+
+
+def swinging(hertz: float, *, seconds: float = 0.8, is_square: bool = False) -> Curve:
+    """Intensity that comes and goes as a cosine, or as a square."""
+    times = np.arange(0.0, seconds, 0.0025)
+    wave = np.cos(2 * np.pi * hertz * times)
+    values = ((np.sign(wave) if is_square else wave) + 1) / 2
+    return tuple(zip(times.tolist(), values.tolist(), strict=True))
+
+
+def file(
+    curve: Curve, hertz: float, taps: Sequence[float] = (), *, to: float | None = None
+) -> Effect:
+    """A file of this intensity and of taps at times [s], all that is played; to: swept."""
+    first, last = sharpness_of(np.array([hertz, to or hertz])).tolist()
+    sharpness = ((0.0, first), (0.8, last))
+    pattern = Pattern(1.0, curve, sharpness, tuple([Transient(at, 1.0, first) for at in taps]))
+    return File.of(pattern, name="it", level_db_sl=ALL)
+
+
+@dataclass(frozen=True)
+class Program:
+    """What fingers feel, by place, until a time [s], and how that ends.
+
+    hertz: of the table; shakes: how often a second the first finger goes 8 mm to and fro.
+    """
+
+    rig: str
+    hertz: tuple[float, ...]
+    effects: tuple[Effect, ...]
+    until: float = 0.9
+    end: str = "lift"
+    shakes: float = 0.0
+
+    async def play(self) -> None:
+        """Play it from arming to closing."""
+        plate, chosen = rig(self.rig), table(self.rig, self.hertz)
+        at = dict(enumerate(PLACES[: len(self.effects)]))
+        layout = SurfaceLayout(
+            tuple(Region(f"{n}", Circle(*each, 0.03), on_press=f"e{n}") for n, each in at.items()),
+            {f"e{n}": each.for_table(chosen.frequencies) for n, each in enumerate(self.effects)},
+            elsewhere=None,
+        )
+        wire = Wire("serial", speed=921_600, unpluggable=True)
+        source, timing = EffectPlayer(layout), Timing(chosen)
+        async with Chain.armed(
+            wire, plate, chosen, intent_source=source, timing=timing, capabilities={"layers": 8}
+        ) as chain:
+            chain.must_be_felt, chain.at = False, at
+            x, y = at[0]
+
+            def way(since: float) -> None:
+                away = 0.004 * np.sin(2 * np.pi * self.shakes * since)
+                chain.at = {**at, 0: (x + away, y)}
+
+            await chain.hold(self.until, way)
+            if self.end == "stop":
+                await chain.operate("stop")
+            elif self.end == "trip":
+                chain.far_end.fault("over_current")
+            else:
+                chain.at = {}
+            await chain.hold(0.15)
+
+    def volts(self) -> ComplexArray:
+        """What exciters get."""
+        with Outputs.recorded() as outputs:
+            run_virtual(self.play())
+        return outputs.volts(len(rig(self.rig).eras))
+
+
+TAPS = tuple(np.arange(0.1, 0.8, 0.06).tolist())
+
+PROGRAMS = {
+    "steady, 70 Hz": Program("low", (70.0,), (Buzz(level=ALL),)),
+    "steady, 40 Hz, large": Program("large", (40.0,), (Buzz(level=ALL),)),
+    "swings 30 times a second, 100 Hz": Program(
+        "weekend", (100.0,), (file(swinging(30, is_square=True), 100),)
+    ),
+    "swings 34 times a second, 110 Hz asked": Program(
+        "weekend", (90.0, 100.0, 110.0, 120.0), (file(swinging(34), 110),)
+    ),
+    "swings 45 times a second, 120 Hz": Program("low", (120.0,), (file(swinging(45), 120),)),
+    "swings 20 times a second, 60 Hz, large": Program(
+        "large", (60.0,), (file(swinging(20, is_square=True), 60),)
+    ),
+    "swings 10 times a second, 50 Hz, large": Program(
+        "large", (50.0,), (file(swinging(10, is_square=True), 50),)
+    ),
+    "taps 60 ms apart, 60 Hz, large": Program("large", (60.0,), (file((), 60, TAPS),)),
+    "taps 60 ms apart, 100 Hz": Program("weekend", (100.0,), (file((), 100, TAPS),)),
+    "swept through the resonance": Program(
+        "low", (60.0, 70.0, 80.0, 90.0), (file(swinging(5), 60, to=100),)
+    ),
+    "two files that beat": Program(
+        "low", (70.0, 100.0), (file(swinging(25), 70), file(swinging(30), 100))
+    ),
+    "a file, a buzz and taps": Program(
+        "low",
+        (60.0, 90.0, 120.0),
+        (file(swinging(15), 90), Buzz(level=ALL), file((), 120, TAPS)),
+    ),
+    "modulated, 100 Hz": Program(
+        "low", (70.0, 80.0, 90.0, 100.0, 110.0, 120.0, 130.0), (Buzz(level=ALL, modulation=25),)
+    ),
+    "texture, shaken": Program("low", (90.0,), (Texture(level=ALL),), shakes=8.0),
+    "steady, 190 Hz, large": Program("large", (190.0,), (Buzz(level=ALL),), until=0.3),
+    "click, 80 Hz": Program("low", (80.0,), (Click(level=ALL),), until=0.2),
+    "stopped amid an onset": Program("low", (70.0,), (Buzz(level=ALL),), until=0.06, end="stop"),
+    "failing amid an onset": Program("large", (60.0,), (Buzz(level=ALL),), until=0.09, end="trip"),
+    "stopped amid swings": Program(
+        "weekend", (100.0,), (file(swinging(30), 100),), until=0.27, end="stop"
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    shortly(
+        PROGRAMS,
+        {
+            "swings 30 times a second, 100 Hz",
+            "taps 60 ms apart, 60 Hz, large",
+            "two files that beat",
+            "failing amid an onset",
+            "steady, 190 Hz, large",
+        },
+    ),
+)
+def test_programs_keep_magnets_within_their_excursion(name: str) -> None:
+    """By all that the amplifier plays of them; no coil takes more than it bears, in any cycle."""
+    program = PROGRAMS[name]
+    volts, solved = program.volts(), magnets(program.rig)
+    moved = solved.moved(volts)
+    limit = rig(program.rig).eras[0].excursion
+    share = np.abs(moved).max() / limit
+    heat = solved.heat(volts, moved).max()
+    _logger.info("%s: %.2f of x_max, %.2g W", name, share, heat)
+    assert 0.15 < share < 1.01
+    assert heat < {"weekend": 10.0, "low": 10.0, "large": 24.0}[program.rig]
+
+
+UPPER = Rectangle(0.0, 0.13, 0.3, 0.09)
+LAYOUT = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="right"),
+        Region("above", UPPER, is_protected=True),
+    ),
+    {"left": Buzz(level=16.0), "right": Buzz(level=14.0), "above": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+SHARED = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
+        Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
+    ),
+    {**LAYOUT.effects, "tick": Click(level=14.0)},
+    elsewhere=None,
+)
+AT_ONE_CONTENT = {1: (0.138, 0.06), 2: (0.165, 0.06)}
+
+
+@in_virtual_time
+async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
+    """Both contents are silent while it rests, each with its reason, and play once it has lifted.
+
+    16 dB SL would need 26 dB of contrast there, of which four ERAs promise fewer than 20.
+    """
+    async with fingers_on(
+        several_fingers_table(), LAYOUT, breaks="touch", at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
+    ) as fingers:
+        assert fingers.levels_db_sl()[3] < -10
+        silenced = fingers.silenced[-1]
+        assert {each.contact.key.id for each in silenced.targets} == {1, 2}
+        view = PlateView(lambda key: "effect", silenced.contacts, silenced)
+        for status in view.contact_statuses():
+            assert (status.verdict == "held back") is (status.id != 3)
+            assert ("protected" in (status.held_back or "")) is (status.id != 3)
+        del fingers.at[3]
+        await fingers.hold(1.0)
+        assert {each.contact.key.id for each in fingers.applied[-1].targets} == {1, 2}
+        assert fingers.levels_db_sl()[1] > 14
+        fingers.at[3] = ABOVE
+        await fingers.hold(1.0)
+        assert fingers.levels_db_sl()[3] < -10
+
+
+@pytest.mark.parametrize(
+    ("effect", "is_played"),
+    [(Buzz(level=0.5), True), (Buzz(level=12.0), False), (Click(level=20.0), False)],
+)
+@in_virtual_time
+async def test_one_content_beside_a_protected_finger(effect: Buzz | Click, is_played: bool) -> None:
+    """Played if at most -10 dB SL reach that finger, of a click over its duration; else silent."""
+    layout = replace(LAYOUT, effects={**LAYOUT.effects, "left": effect})
+    async with fingers_on(
+        several_fingers_table(), layout, breaks="touch", at={3: ABOVE}, held=0.2
+    ) as fingers:
+        fingers.at[1] = LEFT
+        await fingers.hold(1.0)
+        assert bool(fingers.applied) is is_played
+        assert fingers.levels_db_sl()[3] < -10
+        if is_played:
+            (applied,) = fingers.applied
+            ((quiet,),) = applied.quiet_levels.values()
+            assert fingers.levels_db_sl()[3] < quiet < -10
+
+
+@in_virtual_time
+async def test_a_protected_finger_feels_its_own_effect() -> None:
+    """That of the others is held back for it, whatever their priorities."""
+    above = Region("above", UPPER, on_press="above", is_protected=True, priority=0)
+    left = replace(LAYOUT.regions[0], priority=5)
+    async with fingers_on(
+        several_fingers_table(),
+        replace(LAYOUT, regions=(left, above)),
+        at={1: LEFT, 3: ABOVE},
+        held=1.0,
+    ) as fingers:
+        verdicts = {each.contact.key.id: each.verdict for each in fingers.applied[-1].targets}
+        assert verdicts == {1: "held back", 3: "own"}
+        assert fingers.levels_db_sl()[3] > 12
+
+
+@in_virtual_time
+async def test_a_region_with_its_own_is_never_mixed() -> None:
+    """Of three fingers on four ERAs one is mixed; where it wants its own, another gives way."""
+    third = Region("above", UPPER, on_press="above", priority=1)
+    for is_own in (False, True):
+        regions = (*LAYOUT.regions[:2], replace(third, is_own=is_own))
+        async with fingers_on(
+            several_fingers_table(),
+            replace(LAYOUT, regions=regions),
+            at={1: LEFT, 2: RIGHT, 3: ABOVE},
+            held=1.0,
+        ) as fingers:
+            targets = fingers.applied[-1].targets
+            verdicts = {each.contact.key.id: each.verdict for each in targets}
+            assert ("held back" in verdicts.values()) is is_own
+            if is_own:
+                assert verdicts[3] == "own"
+                assert all(level > 12 for level in fingers.contrasts().values())
+
+
+@in_virtual_time
+async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
+    """Two near fingers of different effects: one vibration, of the name of the higher priority."""
+    regions = (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left", may_share=True),
+        Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
+    )
+    async with fingers_on(
+        several_fingers_table(),
+        replace(LAYOUT, regions=regions),
+        at={1: (0.138, 0.06), 2: (0.165, 0.06)},
+        held=1.0,
+    ) as fingers:
+        applied = fingers.applied[-1]
+        view = PlateView(lambda key: ("", "left", "right")[key.id], applied.contacts, applied)
+        first, second = view.contact_statuses()
+        assert (first.verdict, first.effect, first.feels) == ("shared", "left", "right")
+        assert (second.effect, second.feels) == ("right", "right")
+        assert first.frequency_hz == second.frequency_hz
+
+
+@in_virtual_time
+async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_that() -> None:
+    """The click has a layer of its own, and each finger is told once what it feels."""
+    async with fingers_on(several_fingers_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
+        ((shared, one),) = fingers.applied[-1].contents.items()
+        owner, other = (contact for contact, _ in one.content.targets)
+        count, sent = len(fingers.applied), len(fingers.committed)
+        fingers.play("tick", owner.key.id)
+        await fingers.hold(0.3)
+        sets = [one for _, _, layers in fingers.committed[sent:] for one in layers]
+        assert {one.layer for one in sets if not one.renew} == {1 - shared}
+        clicked, ended = fingers.applied[count:]
+        assert clicked.contents[shared].content == ended.contents[shared].content == one.content
+        for applied in (clicked, ended):
+            assert sorted(each.contact.key for each in applied.targets) == sorted(
+                [owner.key, other.key]
+            )
+        assert {each.contact.key: each.verdict for each in clicked.targets}[owner.key] == "mixed"
+
+
+@in_virtual_time
+async def test_a_click_that_is_refused_leaves_what_others_share() -> None:
+    """Of the finger whose content it is: only the click is left out."""
+    async with fingers_on(several_fingers_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
+        ((shared, one),) = fingers.applied[-1].contents.items()
+        sent = len(fingers.committed)
+        fingers.refuse(
+            "too much power",
+            lambda layers: any(t.level for each in layers if not each.renew for t in each.tones),
+        )
+        fingers.play("tick", one.content.targets[0][0].key.id)
+        await fingers.hold(0.1)
+        assert {n: each.content for n, each in fingers.applied[-1].contents.items()} == {
+            shared: one.content
+        }
+        assert not fingers.silenced
+        sets = [each for _, _, layers in fingers.committed[sent:] for each in layers]
+        assert shared not in {each.layer for each in sets if not each.renew}
+
+
+LEAKING = SurfaceLayout(
+    (
+        Region("left", Rectangle(0.0, 0.0, 0.15, 0.12), on_press="left"),
+        Region("right", Rectangle(0.16, 0.0, 0.14, 0.12), on_press="right"),
+    ),
+    {"left": Buzz(level=14.0), "right": Buzz(level=14.0)},
+    elsewhere=None,
+)
+
+
+def statuses(fingers: Fingers) -> dict[int, float]:
+    """What the status says that leaks to each finger [dB SL]."""
+    contacts = tuple(
+        Contact(ContactKey("panel", id), *at, since=0.0) for id, at in fingers.at.items()
+    )
+    view = PlateView(lambda key: None, contacts, fingers.applied[-1])
+    found = {each.id: each.leak_db_sl for each in view.statuses_now(several_fingers_table())}
+    return {id: -math.inf if level is None else level for id, level in found.items()}
+
+
+@in_virtual_time
+async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
+    """Slowly, by less than 8 mm, no weights change: within a decibel of what is measured there."""
+    async with fingers_on(
+        several_fingers_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2
+    ) as fingers:
+        rested = statuses(fingers)
+        assert rested == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
+        count = len(fingers.applied)
+
+        def move(since: float) -> None:
+            way = min(0.02 * since, 0.0055)
+            fingers.at[3] = (ABOVE[0] + way, ABOVE[1] - way)
+
+        await fingers.hold(1.5, move)
+        assert len(fingers.applied) == count
+        moved = statuses(fingers)
+        assert moved == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
+        assert moved[3] > rested[3]
+
+
+@in_virtual_time
+async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
+    """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""
+    async with fingers_on(
+        several_fingers_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0
+    ) as fingers:
+        rested, count = statuses(fingers)[3], len(fingers.applied)
+        on_the_way = []
+
+        def way(since: float) -> None:
+            on_the_way.append(statuses(fingers)[3])
+            fingers.at[3] = (ABOVE[0] + 0.5 * since, ABOVE[1])
+
+        await fingers.hold(0.2, way)
+        changes = [each.time for each in fingers.applied[count:]]
+        assert 4 <= len(changes) <= 0.2 / 0.017 + 1
+        await fingers.hold(1.0)
+        assert statuses(fingers)[3] == pytest.approx(fingers.levels_db_sl(foreign=True)[3], abs=1.0)
+        assert max(on_the_way) > rested
+        assert statuses(fingers)[3] < max(on_the_way)
+
+
+@in_virtual_time
+async def test_nothing_leaks_without_fingers() -> None:
+    """The status is read when the last has lifted and its silence is not confirmed yet."""
+    async with fingers_on(several_fingers_table(), LEAKING, at={1: LEFT}, held=0.3) as fingers:
+        view = PlateView(lambda key: None, (), fingers.applied[-1])
+        assert view.statuses_now(several_fingers_table()) == []

@@ -1,11 +1,88 @@
-"""What programs write of pages and files, and the check of it."""
+"""What programs write of pages and files, and the check of it.
 
+The ways that docs/architecture.md follows through the files are those that the code takes.
+
+The file of tested versions.
+
+The tutorials, followed to the letter.
+
+The reference of the daemon's file against what it describes.
+
+Comparison of shown with printed output, and invalid pages.
+
+The reference of commands against the commands.
+
+What pages state and something else decides: constants, URLs, figures of other pages, files.
+
+All of docs/reference/amplifier.json by a reader that knows nothing else, against the codecs.
+"""
+
+import json
+import random
 import re
+import shutil
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterator
+from importlib.metadata import requires
 from pathlib import Path
+from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from typer.core import TyperCommand, TyperGroup
+from typer.testing import CliRunner
 
+import constraints
+import model
 import pages
+from controller.api.schema import headline
+from controller.api.server import StateEvent
+from controller.cli.main import load_commands
+from controller.daemon.config import DaemonSection, DumpSection, LogSection, TouchSection
+from controller.operation.operation_states import DaemonState
+from controller.sources.touch import CONTACT_TIMEOUT
+from drivers.by_hand.cli import amp
+from drivers.by_hand.reaching import check_links
+from drivers.errors import CommandError
+from drivers.protocol.definition import (
+    BOOT_TIME,
+    COMMAND,
+    ENVELOPE,
+    EVENT,
+    EVENT_RECORD,
+    FAULTS,
+    FEATURES,
+    HELLO,
+    IDENTITY,
+    KNOT,
+    LAYER,
+    MESSAGES,
+    NAK,
+    NAK_RECORD,
+    QUANTITIES,
+    REACTION,
+    READING_STATES,
+    REFUSALS,
+    SENSOR_UNITS,
+    STATES,
+    STATUS_FLAGS,
+    sensor_reading,
+)
+from drivers.protocol.records import Record
+from drivers.wires.known import address_of
+from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
+from model.answer.promise import MIN_RAISED_CONTRAST_DB
+from model.cli import app
+from model.config.fields import Section
+from model.study import overview
+from model.study.contrast_maps import WANTED_CONTRAST_DB
+from model.study.verification import MIN_KEPT_SHARE
+from registry.limits import GuardLimits
+from typed_page import PORTS, PageError, Reader, Typed, Written, difference, read_steps
+from ways import WAYS, steps_of
 
 BEGIN, END = "<!-- begin: written by a.py -->", "<!-- end -->"
 
@@ -59,3 +136,547 @@ def test_whatever_says_that_it_is_written_is_among_the_pages() -> None:
     }
     assert len(found) > 6
     assert found <= set(pages.WRITTEN)
+
+
+MOST_FILES = {"touch": 25, "stop": 9, "question": 11, "build": 25}
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_page_follows_the_code(name: str) -> None:
+    """The functions to break at are called in the order of the page, in files that can be read."""
+    steps, called = steps_of(name), [*WAYS[name]().functions]
+    assert [step for step in steps if step not in called] == []
+    assert steps == sorted(steps, key=called.index)
+    assert 5 <= len({file for file, _ in steps}) <= MOST_FILES[name]
+
+
+FILE = Path(constraints.__file__).parents[2] / "constraints.txt"
+
+
+def test_constraints_pin_every_dependency_within_its_bounds() -> None:
+    """One tested version of each that the extras for users require, directly or not."""
+    lines = [line for line in FILE.read_text("utf-8").splitlines() if not line.startswith("#")]
+    pinned = dict(line.split("==") for line in lines)
+    assert constraints.closure("era-haptics", *constraints.EXTRAS).keys() == pinned.keys()
+    for text in requires("era-haptics") or ():
+        required = Requirement(text)
+        if required.marker is None or required.marker.evaluate({"extra": "gateway"}):
+            assert pinned[canonicalize_name(required.name)] in required.specifier
+
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "tutorials"
+SHORT = "own-plate"
+"""Followed by every run of the tests; the others by `make test-long`."""
+
+
+@pytest.fixture
+def home() -> Iterator[Path]:
+    """A short path: a Unix socket's has room for a hundred letters."""
+    folder = Path(tempfile.mkdtemp(prefix="era"))
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[] if page == SHORT else [pytest.mark.long])
+        for page in sorted(path.stem for path in PAGES.glob("*.md"))
+    ],
+)
+def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path, home: Path) -> None:
+    """A tutorial typed from an empty folder beside the examples prints what it shows."""
+    folder = tmp_path / "my_plate"
+    folder.mkdir()
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    steps = read_steps(PAGES / f"{page}.md")
+    assert sum(isinstance(step, Typed) and step.shown is not None for step in steps) >= 3
+    with Reader(folder, home=home) as reader:
+        for step in steps:
+            reader.follow(step)
+
+
+def test_the_first_tutorial_writes_the_rig_of_the_others() -> None:
+    """Who skipped it copies the same file from the examples."""
+    written = [step for step in read_steps(PAGES / "own-plate.md") if isinstance(step, Written)]
+    example = (ROOT / "examples" / "tutorial_rig.yaml").read_text("utf-8")
+    assert [(step.name, step.text) for step in written] == [("my_rig.yaml", example)]
+
+
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
+
+
+def rows(page: str, head: str) -> list[list[str]]:
+    """The cells of the table that begins with this head, one list a row."""
+    text = (REFERENCE / page).read_text("utf-8")
+    table = text[text.index(head) :].partition("\n\n")[0]
+    return [[cell.strip() for cell in line[1:-1].split("|")] for line in table.splitlines()[2:]]
+
+
+def test_every_key_of_the_daemons_file_is_in_its_table() -> None:
+    """As the configuration's model has them, and no others."""
+    keys = [row[0].strip("`") for row in rows("daemon.md", "| key | meaning | default |")]
+    assert sorted(keys) == sorted(DaemonSection.model_fields)
+
+
+def test_people_see_the_word_that_the_page_has_for_each_state() -> None:
+    """In the status, in the event of a change, and in a line unless the cause begins with it."""
+    shown = {row[0]: row[1].strip("*") for row in rows("daemon.md", "| state | shown |")}
+    assert list(shown) == [state.value for state in DaemonState]
+    for state, word in shown.items():
+        event = StateEvent(old="FAULT", new=state, cause="a cable was cut", remedy=None, epoch=1)
+        assert event.model_dump()["word"] == word
+        assert headline(state, event.cause) == f"{word}: a cable was cut"
+        assert headline(state, f"{word} by 'era'") == f"{word} by 'era'"
+
+
+@pytest.mark.parametrize(
+    ("key", "section"), [("touch", TouchSection), ("log", LogSection), ("dumps", DumpSection)]
+)
+def test_a_section_is_told_in_its_row(key: str, section: type[Section]) -> None:
+    """`{name, url, ...}`: the keys that it takes, and no others."""
+    (row,) = [
+        row for row in rows("daemon.md", "| key | meaning | default |") if row[0] == f"`{key}`"
+    ]
+    found = re.search(r"`\{(.*?)\}`", row[1])
+    assert found is not None
+    assert found[1].split(", ") == list(section.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("level 20.0 dB", "level  20.1 dB\n"),  # the last digit
+        ("median 31.9 dB", "median 32.4 dB"),  # two in a hundred
+        ("wrote x ... s", "wrote x in 0.3 s"),
+        ("first\n...\nlast", "first\nbetween\nbetween\nlast"),
+        ("...\nlast", "last"),
+        ("first\n...", "first"),
+        ("-13.4 dB SL, unaware", "-13.5 dB SL, below its threshold"),
+        ("level 20.0 dB", "contrast 20.0 dB"),
+        ("armed by 'era', ... s left", "armed by 'era'; 59.8 s left"),
+        ("mesh 11x7 ..., ERAs SW", "mesh 11x7, ERAs SW"),
+        ("mesh 11x7 ...: within 0.09 % ...", "mesh 11x7 Q5, strips of 4 mm: within 0.09 % (17x11)"),
+        ("armed until Ctrl-C", "armed; Ctrl-C disarms"),
+        ("READY: all is well", "READY: nothing is wrong"),
+    ],
+)
+def test_difference_is_none(shown: str, printed: str) -> None:
+    """Words, blanks, last digits and what `...` stands for make no difference."""
+    assert difference(shown, printed) is None
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "line"),
+    [
+        ("level 20.0 dB", "level 21.0 dB", "line 1"),
+        ("READY: all is well", "FAULT: all is well", "line 1"),
+        ("wrote my.yaml", "wrote your.yaml", "line 1"),
+        ("5 ERAs", "6 ERAs", "line 1"),  # a count is exact
+        ("1 a\n2 b", "1 a", "line 2"),
+        ("1 a", "1 a\n2 b", "beyond"),
+        ("1 first\n...\n3 last", "1 first\n2 between", "line 3"),
+        ("ready", "", "lines"),
+        ("33.4 dB", "-33.4 dB", "line 1"),
+    ],
+)
+def test_difference_has_its_place(shown: str, printed: str, line: str) -> None:
+    """Another name, number, sign, count, or line is reported with its place."""
+    assert line in (difference(shown, printed) or "")
+
+
+@pytest.mark.parametrize("comment", ["statsu: 1", "edit: a.yaml"])
+def test_read_steps_refuses_an_unknown_comment(tmp_path: Path, comment: str) -> None:
+    """A misspelt comment, or one above the wrong kind of fence, is refused with its line."""
+    page = tmp_path / "page.md"
+    page.write_text(f"<!-- {comment} -->\n```yaml\na: 1\n```\n", encoding="utf-8")
+    with pytest.raises(PageError, match=r"page\.md:[12]"):
+        read_steps(page)
+
+
+def test_ports_include_all_ports_of_pages() -> None:
+    """Every port of a page is replaced by a free one."""
+    docs = Path(__file__).parents[2] / "docs"
+    pages = [*docs.glob("tutorials/*.md"), *docs.glob("how-to/*.md")]
+    named = {
+        port
+        for page in pages
+        for step in read_steps(page)
+        for port in re.findall(r"(?:127\.0\.0\.1:|--port )(\d+)", str(step))
+    }
+    assert len(named) > 4
+    assert named <= set(PORTS)
+
+
+PAGE = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
+RIG = str(ROOT / "examples" / "paper_plate.yaml")
+COARSE = ["--frequencies", "100:200:50", "--grid", "4x3", "--mesh", "12x9"]
+
+
+def commands(group: TyperGroup, name: str = "era") -> Iterator[tuple[str, TyperCommand]]:
+    """Every command by its full name."""
+    for command in group.commands.values():
+        full = f"{name} {command.name}"
+        if isinstance(command, TyperGroup):
+            yield from commands(command, full)
+        else:
+            assert isinstance(command, TyperCommand)
+            yield full, command
+            for flag, variant in getattr(command, "variants", {}).items():
+                yield f"{full} {flag}", variant
+
+
+def test_page_lists_every_command_with_its_options() -> None:
+    """The names on the page are those of the program; what it says once, it says above them."""
+    parts = re.split(r"^### ", PAGE, flags=re.MULTILINE)[1:]
+    listed = {part.splitlines()[0]: part for part in parts}
+    known = dict(commands(load_commands()[0]))
+    common = set(re.findall(r"^- `(--[a-z-]+)", parts[0], re.MULTILINE))
+    assert {name for name in listed if name.startswith("era ")} == set(known)
+    for name, command in known.items():
+        own = re.findall(r"^- `(?:-\w, )?(--[a-z-]+)", listed[name], re.MULTILINE)
+        also = re.findall(
+            r"`(--[a-z-]+)", listed[name].lower().partition("also with ")[2].split("\n")[0]
+        )
+        assert set(also) <= common, name
+        named = {*own, *also}
+        names = {max(option.opts, key=len) for option in command.params}
+        options = {name for name in names if name.startswith("--")}
+        assert named == options - {"--help"}, name
+
+
+def test_every_command_with_json_tells_its_keys() -> None:
+    """A command that has the option is in the table of keys."""
+    table = PAGE.partition("## What `--json` prints")[2].partition("## All commands")[0]
+    listed = " ".join(re.findall(r"^\| (`era .*?) \|", table, re.MULTILINE))
+    parts = re.split(r"^### era ", PAGE, flags=re.MULTILINE)[1:]
+    with_json = [
+        part.splitlines()[0] for part in parts if re.search(r"[Aa]lso with .*`--json`", part)
+    ]
+    assert len(with_json) > 30
+    for name in with_json:
+        assert f"`era {name}`" in listed or f"`{name.split()[-1]}`" in listed, name
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small table."""
+    folder = tmp_path_factory.mktemp("built")
+    arguments = ["table", "build", RIG, "-o", str(folder / "table.npz"), *COARSE]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["config", "check", RIG],
+        ["plate", "modes", RIG, "--mesh", "12x9"],
+        ["plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110"],
+        ["plate", "show", RIG],
+        ["plate", "materials"],
+        ["plate", "template", RIG, "-o", "template.svg"],
+        ["table", "build", RIG, "-o", "another.npz", *COARSE],
+        ["table", "show", "table.npz"],
+        ["table", "query", "table.npz", "--target", "0.06,0.05", "--quiet", "0.2,0.1"],
+        ["table", "export", "table.npz", "--format", "csv", "-o", "table.csv"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_the_keys_are_those_that_are_printed(
+    arguments: list[str], built: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The table names the keys at the top of what `--json` prints, and no others."""
+    monkeypatch.chdir(built)
+    monkeypatch.setattr(overview, "CONTACT_SETS", 12)
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    assert result.exit_code == 0, result.output
+    name = " ".join(["era", *arguments[:2]])
+    (row,) = re.findall(rf"^\| .*`{name}`.* \| (.*) \|$", PAGE, re.MULTILINE)
+    row = re.sub(r"\(.*?\)", "", row)
+    keys = set(re.findall(r"`(\w+)`", row))
+    for key in [key for key in keys if "_N_" in key]:
+        keys = keys - {key} | {key.replace("N", number) for number in "123"}
+    assert keys == set(json.loads(result.stdout))
+
+
+STATED_FACTS_ROOT = Path(model.__file__).parents[1]
+STATED_FACTS_PAGES = [
+    STATED_FACTS_ROOT / "README.md",
+    STATED_FACTS_ROOT / "CONTRIBUTING.md",
+    *(STATED_FACTS_ROOT / "docs").rglob("*.md"),
+]
+
+
+def text_of(page: str) -> str:
+    """A page's text; its name is relative to the root."""
+    return (STATED_FACTS_ROOT / page).read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("page", "stated", "constant"),
+    [
+        ("docs/reference/table-file.md", r"must be (\d+) % or more", 100 * MIN_KEPT_SHARE),
+        ("docs/architecture.md", r"no frame confirms \((\d+) ms", 1000 * CONTACT_TIMEOUT),
+        ("docs/reference/touch.md", r"after (\d+) ms without a frame", 1000 * CONTACT_TIMEOUT),
+        ("docs/reference/protocol.md", r"of its request [^|]*\| – \| (\d+) ms", 1000 * REACTION),
+        *(
+            (f"docs/{page}.md", stated, MIN_CONTRAST_DB)
+            for page, stated in (
+                ("reference/effects", r"less than (\d+) dB, contents give way"),
+                ("reference/effects", r"^\| (\d+) to \d+ dB, or more of what pauses"),
+                ("reference/effects", r"\| below (\d+) dB at any finger"),
+                ("reference/effects", r"still below (\d+) dB"),
+                ("reference/effects", r"would fall below (\d+) dB"),
+                ("reference/effects", r"names the pairs below (\d+) dB"),
+                ("reference/commands", r"not even one content reaches (\d+) dB"),
+                ("reference/python-api", r"would have less than (\d+) dB"),
+                ("tutorials/reading-a-table", r"with less than (\d+) dB vibrations are"),
+                ("how-to/design-a-layout", r"same time, below (\d+) dB"),
+                ("measured/promise", r"which below (\d+) dB they are"),
+            )
+        ),
+        *(
+            (f"docs/{page}.md", stated, OWN_CONTRAST_DB)
+            for page, stated in (
+                ("reference/effects", r"^\| from (\d+) dB; of a click"),
+                ("reference/effects", r"^\| \d+ to (\d+) dB, or more of what pauses"),
+                ("reference/effects", r"`own: true`: (\d+) dB are required"),
+                (
+                    "reference/effects",
+                    r"duration; below (\d+) dB, or beside others that are felt, they",
+                ),
+                ("reference/api", r"promised contrast below (\d+) dB"),
+                ("concepts/each-finger-its-own", r"^(\d+) dB make a steady content"),
+                ("tutorials/reading-a-table", r"less than (\d+) dB\s+are `mixed`"),
+                ("how-to/design-a-layout", r"from (\d+) dB two regions"),
+            )
+        ),
+        ("docs/reference/effects.md", r"half of it \((\d+) dB\)", MIN_RAISED_CONTRAST_DB),
+        ("docs/reference/table-file.md", r"has (\d+) dB of felt contrast", WANTED_CONTRAST_DB),
+        ("docs/concepts/localization.md", r"have (\d+) dB to the median", WANTED_CONTRAST_DB),
+    ],
+)
+def test_page_states_the_constant(page: str, stated: str, constant: float) -> None:
+    """The number beside these words is that of the code."""
+    (found,) = re.findall(stated, text_of(page), re.MULTILINE)
+    assert float(found) == pytest.approx(constant)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/concepts/localization.md"])
+def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
+    """The share and number of fingers of the main run; clicks are counted by runs of their own."""
+    figures, _, _ = text_of("docs/measured/promise.md").partition("<!-- end figures -->")
+    rows = re.findall(r"(\d+) % of (\d+) \|", figures)
+    counts = [int(count) for _, count in rows]
+    kept = sum(int(share) * int(count) for share, count in rows) / sum(counts)
+    ((share, count),) = re.findall(r"(\d+) % of\s+(\d+) fingers", text_of(page))
+    assert int(count) == sum(counts)
+    assert float(share) == pytest.approx(kept, abs=1)
+
+
+def test_files_that_pages_name_are_there() -> None:
+    """In any folder, and tests by their bare names; decisions name what was there at the time."""
+    tests = {path.name for path in (STATED_FACTS_ROOT / "tests").rglob("test_*.py")}
+    folders = "|".join(path.name for path in STATED_FACTS_ROOT.iterdir() if path.is_dir())
+    named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
+    gone = {
+        name
+        for page in STATED_FACTS_PAGES
+        if "decisions" not in page.parts
+        for name in named.findall(page.read_text("utf-8"))
+        if not (STATED_FACTS_ROOT / name).exists()
+        and not name.startswith(("dist/", "tests/faults/AREA"))
+    }
+    pages = [
+        page.read_text("utf-8") for page in STATED_FACTS_PAGES if "decisions" not in page.parts
+    ]
+    assert gone == set()
+    assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
+
+
+STATED_FACTS_PAGE = (STATED_FACTS_ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")
+EXAMPLES = re.findall(r"^\| `(\S+)` \| `(\S+)` \| (\d+) \|$", STATED_FACTS_PAGE, re.MULTILINE)
+SCHEMES = {url.partition("://")[0] for url, _, _ in EXAMPLES}
+
+
+@pytest.mark.parametrize(("url", "line", "number"), EXAMPLES)
+def test_example_is_the_amplifier_that_the_page_says(url: str, line: str, number: str) -> None:
+    """Its line, and its number there."""
+    address = address_of(url)
+    assert (address.line, address.number) == (line, int(number))
+
+
+def test_slowest_line_is_that_of_the_page() -> None:
+    """As the check has it; the next slower speed is refused."""
+    baud, bitrate = map(
+        int, re.findall(r"at least (\d+) baud, or (\d+) kbit/s", STATED_FACTS_PAGE)[0]
+    )
+    slow = {
+        "a": "serial:///dev/a?baud={}",
+        "b": "modbus+rtu:///dev/b?baud={}",
+        "c": "can+slcan:///c?bitrate={}",
+    }
+    for factor, refused in ((1, []), (2, [*slow])):
+        speeds = {"a": baud // factor, "b": baud // factor, "c": bitrate * 1000 // factor}
+        urls = {name: url.format(speeds[name]) for name, url in slow.items()}
+        errors, _ = check_links(urls, channels={}, limits=GuardLimits(40.0, 250.0, 1.0))
+        assert [*errors] == refused
+
+
+def test_page_has_every_scheme_and_the_time_of_a_board() -> None:
+    """Those that an unknown one is answered with, each in both tables; and in the help."""
+    with pytest.raises(CommandError) as unknown:
+        address_of("carrier+pigeon://roof")
+    assert (
+        set(re.findall(r"([\w+-]+)://[,\s]", f"{unknown.value} ")) - {"carrier+pigeon"} == SCHEMES
+    )
+    assert set(re.findall(r"^\| `([\w+-]+)://", STATED_FACTS_PAGE, re.MULTILINE)) == SCHEMES
+    assert set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE)) == SCHEMES
+    assert f"for {BOOT_TIME:g} s" in STATED_FACTS_PAGE
+
+
+SHEET = json.loads(
+    (Path(__file__).parents[2] / "docs" / "reference" / "amplifier.json").read_text("utf-8")
+)
+RECORDS: dict[str, tuple[list[Any], Record]] = {
+    "Hello": (SHEET["messages"]["Hello"]["reply"], IDENTITY),
+    "Event": (SHEET["messages"]["Event"]["reply"], EVENT_RECORD),
+    "Nak": (SHEET["messages"]["Nak"]["reply"], NAK_RECORD),
+    "sensor_of_a_reading": (SHEET["records"]["sensor_of_a_reading"], sensor_reading(1)),
+    **{
+        name: (SHEET["records"][name.lower()], record)
+        for name, record in {
+            **{"Layer": LAYER, "Command": COMMAND, "Envelope": ENVELOPE, "Knot": KNOT}
+        }.items()
+    },
+    **{
+        f"{name}, request": (SHEET["messages"][name]["request"], m.request)
+        for name, m in MESSAGES.items()
+    },
+    **{
+        f"{name}, reply": (SHEET["messages"][name]["reply"], m.reply)
+        for name, m in MESSAGES.items()
+    },
+}
+ROWS = 3
+
+
+def drawn(fields: list[Any], rng: random.Random) -> tuple[dict[str, Any], list[int]]:
+    """Values of fields within their ranges, and the words that the sheet makes of them."""
+    values: dict[str, Any] = {}
+    words: list[int] = []
+    counts = {field.get("count") for field in fields}
+
+    def number(name: str) -> int:
+        quantity = SHEET["quantities"][name]
+        return rng.randint(quantity["min"], quantity["max"])
+
+    def word(quantity: str, value: int) -> list[int]:
+        if SHEET["quantities"][quantity]["type"] == "u32":
+            return [value >> 16, value & 0xFFFF]
+        return [value & 0xFFFF]
+
+    for field in fields:
+        name = field.get("name")
+        match field["kind"]:
+            case "number":
+                values[name] = ROWS if name in counts else number(field["quantity"])
+                words += word(field["quantity"], values[name])
+            case "bits":
+                packed = 0
+                for part in field["parts"]:
+                    one = ROWS if part["name"] in counts else rng.getrandbits(part["bits"])
+                    values[part["name"]] = one
+                    packed = packed << part["bits"] | one
+                words.append(packed)
+            case "f32":
+                (values[name],) = struct.unpack(">f", struct.pack(">f", rng.uniform(0, 1000)))
+                words += struct.unpack(">HH", struct.pack(">f", values[name]))
+            case "text":
+                values[name] = "".join(rng.choices("aZ 9-µ", k=rng.randint(0, 15)))
+                raw = values[name].encode()
+                words.append(len(raw))
+                words += struct.unpack(f">{(len(raw) + 1) // 2}H", raw + b"\0" * (len(raw) % 2))
+            case "numbers":
+                values[name] = [number(field["quantity"]) for _ in range(ROWS)]
+                words += [each & 0xFFFF for each in values[name]]
+            case "rows":
+                count = ROWS if isinstance(field["count"], str) else field["count"]
+                rows = [drawn(field["fields"], rng) for _ in range(count)]
+                values[name] = [row for row, _ in rows]
+                words += [each for _, row in rows for each in row]
+            case "words to the end":
+                values[name] = [rng.getrandbits(16) for _ in range(ROWS)]
+                words += values[name]
+            case kind:
+                pytest.fail(f"kind must be known, got {kind}")
+    return values, words
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_every_record_is_read_as_the_data_pack_it(name: str) -> None:
+    """Requests, replies, Events, Naks and parts of them, with values anywhere in their ranges."""
+    fields, record = RECORDS[name]
+    rng = random.Random(name)
+    for _ in range(20):
+        values, words = drawn(fields, rng)
+        assert record.unpack(words, is_strict=True) == values
+
+
+def test_numbers_and_names_are_all_there() -> None:
+    """Of messages, quantities, states, faults, codes, features, flags and units."""
+    numbers = {"Hello": HELLO, "Event": EVENT, "Nak": NAK}
+    numbers |= {name: each.number for name, each in MESSAGES.items()}
+    assert {name: each["number"] for name, each in SHEET["messages"].items()} == numbers
+    for name, each in MESSAGES.items():
+        listed = SHEET["messages"][name]
+        assert (listed["feeds"], listed["broadcast"]) == (each.feeds, each.is_broadcast)
+    assert SHEET["quantities"].keys() == QUANTITIES.keys()
+    for name, quantity in QUANTITIES.items():
+        listed = SHEET["quantities"][name]
+        for integer in (quantity.minimum, quantity.maximum):
+            value = (integer - listed["zero"]) / listed["per_unit"]
+            assert value == pytest.approx(quantity.from_wire(integer))
+        assert (listed["type"], listed["unit"]) == (quantity.wire, quantity.unit)
+    tables = {"states": STATES, "faults": FAULTS, "codes": REFUSALS, "features": FEATURES}
+    tables |= {"status_flags": STATUS_FLAGS, "sensor_units": SENSOR_UNITS}
+    tables["reading_states"] = READING_STATES
+    assert {name: SHEET[name] for name in tables} == {
+        name: json.loads(json.dumps(each)) for name, each in tables.items()
+    }
+
+
+def test_check_of_serial_frames_follows_from_its_parameters() -> None:
+    """Bit by bit as the parameters say, against zlib and the value that the sheet states."""
+    crc = SHEET["serial"]["crc"]
+    assert crc["reflected"]
+    polynomial = int(f"{crc['polynomial']:0{crc['width']}b}"[::-1], 2)
+    register = crc["initial"]
+    for byte in b"123456789":
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (polynomial if register & 1 else 0)
+    assert register ^ crc["xor"] == crc["check"] == zlib.crc32(b"123456789")
+
+
+def test_registers_hold_what_the_layout_lists() -> None:
+    """A commit of modbus.md: registers of its number, a tag before the request and its reply."""
+    sheet = SHEET["modbus"]
+    for name, each in sheet["registers"].items():
+        number = SHEET["messages"][name]["number"]
+        assert each == {"written_from": 0x100 * number, "reply_from": 0x100 * number + 0x80}
+    written = bytes.fromhex("0600 0004 08 0001 2A17 0102 6000")  # place, count, bytes, registers
+    assert struct.unpack_from(">H", written)[0] == sheet["registers"]["Commit"]["written_from"]
+    tag, *words = struct.unpack_from(">4H", written, 5)
+    assert sheet["layout"]["written"] == ["tag", "words of the request"]
+    assert (tag, MESSAGES["Commit"].request.unpack(words, is_strict=True)) == (
+        *(1, {"session": 0x2A17, "token": 0x0102, "at": 0x6000}),
+    )
+    tag, result, *words = struct.unpack(">5H", bytes.fromhex("0002 0000 0102 0006 0000"))
+    assert [each.partition(":")[0] for each in sheet["layout"]["reply"]] == [
+        *("tag", "result", "words of the reply", "zeros"),
+    ]
+    taken = MESSAGES["Set"].reply.unpack(words, is_strict=False)
+    assert (tag, result, taken["token"], taken["staged"], taken["played"]) == (2, 0, 0x0102, 1, 0)

@@ -28,8 +28,8 @@ from model.compiled.kernels import processor_features, versions
 ROOT = Path(__file__).parents[2]
 TESTS = (
     "tests/model",
-    "tests/docs/test_tutorials.py",
-    "tests/docs/test_printed.py",
+    "tests/docs/test_pages.py",
+    "tests/docs/test_pages.py",
     "tests/examples/test_how_to_pages.py",
     "tests/integration/test_demo.py",
 )

@@ -1,0 +1,426 @@
+"""Actions of `era amp` on real wires, at simulated amplifiers of version 4.
+
+The commands `era amp` and the synchronous amplifier, over one simulated in the same process.
+"""
+
+import asyncio
+import json
+import re
+import threading
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import pytest
+from serial.tools.list_ports_common import ListPortInfo
+from typer.testing import CliRunner, Result
+
+from drivers.by_hand import actions
+from drivers.by_hand.actions import BlockingAmplifier
+from drivers.by_hand.cli import app as amp_app
+from drivers.by_hand.reaching import identify_all
+from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
+from drivers.opening import Lines
+from drivers.playing import Layer, Tone
+from drivers.protocol.definition import FEATURES, READINGS, STATUS_FLAGS
+from drivers.trace import tracing
+from drivers.urls import with_address
+from era_haptics.lab.cli import app as lab_app
+from era_haptics.lab.conformance.contract import Report
+from model.rig.rig_file import example_rig_path
+from real_wires import WORD_WIRES, WordWiresFarSide
+from registry.limits import GuardLimits
+
+LIMITS = GuardLimits(20.0, 1000.0, 1.0)
+OF_CONNECTIONS = ("tcp", "server", "socketcand")
+ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(OF_CONNECTIONS)]
+"""Wires whose far end lasts: the others have one for each connection, at the first addresses."""
+
+
+async def leave_playing(far: WordWiresFarSide, number: int = 1) -> None:
+    """Play at half level, as a host that then ends without a word."""
+    lines = Lines()
+    amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)
+    await amplifier.open()
+    await amplifier.arm(77, 2.0)
+    await amplifier.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)], now=True)
+    await lines.close()
+    assert far.level(number) == pytest.approx(0.5)
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_stop_is_sent_before_anything_is_read(wire: str, tmp_path: Path) -> None:
+    """An amplifier that plays for another host is silent, confirmed; identity is read after."""
+    async with WORD_WIRES[wire](1) as far:
+        await leave_playing(far)
+        with tracing(tmp_path / "trace"):
+            result = await actions.stop(far.url(1))
+        assert far.level(1) == 0.0
+        assert (result["silence"], result["cause"]) == ("confirmed_silent", "")
+        assert (result["state"], result["levels"]) == ("QUICK_STOP_ACTIVE", [0.0])
+    text = (tmp_path / "trace").read_text("utf-8")
+    requests = re.findall(r" request (\w+)\(", text)
+    assert requests[0] == "Stop"
+    assert {"Hello", "GetCaps"} <= set(requests[1:])
+    assert re.search(r" wire .* > (?:[0-9a-f]{2} )+ Stop to 1\n", text)
+    assert re.search(r" wire .* < (?:[0-9a-f]{2} )+ Reply\(", text)
+
+
+@pytest.mark.real_time
+async def test_stop_of_a_mute_amplifier_may_play() -> None:
+    """Nothing replies at its address, so nothing confirms that it is silent."""
+    async with WORD_WIRES["serial"](1) as far:
+        result = await actions.stop(far.url(2))
+    assert (result["silence"], result["may_play_for_s"]) == ("may_play", None)
+    assert "no reply" in result["cause"]
+    assert "state" not in result
+
+
+@pytest.mark.real_time
+async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
+    """Frames of 252 and 18 bytes for the longest part of a set: 120 and 3 words, and 12 bytes each.
+
+    At 115 200 baud these 2700 bits are 23.4 ms, 42 sets a second.
+    """
+    async with WORD_WIRES["serial"](1) as far:
+        rows = await actions.identify(f"{far.url(1)}&baud=115200")
+    assert (rows["serial_number"], rows["versions"], rows["channels"]) == ("SIM-1", [4], 1)
+    assert (rows["watchdog_min_s"], rows["watchdog_max_s"]) == (0.1, 2.0)
+    assert rows["channel_limits"][0].keys() == {
+        *("frequency_min_hz", "frequency_max_hz", "level_max")
+    }
+    assert "events" in rows["features"]
+    assert rows["wire_round_trip_s"] == pytest.approx(2700 / 115_200, abs=1e-6)
+    assert rows["sets_per_second_max"] == 42
+    assert rows["watchdog_shortest_s"] == pytest.approx(0.15 + 2700 / 115_200, abs=1e-6)
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_status_of_what_plays_and_clear_of_a_stop(wire: str) -> None:
+    """Looking changes nothing; after a stop Clear leaves it disarmed.
+
+    What full level means is the rig's business.
+    """
+    async with WORD_WIRES[wire](2) as far:
+        far.amplifiers[2].capabilities["features"] |= 1 << FEATURES["output"]
+        await leave_playing(far, 2)
+        rows = await actions.status(far.url(2))
+        assert (rows["state"], rows["levels"], rows["token"]) == ("OPERATION_ENABLED", [0.5], 5)
+        assert rows["layer_tokens"][:2] == [5, 0]
+        assert (rows["high_voltage"], rows["interlock_open"], rows["limited"]) == (
+            *(True, False, False),
+        )
+        assert 0 < rows["watchdog_left_s"] <= 2.0
+        assert rows["last_round_trip_s"] > 0
+        assert 0 <= rows["clock_s"] < 20
+        await actions.stop(far.url(2))
+        assert (await actions.clear(far.url(2)))["state"] == "SWITCH_ON_DISABLED"
+
+
+@pytest.mark.real_time
+async def test_drive_plays_and_ends_silent_and_disarmed(tmp_path: Path) -> None:
+    """What is achieved is what was asked for; pings feed the watchdog meanwhile."""
+    async with WORD_WIRES["serial"](1) as far:
+        options = {"channel": 0, "frequency": 123.45, "level": 0.3, "duration": 0.3}
+        with tracing(tmp_path / "trace"):
+            driving = asyncio.ensure_future(actions.drive(far.url(1), **options))
+            heard = set()
+            while not driving.done():
+                heard.add(round(far.level(1), 6))
+                await asyncio.sleep(0.01)
+            rows = await driving
+            assert max(heard) == 0.3
+        assert rows["achieved"] == [
+            {"channel": 0, "frequency_hz": 123.45, "level": 0.3, "phase_deg": 0.0}
+        ]
+        assert (rows["state"], rows["levels"]) == ("SWITCH_ON_DISABLED", [0.0])
+    requests = re.findall(r" request (\w+)\(", (tmp_path / "trace").read_text("utf-8"))
+    assert requests.index("Ping") < requests.index("Disarm")
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("query", "wrong"),
+    [
+        ("", {"level": 1.1}),
+        ("", {"frequency": float("nan")}),
+        ("", {"channel": 1}),
+        ("", {"duration": 0.0}),
+        ("", {"duration": float("nan")}),
+        ("&baud=4800", {}),  # too slow for three heartbeats and a round trip
+    ],
+)
+async def test_invalid_drive_never_arms(query: str, wrong: dict[str, float]) -> None:
+    """It is bad input and does not change the amplifier."""
+    options = {"channel": 0, "frequency": 110.0, "level": 0.2, "duration": 0.1, **wrong}
+    async with WORD_WIRES["serial"](1) as far:
+        with pytest.raises(CommandError):
+            await actions.drive(far.url(1) + query, **options)  # type: ignore[arg-type]
+        assert far.amplifiers[1].session == 0
+
+
+@pytest.mark.real_time
+async def test_drive_after_a_stop_names_the_clear_command() -> None:
+    """State, fault and remedy, with the URL quoted for a shell."""
+    async with WORD_WIRES["serial"](1) as far:
+        await actions.stop(far.url(1))
+        with pytest.raises(CommandRefused) as refused:
+            await actions.drive(far.url(1), channel=0, frequency=110.0, level=0.2, duration=0.1)
+    assert "QUICK_STOP_ACTIVE" in str(refused.value)
+    assert str(refused.value).endswith(f"era amp clear '{far.url(1)}'")
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", ADDRESSED)
+async def test_amplifier_takes_another_address(wire: str) -> None:
+    """It replies there, nobody where it was, and the other amplifier where it is."""
+    async with WORD_WIRES[wire](2) as far:
+        moved = await actions.set_address(far.url(1), 9, None)
+        assert moved == {"url": with_address(far.url(1), 9), "serial_number": "SIM-1"}
+        assert (await actions.identify(moved["url"]))["serial_number"] == "SIM-1"
+        assert (await actions.identify(far.url(2)))["serial_number"] == "SIM-2"
+        with pytest.raises(LinkTimeout):
+            await actions.identify(far.url(1))
+        back = await actions.set_address(moved["url"], 10, "SIM-1")
+        assert (await actions.identify(back["url"]))["serial_number"] == "SIM-1"
+
+
+@pytest.mark.real_time
+async def test_armed_amplifier_keeps_its_address() -> None:
+    """So does one of another serial number; a wire without addresses has none to set."""
+    async with WORD_WIRES["serial"](1) as far:
+        await leave_playing(far)
+        with pytest.raises(CommandRefused, match="disarm"):
+            await actions.set_address(far.url(1), 9, None)
+        assert far.level(1) == pytest.approx(0.5)
+        with pytest.raises(LinkError):
+            await actions.set_address(far.url(1), 9, "SIM-nobody")
+        assert (await actions.identify(far.url(1)))["serial_number"] == "SIM-1"
+    with pytest.raises(CommandError, match="address"):
+        await actions.set_address("sim://rig.yaml", 9, None)
+
+
+@pytest.mark.real_time
+async def test_discovery_only_identifies(tmp_path: Path) -> None:
+    """A URL without a reply is no error; what plays goes on."""
+    async with WORD_WIRES["modbus+rtu"](1) as far:
+        await leave_playing(far)
+        with tracing(tmp_path / "trace"):
+            unreached = ["serial:///dev/no-such-port", "can+socketcand://127.0.0.1:1/can0#1"]
+            here, *others = (await identify_all([far.url(1), *unreached])).values()
+        assert far.level(1) == pytest.approx(0.5)
+    assert isinstance(here, dict)
+    assert here["serial_number"] == "SIM-1"
+    assert [type(other) for other in others] == [LinkError, LinkError]
+    requests = re.findall(r" request (\w+)\(", (tmp_path / "trace").read_text("utf-8"))
+    assert set(requests) <= {"Hello", "GetCaps", "GetStatus"}
+
+
+COMMANDS_LIMITS = GuardLimits(40.0, 500.0, 0.5)
+DRAWN = f"sim://{example_rig_path()}"
+
+
+def layer(channel: int, frequency: float, level: float) -> Layer:
+    """One tone at once, in a layer."""
+    return Layer(0, (Tone(channel, frequency, level),), ramp=0.0)
+
+
+def loop_threads() -> list[str]:
+    """Names of the running event loop threads."""
+    names = [thread.name for thread in threading.enumerate()]
+    return [name for name in names if name.startswith("amplifier ")]
+
+
+def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
+    """Arm, play, stop, clear; layers that are not given end, and nothing is left running."""
+    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+        assert amplifier.identity["serial_number"] == "SIM-main"
+        assert amplifier.capabilities["channels"] == 4
+        assert amplifier.arm(2.0)["state"] == "OPERATION_ENABLED"
+        played = amplifier.play([layer(0, 110.004, 0.2)], duration=0.03)
+        assert played.layers[0].commands[0].frequency == 2200  # in 1/20 Hz
+        later = amplifier.apply([layer(1, 110.0, 0.3)])
+        assert [bool(each.commands) for each in later.layers] == [True] + [False] * 7
+        status = amplifier.status()
+        assert (status["token"], status["levels"]) == (later.token, [0.0, 0.3, 0.0, 0.0])
+        amplifier.stop()
+        assert amplifier.status()["state"] == "QUICK_STOP_ACTIVE"
+        with pytest.raises(CommandRefused):
+            amplifier.apply([layer(1, 110.0, 0.3)])
+        with pytest.raises(CommandRefused):
+            amplifier.heartbeat()
+        assert amplifier.clear()["state"] == "SWITCH_ON_DISABLED"
+        assert amplifier.faults() == []
+    assert loop_threads() == []
+
+
+def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
+    """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
+    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+        amplifier.arm(1.0)
+        amplifier.apply([layer(2, 110.0, 0.2)])
+        reading = amplifier.measure([110.0], 1.2)
+        assert amplifier.status()["state"] == "OPERATION_ENABLED"
+        sensors = amplifier.sensors()
+        loudest = max(range(len(sensors)), key=lambda n: reading.sensors[n].tones[0][0])
+        assert sensors[loudest].channel == 2
+
+
+def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names fault and remedy."""
+    monkeypatch.setattr("drivers.by_hand.actions.HEARTBEAT", 0.15)
+    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+        amplifier.arm(0.1)
+        with pytest.raises(CommandRefused, match=r"WATCHDOG.*clear"):
+            amplifier.play([layer(0, 110.0, 0.2)], duration=1.0)
+
+
+def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
+    """The error reaches the script, and the loop's thread has ended."""
+    with (
+        pytest.raises(CommandError),
+        BlockingAmplifier("sim://no-such-rig.yaml", limits=COMMANDS_LIMITS),
+    ):
+        pass
+    assert loop_threads() == []
+
+
+URL = f"sim://{example_rig_path()}?exact"
+COMMON = {
+    *("url", "state", "fault", "token", "watchdog_left_s", "clock_s", "levels"),
+    *("layer_tokens", "reports"),
+    *(*STATUS_FLAGS, *(each.key for each in READINGS)),
+}
+
+
+def invoke(*args: str) -> Result:
+    """Run `era amp` with these arguments."""
+    return CliRunner().invoke(lab_app if args[0] == "conformance" else amp_app, ["amp", *args])
+
+
+def result_of(*args: str) -> dict[str, Any]:
+    """Run `era amp` with these arguments and --json; its result."""
+    result = invoke(*args, "--json")
+    assert result.exit_code == 0, result.output
+    parsed: dict[str, Any] = json.loads(result.stdout)
+    return parsed
+
+
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        ("status", {"faults", "measured", "last_round_trip_s"}),
+        ("clear", set()),
+        ("stop", {"silence", "may_play_for_s", "cause"}),
+    ],
+)
+def test_results_have_the_documented_keys(command: str, more: set[str]) -> None:
+    """Those of docs/reference/commands.md, and what version 4 has besides."""
+    assert set(result_of(command, URL)) == COMMON | more
+
+
+def test_unconfirmed_stop_exits_3_and_a_confirmed_one_names_the_next_command() -> None:
+    """Nothing could be sent to a port that is not there."""
+    result = invoke("stop", "serial:///dev/no-such-port", "--json")
+    assert result.exit_code == 3
+    said = json.loads(result.stdout)
+    assert said["silence"] == "may_play"
+    assert "no such port" in said["cause"]
+    assert "switch it off" in said["cause"]
+    *rows, last = invoke("stop", URL).stdout.splitlines()
+    assert last == f"Next: era amp clear '{URL}'"
+    assert all(len(row.split()) > 1 for row in rows)  # no cause, as nothing went wrong
+
+
+def test_stop_needs_no_trace(tmp_path: Path) -> None:
+    """With a trace file that cannot be written it stops, while other commands do nothing."""
+    options = ("--trace", str(tmp_path / "missing" / "trace.txt"))
+    assert isinstance(invoke("clear", URL, *options).exception, CommandError)
+    assert invoke("stop", URL, *options).exit_code == 0
+
+
+def test_tones_are_measured_by_hand() -> None:
+    """Sensors with unit and channel; a reading of two tones at each, of a plate at rest."""
+    sensors = result_of("sensors", URL)["sensors"]
+    assert [one["channel"] for one in sensors] == [0, 1, 2, 3]
+    assert {(one["measures"], one["unit"]) for one in sensors} == {("acceleration", "m/s²")}
+    tones = ["--frequency", "110", "--frequency", "150", "--window", "0.1"]
+    reading = result_of("measure", URL, *tones)
+    assert (reading["state"], reading["token"]) == ("COMPLETE", 0)
+    for one in reading["sensors"]:
+        assert [tone["frequency_hz"] for tone in one["tones"]] == [110.0, 150.0]
+        assert [tone["amplitude"] for tone in one["tones"]] == [0.0, 0.0]
+
+
+def test_conformance_reads_first_and_reports_what_is_left() -> None:
+    """All reading checks of a serial line pass; driving ones are not run, and named as next."""
+    report = result_of("conformance", URL)
+    assert (report["overall"], report["failed"], report["level"]) == ("incomplete", 0, 0.0)
+    assert report["not_run"] > 40
+    assert {row["result"] for row in report["checks"]} <= {"passed", "skipped"}
+    shown = invoke("conformance", URL)
+    assert shown.exit_code == 0, shown.output
+    assert shown.stdout.splitlines()[-1] == f"Next: era amp conformance '{URL}' --write"
+
+
+@pytest.mark.real_time
+async def test_conformance_stops_after_a_failed_reading_check() -> None:
+    """An amplifier that is armed already: exit status 1, nothing is driven, nor advised."""
+    async with WORD_WIRES["serial"](1) as far:
+        far.amplifiers[1].handle("Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic())
+        arguments = ("conformance", far.url(1), "--write", "--json")
+        result = await asyncio.to_thread(invoke, *arguments)
+        assert result.exit_code == 1, result.output
+        report = json.loads(result.stdout)
+        assert report["overall"] == "failed"
+        assert report["not_run"] > 40
+        rows = {row["name"]: row for row in report["checks"]}
+        assert rows["starts_disarmed"]["result"] == "failed"
+        shown = await asyncio.to_thread(invoke, "conformance", far.url(1))
+        assert (shown.exit_code, "Next: " in shown.stdout) == (1, False)
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), LinkError("line was lost")])
+async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
+    end: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By Ctrl-C, or a line that was lost and is there again: stopped, cleared, its state told."""
+    async with WORD_WIRES["serial"](1) as far:
+
+        async def judged(url: str, *, drives: bool, **others: Any) -> Report:
+            if drives:
+                far.amplifiers[1].handle(
+                    "Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic()
+                )
+                raise end
+            return Report(url, 0.0, (), 1)
+
+        monkeypatch.setattr("era_haptics.lab.conformance.judge_client", judged)
+        result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")
+        assert result.exit_code != 0
+        assert f"{far.url(1)} is left in SWITCH_ON_DISABLED" in result.stderr
+        assert far.amplifiers[1].state == "SWITCH_ON_DISABLED"
+
+
+def test_discover_reports_why_a_port_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reason stands with the port."""
+    port = ListPortInfo("/dev/no-such-port")
+    monkeypatch.setattr("drivers.by_hand.reaching.comports", lambda: [port])
+    result = invoke("discover")
+    assert result.exit_code == 0, result.output
+    assert "no such port" in result.stdout
+
+
+@pytest.mark.parametrize(("url", "status"), [("foo", 2), ("serial:///dev/no-such-port", 3)])
+def test_discover_fails_where_a_named_url_has_no_amplifier(url: str, status: int) -> None:
+    """Exit status 2 for one that is none, 3 for one that cannot be reached; others are listed."""
+    result = invoke("discover", url, URL, "--no-probe")
+    assert result.exit_code == status
+    assert f"{url}: " in result.stdout
+    assert "SIM-main" in result.stdout
+    listed = invoke("discover", url, URL, "--no-probe", "--json")
+    assert listed.exit_code == status
+    assert [each["url"] for each in json.loads(listed.stdout)["amplifiers"]] == [URL]

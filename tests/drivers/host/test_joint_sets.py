@@ -1,12 +1,28 @@
-"""Commits of several lines: at one moment, or none of them; and tokens that fall far behind."""
+"""Commits of several lines: at one moment, or none of them; and tokens that fall far behind.
 
+Where every frame comes late no amplifier is taken for faulty, and clicks are felt or counted.
+
+Stops of a group report what the amplifiers play, whatever happens to frames and on the way.
+
+The source has no path from the controller to a wire that bypasses the ledger.
+"""
+
+import ast
 import asyncio
+import logging
 import math
-from collections.abc import Callable, Sequence
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from itertools import combinations
+from pathlib import Path
 
 import pytest
 
+import drivers
+from chain import set_running
+from courses import Acted
 from drivers.errors import (
     CommandRefused,
     DriverError,
@@ -23,6 +39,11 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
+from group_stops import LINES as GROUP_STOPS_LINES
+from group_stops import PER_CHAIN, PROGRAMMES, Tally
+from group_stops import play as group_stops_play
+from late_taps import AMPLIFIERS, play
+from late_taps import WIRES as LATE_TAPS_WIRES
 from sim.amplifier.readings import AmplifierClock, Crystal
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 
@@ -359,3 +380,133 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     await group.apply({name: [loud(0, 0.2)] for name in group.amplifiers})
     await group.silence(0.0)
     assert [ends[0].levels("a")[0], ends[1].levels("b")[0]] == [0.0, 0.0]
+
+
+_ROWS = [(wire, amplifiers, 1) for wire in LATE_TAPS_WIRES for amplifiers in AMPLIFIERS]
+
+
+# The others: three on a line were not fed in time, or one that replied again was not heard.
+@pytest.mark.parametrize(
+    ("wire", "amplifiers", "seed"), [*_ROWS, ("modbus", 3, 12), ("modbus", 3, 64)]
+)
+def test_late_frames_are_no_fault(wire: str, amplifiers: int, seed: int) -> None:
+    """Up to 16 ms either way: nothing is wrong, and each click that was not played is counted.
+
+    But for some that come while all is disarmed. On one amplifier, in one exchange, all may be.
+    """
+    counts = play(wire, amplifiers, seed)
+    taps, played, too_late = map(counts.pop, ("taps", "played", "too late"))
+    assert not counts - Counter(["clicks"] * taps)
+    assert too_late > 0 or amplifiers == 1
+    assert played + too_late >= 0.9 * taps
+
+
+@in_virtual_time
+async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> None:
+    """On a line that amplifiers share, where one commit feeds all of them before each in turn."""
+    async with set_running("a", "b", of=Acted, wire="modbus-rtu") as chain:
+        chain.witness.disturb()  # a status goes before what feeds
+        chain.delays(0.012)
+        await chain.holds(1.0, "finger")
+        assert chain.controller.group.is_armed
+        chain.answer("GetStatus", watchdog_left=250)
+        await chain.holds(3.0, "finger")
+        assert not chain.controller.group.is_armed
+
+
+STOPS, FIRST = (int(os.environ.get(name, value)) for name, value in (("STOPS", 216), ("FIRST", 0)))
+
+
+@pytest.fixture(autouse=True)
+def _unlogged() -> Iterator[None]:
+    """Losses and planted exceptions are logged by the thousand."""
+    logger = logging.getLogger("drivers")
+    logger.setLevel(logging.CRITICAL)
+    yield
+    logger.setLevel(logging.NOTSET)
+
+
+@pytest.mark.parametrize(
+    ("programme", "share", "least"),
+    [*zip(PROGRAMMES, (PER_CHAIN, 6, 6), (0.25, 0.25, 1 / 3), strict=True)],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # coroutines that were never awaited
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_stop_is_true(programme: str, share: int, least: float) -> None:
+    """On every wire: what is confirmed silent is silent, and stays so.
+
+    With faults of frames in every scene; with an exception at any line of the drivers that runs
+    meanwhile; of an amplifier that a killed host has left playing.
+    """
+    tally = Tally()
+    for seed in range(FIRST, FIRST + STOPS // share):
+        group_stops_play(programme, seed, tally)
+    assert tally.found == []
+    assert tally.total("confirmed") > tally.total("stops") * least
+    if programme.startswith("frames"):
+        assert all(tally.counts[wire, "may play"] for wire in GROUP_STOPS_LINES)
+        assert tally.total("raised") == 0
+
+
+ROOT = Path(drivers.__file__).parents[1]
+ON_THE_WAY = sorted(
+    file for package in ("drivers", "controller") for file in (ROOT / package).rglob("*.py")
+)
+
+# Sends sets of its own, and frames damaged on purpose, to amplifiers that it judges.
+CONFORMANCE = ROOT / "drivers" / "judge" / "asking"
+
+# Kinds of wire make the bytes of requests; ports of CAN adapters take and give packed frames.
+WIRES = ROOT / "drivers" / "wires"
+
+# One class makes requests of sets.
+HOST = ROOT / "drivers" / "host"
+
+
+@cache
+def nodes(file: Path) -> list[ast.AST]:
+    """All nodes of a file."""
+    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
+def calls(file: Path, part: str) -> Iterator[tuple[str, ast.Call]]:
+    """Calls in a file that has a part of a name, with the last part of their name."""
+    for node in nodes(file) if part in file.read_text(encoding="utf-8") else ():
+        if isinstance(node, ast.Call):
+            called = node.func
+            yield getattr(called, "attr", "") or getattr(called, "id", ""), node
+
+
+def test_only_wires_use_encoders() -> None:
+    """`encode_...` and `pack_...` are called by wires, codecs and the table, not from above."""
+    users = {
+        file
+        for file in ON_THE_WAY
+        for part in ("encode_", "pack_")
+        for name, _ in calls(file, part)
+        if name.startswith(part)
+    }
+    wires = {file for file in users if WIRES in file.parents}
+    assert {file.parent.name for file in wires if file.name == "host.py"} == {
+        "can_bus",
+        "serial_line",
+    }
+    above = [file for file in users - wires if "protocol" not in file.parts]
+    assert {file.parent for file in above} == {CONFORMANCE, HOST}
+    assert [file.name for file in above if file.parent == HOST] == ["dialogue.py"]
+
+
+def test_only_what_a_ledger_admits_is_packed() -> None:
+    """The host makes the words of sets in one place, of what `admit` returned."""
+    (packed,) = (
+        ast.unparse(call.args[0])
+        for file in ON_THE_WAY
+        for name, call in calls(file, "pack_layers")
+        if name == "pack_layers" and file.parent != CONFORMANCE
+    )
+    admitted = [
+        ast.unparse(node.targets[0])
+        for node in nodes(HOST / "dialogue.py")
+        if isinstance(node, ast.Assign) and ".ledger.admit(" in ast.unparse(node.value)
+    ]
+    assert admitted == [packed]

@@ -1,25 +1,47 @@
-"""Sets of which frames are lost: all play whole and once, or it is said that they do not."""
+"""Sets of which frames are lost: all play whole and once, or it is said that they do not.
+
+Statuses that are late, of what ends meanwhile: no sound amplifier contradicts its requests.
+
+What a group does where something fails that should not: nobody feels more than is said.
+
+Groups on lines in virtual time: courses, of the sentence that they prove.
+
+What a person would feel is read from the simulated amplifiers themselves.
+"""
 
 import asyncio
+import contextlib
 import random
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from drivers.errors import DriverError, LinkTimeout
+from courses import Taken, courses, follow
+from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkTimeout, Preempted
+from drivers.host.amplifier import read_measured
+from drivers.host.dialogue import Stopped
 from drivers.host.group import Group
-from drivers.playing import Layer
-from drivers.protocol.definition import MESSAGES
+from drivers.playing import Layer, Tone
+from drivers.protocol.definition import MESSAGES, STATES
+from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words
+from sim.amplifier.simulated_amplifier import Amplifier as FarEnd
 from virtual_lines import (
     KINDS,
     Alter,
     MemoryLine,
     group_of,
     grouped,
+    in_virtual_time,
     layer,
+    losing,
     run_virtual,
     tone,
     unaltered,
@@ -215,3 +237,556 @@ async def test_one_reply_is_due_at_a_time_where_two_share_a_line(
     await group.apply(dict.fromkeys("ab", of_parts(3)))
     await group.beat()
     assert (due, most) == (0, 1)
+
+
+LATEST = 0.014  # s, each way
+PULSE = tone(level=0.0, onset=Envelope(100, ((3000, 0), (3000, 0))))  # over after 30 ms
+
+
+def delayed(end: MemoryLine, rng: random.Random) -> None:
+    """Have what passes a line come late, as on a busy machine."""
+    end.inward = end.outward = lambda name, data: [(rng.uniform(0.0, LATEST), data)]
+
+
+async def read(group: Group) -> None:
+    """Read two statuses of the amplifier, which show a contradiction each."""
+    for _ in range(2):
+        await asyncio.sleep(0.02)
+        await group.amplifiers["a"].read_status()
+
+
+@pytest.mark.parametrize("ends_by", ["a pulse", "its time", "what waited"])
+@in_virtual_time
+async def test_what_ends_amid_an_exchange_may_be_shown_or_not(ends_by: str) -> None:
+    """Up to 14 ms out, and back: a status may show the layer and its level, whenever it is read."""
+    rng, end = random.Random(5), MemoryLine("serial", "a")
+    group = await group_of(end, watchdog=2.0)
+    host = group.amplifiers["a"]
+    layers = {
+        "a pulse": [layer(0, PULSE)],
+        "its time": [layer(0, tone(ending=Envelope(50, ((8000, 0),))), valid_for=0.04)],
+        "what waited": [layer(0, PULSE), layer(1, tone(1, 0.1))],
+    }[ends_by]
+    shown = set[int]()
+    for _ in range(60):
+        await group.apply({"a": layers})
+        if ends_by == "what waited":
+            await group.apply({"a": [layer(0, tone(level=0.4), after=True, valid_for=0.02)]})
+        delayed(end, rng)
+        for _ in range(4):
+            await asyncio.sleep(rng.uniform(0.0, 0.02))
+            shown.add((await host.read_status())["tokens"][0] > 0)
+            assert host._contradictions == 0
+        end.inward = end.outward = unaltered
+        await asyncio.sleep(0.1)
+    assert shown == {False, True}
+
+
+@in_virtual_time
+async def test_renewal_that_comes_as_its_layer_ends_may_be_too_late() -> None:
+    """A layer of 40 ms is renewed about then, up to 14 ms late: it plays on, or it does not."""
+    rng, end = random.Random(7), MemoryLine("serial", "a")
+    group = await group_of(end, watchdog=2.0)
+    host, shown = group.amplifiers["a"], set[int]()
+    for _ in range(40):
+        await group.apply({"a": [layer(0, tone(), valid_for=0.04)]})
+        delayed(end, rng)
+        await asyncio.sleep(rng.uniform(0.02, 0.045))
+        await group.apply({"a": [layer(0, renew=True, valid_for=1.0)]})
+        for _ in range(3):
+            await asyncio.sleep(0.015)
+            shown.add((await host.read_status())["tokens"][0] > 0)
+            assert host._contradictions == 0
+        end.inward = end.outward = unaltered
+        await group.silence(0.0)
+    assert shown == {False, True}
+
+
+@grouped(("a",), wire="serial")
+async def test_silence_without_a_reply_may_have_been_heard(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Three times: all that plays is over, as statuses say afterwards; a wrong token contradicts.
+
+    Once a silence is confirmed another layer that is not played contradicts as ever.
+    """
+    (end,), host = ends, group.amplifiers["a"]
+    await group.apply({"a": [layer(0, tone())]})
+    end.outward = losing("Silence", count=3)
+    with pytest.raises(LinkDegraded):
+        await group.silence(0.005)
+    for _ in range(3):
+        await asyncio.sleep(0.02)
+        assert (await host.read_status())["tokens"][0] == 0
+        await host.ping()
+    assert host._contradictions == 0
+    await group.silence(0.005)
+    await group.apply({"a": [layer(0, tone())]})
+    await asyncio.sleep(0.02)
+    end.far["a"].playback.silence(end.loop.time(), 0.0)
+    with pytest.raises(CommandRefused, match="token of layer 0"):
+        await read(group)
+
+
+@pytest.mark.parametrize("what", ["token", "level"])
+@in_virtual_time
+async def test_layer_that_is_dropped_is_found_where_statuses_are_late(what: str) -> None:
+    """Silent, or at half its level: by two statuses, however late."""
+    end = MemoryLine("serial", "a")
+    group = await group_of(end)
+    await group.apply({"a": [layer(0, tone())]})
+    delayed(end, random.Random(6))
+    await asyncio.sleep(0.05)
+    playback, now = end.far["a"].playback, end.loop.time()
+    if what == "token":
+        playback.silence(now, 0.0)
+    else:
+        playback.scale(now, 0.5, 0.0)
+    with pytest.raises(CommandRefused, match=f"{what} of"):
+        await read(group)
+
+
+def altered(
+    far: FarEnd, change: Callable[[str, Values, float, Callable[..., Values]], Values]
+) -> None:
+    """Have a far end reply by a function of the request, its time, and what it does itself."""
+    handle = far.handle
+    far.handle = lambda name, values, now, **options: change(  # type: ignore[method-assign]
+        name, values, now, partial(handle, **options)
+    )
+
+
+@grouped(("a",), ("b",), wire="serial")
+async def test_reply_that_cannot_be_noted_keeps_nobody_waiting(
+    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The exchange fails, all are stopped; a stop whose reply cannot be noted ends in time."""
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("planted")
+
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    monkeypatch.setattr(group.amplifiers["b"].ledger, "resolve", fail)
+    with pytest.raises(ZeroDivisionError):
+        async with asyncio.timeout(1.0):
+            await group.apply({name: [layer(0, tone(level=0.4))] for name in "ab"})
+    assert not group.is_armed
+    await asyncio.sleep(0.01)
+    assert (ends[0].levels("a"), ends[1].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+    monkeypatch.setattr(group.amplifiers["b"].ledger, "silenced", fail)
+    async with asyncio.timeout(1.0):
+        await group.stop()
+
+
+@grouped(("a", "b"), wire="serial")
+async def test_stop_is_sent_to_each_where_the_broadcast_fails(
+    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever fails in the broadcast, which comes first."""
+    await group.apply({name: [layer(0, tone())] for name in "ab"})
+    submit = ends[0].line.submit
+
+    def fail(member: object, *values: object, **other: object) -> object:
+        if member is None:
+            raise ZeroDivisionError("planted")
+        return submit(member, *values, **other)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ends[0].line, "submit", fail)
+    stopped = await group.stop()
+    assert all(each.is_confirmed for each in stopped.values())
+    assert (ends[0].levels("a"), ends[0].levels("b")) == ([0.0, 0.0], [0.0, 0.0])
+
+
+@grouped(("a",), wire="serial")
+async def test_arm_that_was_busy_after_a_lost_reply_does_not_stay_armed(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """The first attempt has armed it, the repeated ones are refused: it is disarmed."""
+    await group.disarm()
+    ends[0].far["a"].session = 1  # that of the test never changes, and is not taken twice
+    asked = 0
+
+    def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        nonlocal asked
+        if name == "Arm":
+            asked += 1
+            if asked > 1:
+                raise Refusal("busy", "BUSY")
+        return handle(name, values, now)
+
+    ends[0].outward = losing("Arm", count=2)  # its event, and the reply
+    altered(ends[0].far["a"], busy)
+    with pytest.raises(CommandRefused):
+        await group.arm()
+    assert asked > 1
+    assert ends[0].far["a"].state != "OPERATION_ENABLED"
+
+
+@grouped(("a",), ("b",), wire="serial")
+async def test_amplifier_that_is_not_armed_after_arm_is_not_said_to_be(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """It tells a fault in its reply: none stays armed, not even the one that was."""
+    await group.disarm()
+    for end in ends:
+        for far in end.far.values():
+            far.session = 1  # that of the test never changes, and is not taken twice
+    far = ends[1].far["b"]
+
+    def trip(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        reply = handle(name, values, now)
+        if name != "Arm":
+            return reply
+        far.trip("OVER_VOLTAGE", now)
+        return far.status(now)
+
+    altered(far, trip)
+    with pytest.raises(CommandRefused, match="OVER_VOLTAGE"):
+        await group.arm()
+    assert not group.is_armed
+    assert ends[0].far["a"].state != "OPERATION_ENABLED"
+
+
+@grouped(("a",), wire="serial")
+async def test_ramp_of_a_disarm_may_play_on_after_the_watchdog(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """One of 1 s is heard once, no reply comes: it is not lost while it fades."""
+    (end,) = ends
+    await group.apply({"a": [layer(0, tone())]})
+    end.outward = lambda name, data: []
+    disarming = asyncio.ensure_future(group.disarm(1.0))
+    for _ in range(100):
+        await asyncio.sleep(0.001)
+        if end.far["a"].state != "OPERATION_ENABLED":
+            break
+    end.inward = lambda name, data: []
+    while end.levels("a")[0]:
+        assert not group.members.lost_by
+        await asyncio.sleep(0.005)
+    with pytest.raises(DriverError):
+        await disarming
+
+
+@pytest.mark.parametrize("wire", ["serial", "can", "tcp"])
+@grouped(("a",))
+async def test_reading_that_gives_way_to_a_set_is_no_silence(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """Its reply takes 8 ms, the set has several parts: all are played, then it is read."""
+    (end,) = ends
+    end.outward = lambda name, data: [(0.008 if name == "GetMeasured" else 0.0002, data)]
+    reading = asyncio.ensure_future(read_measured(group.amplifiers["a"]))
+    await asyncio.sleep(0.001)
+    onset = Envelope(20, ((100, 0),) * 12)
+    await group.apply({"a": [layer(number, tone(level=0.05, onset=onset)) for number in range(4)]})
+    assert not group.members.degraded
+    await reading
+
+
+@pytest.mark.parametrize("wire", ["serial", "can", "rtu"])
+@grouped(("a",))
+async def test_heartbeats_and_stops_go_between_the_parts_of_a_set(
+    group: Group, ends: list[MemoryLine]
+) -> None:
+    """What comes while parts are on the line is sent next; after a stop no other part is."""
+    (end,) = ends
+    end.outward = lambda _, data: [(0.002, data)]
+    tones = [tone(each, 0.05, onset=Envelope(20, ((100, 0),) * 12)) for each in (0, 1)]
+    layers = {"a": [layer(number, *tones) for number in range(8)]}
+    kinds = [f"1:{MESSAGES[name].number}" for name in ("Set", "Ping", "Stop")]
+    part, heartbeat, stop = kinds
+
+    def sent() -> list[str]:
+        return [each for _, each in end.sent]
+
+    playing = asyncio.ensure_future(group.apply(layers))
+    await asyncio.sleep(0.001)
+    assert sent()[-1] == part
+    end.sent.clear()
+    await group.amplifiers["a"].ping()
+    await playing
+    assert sent()[:2] == [heartbeat, part]
+    assert sent()[-1] == part
+    playing = asyncio.ensure_future(group.apply(layers))
+    await asyncio.sleep(0.001)
+    end.sent.clear()
+    await group.stop()
+    with pytest.raises(Preempted):
+        await playing
+    assert sent()[0] == stop
+    assert part not in sent()
+    assert end.far["a"].state == "QUICK_STOP_ACTIVE"
+
+
+@grouped(("a",), wire="serial")
+async def test_request_to_a_busy_amplifier_goes_again_whenever_its_timer_comes(
+    group: Group, ends: list[MemoryLine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the clock of some systems a timer comes up to 16 ms early: here 4 ms."""
+    (end,) = ends
+    call_at, refusals = end.loop.call_at, [Refusal("busy", "BUSY")]
+
+    def early(when: float, *args: Any, **more: Any) -> asyncio.TimerHandle:
+        return call_at(when - 0.004 if when - end.loop.time() > 0.0045 else when, *args, **more)
+
+    def busy(name: str, values: Values, now: float, handle: Callable[..., Values]) -> Values:
+        if name == "Ping" and refusals:
+            raise refusals.pop()
+        return handle(name, values, now)
+
+    monkeypatch.setattr(end.loop, "call_at", early)
+    altered(end.far["a"], busy)
+    await asyncio.wait_for(group.beat(), 0.1)
+    assert not refusals
+
+
+@pytest.mark.parametrize("what", ["cables", "replies"])
+@grouped(("a",), ("b",))
+async def test_lines_that_are_exchanged_while_armed_are_silenced(
+    group: Group, ends: list[MemoryLine], what: str
+) -> None:
+    """Each amplifier refuses the other's session, and a line takes no reply to the other's request.
+
+    Both are at address 1, alike and silent, so that no status contradicts what was sent.
+    """
+    first, second = ends
+    if what == "cables":
+        first._end, second._end = (
+            one.kind.far_end({1: far}, one._send)
+            for one, far in ((first, second.far["b"]), (second, first.far["a"]))
+        )
+    else:
+        await second.hosts["b"].read_status()  # numbers of requests begin anywhere on each line
+        first.line, second.line = second.line, first.line
+    async with asyncio.timeout(2.0):
+        while group.is_armed:
+            with contextlib.suppress(DriverError):
+                await group.beat()
+            await asyncio.sleep(0.05)
+    await asyncio.sleep(0.3)
+    for end in ends:
+        for far in end.far.values():
+            far.tick(end.loop.time())
+            assert far.state != "OPERATION_ENABLED"
+
+
+@grouped(("a", "b"), ("c",), wire="serial")
+async def test_session_is_one_on_each_line(group: Group, ends: list[MemoryLine]) -> None:
+    """A broadcast commit carries it to all amplifiers of its line, and plays on no other's."""
+    await group.apply({name: [layer(0, tone())] for name in "abc"})
+    await asyncio.sleep(0.01)
+    assert [ends[0].levels("a"), ends[0].levels("b"), ends[1].levels("c")] == [[0.5, 0.0]] * 3
+    a, b, c = (far.session for end in ends for far in end.far.values())
+    assert a == b != c
+
+
+def _layer(number: float, channel: float = 0, level: float = 0, frequency: float = 0) -> Layer:
+    """A layer with a ramp of 1 ms and a tone, or none without a frequency."""
+    tones = (Tone(int(channel), frequency, level),) if frequency else ()
+    return Layer(int(number), tones, 0.001)
+
+
+@dataclass
+class OnLines(Taken):
+    """A group on lines, which takes steps; lines are given by number, amplifiers by name."""
+
+    lines: Sequence[MemoryLine] = ()
+    group: Group = field(init=False)
+    stopped: dict[str, Stopped] = field(default_factory=dict)
+    since: float = 0.0
+
+    @property
+    def far(self) -> SimpleNamespace:
+        """The amplifiers by name."""
+        return SimpleNamespace(
+            **{name: far for line in self.lines for name, far in line.far.items()}
+        )
+
+    @property
+    def hosts(self) -> SimpleNamespace:
+        """What the host has of them, by name."""
+        return SimpleNamespace(**self.group.amplifiers)
+
+    @property
+    def levels(self) -> dict[str, list[float]]:
+        """What channels play now."""
+        return {name: line.levels(name) for line in self.lines for name in line.far}
+
+    @property
+    def sent(self) -> list[list[str]]:
+        """What was sent on each line since `forget`, as address:number."""
+        return [[each for _, each in line.sent] for line in self.lines]
+
+    @property
+    def unexpected(self) -> list[int]:
+        """Frames on each line that belonged to nothing."""
+        return [line.line.wire.counters.unexpected_frames for line in self.lines]
+
+    @property
+    def tokens(self) -> dict[str, Any]:
+        """Tokens of layers, as the host has them."""
+        return {name: each.ledger.playback.tokens for name, each in self.group.amplifiers.items()}
+
+    @property
+    def may_play(self) -> list[str]:
+        """What the last stop said may play on, with a time and a cause."""
+        left = {name: each for name, each in self.stopped.items() if not each.is_confirmed}
+        return [name for name, each in left.items() if each.may_play_until > self.since]
+
+    @property
+    def causes(self) -> list[str]:
+        """Why each is not confirmed."""
+        return [each.cause for each in self.stopped.values()]
+
+    def forget(self) -> None:
+        """Forget what was sent so far."""
+        self.since = self.lines[0].loop.time()
+        for line in self.lines:
+            line.sent.clear()
+
+    def never_sent(self, line: int, *requests: str) -> None:
+        """Require that none of these was sent on a line."""
+        assert not {*requests} & {*self.sent[line]}
+
+    def sent_within(self, request: str, seconds: float) -> None:
+        """Require that a request was sent on the first line so soon after `forget`."""
+        assert (
+            next(at for at, each in self.lines[0].sent if each == request) <= self.since + seconds
+        )
+
+    async def applies(self, **rows: Sequence[Sequence[float]]) -> None:
+        """Apply rows of layer, channel, level, frequency [Hz], by amplifier; a layer alone ends."""
+        layers = {name: [_layer(*row) for row in each] for name, each in rows.items()}
+        await self.group.apply(layers)
+
+    async def plays(self, level: float) -> None:
+        """Play 100 Hz at a level on the first channel of all amplifiers, in layer 0."""
+        await self.applies(**{name: [(0, 0, level, 100.0)] for name in self.group.amplifiers})
+
+    async def reads(self, name: str, times: int = 1) -> None:
+        """Read the status of one, so often at once."""
+        await asyncio.gather(*(self.group.amplifiers[name].read_status() for _ in range(times)))
+
+    async def beats(self, times: int) -> None:
+        """Beat so often, 50 ms after one another."""
+        for _ in range(times):
+            await asyncio.sleep(0.05)
+            await self.group.beat()
+
+    async def stops(self, **confirmed: bool) -> None:
+        """Stop all; it is confirmed, or not, that they are silent."""
+        self.since = self.lines[0].loop.time()
+        self.stopped = {**await self.group.stop()}
+        assert {name: each.is_confirmed for name, each in self.stopped.items()} == confirmed
+        assert all(each.is_confirmed or each.cause for each in self.stopped.values())
+
+    def answers_after(self, *delays: float) -> None:
+        """Let replies come after these times, the last for all that follow; without any, none."""
+        for line in self.lines:
+            left = [*delays]
+            line.outward = (
+                lambda _, data, left=left: [  # type: ignore[misc]
+                    (left.pop(0) if len(left) > 1 else each, data) for each in left[:1]
+                ]
+            )
+
+    def mute(self, number: int, seconds: float = 1e9) -> None:
+        """Let no reply come on a line, for a time."""
+        line = self.lines[number]
+        until = line.loop.time() + seconds
+        line.outward = lambda _, data: [] if line.loop.time() < until else [(0.0, data)]
+
+    def tells_nothing(self, address: str) -> None:
+        """Let no reply come to a request at an address of the first line."""
+        (line, *_) = self.lines
+        answered = line.outward
+        line.outward = lambda name, data: (
+            [] if line.sent[-1][1].startswith(address) else answered(name, data)
+        )
+
+    def hears_nothing(self, *names: str) -> None:
+        """Let amplifiers of the first line get nothing that is for them alone."""
+        (line, *_) = self.lines
+        muted = {line.hosts[name].address for name in names}
+        line.inward = lambda _, data: [] if line.kind.request_of(data)[0] in muted else [(0, data)]  # type: ignore[index]
+
+    def misses(self, name: str, count: int, line: int) -> None:
+        """Lose so many requests of a name on a line."""
+        self.lines[line].inward = losing(name, count=count)
+
+    def loses_reply(self, name: str) -> None:
+        """Lose a reply to a request of a name on the first line."""
+        self.lines[0].outward = losing(name)
+
+    def cuts(self, line: int) -> None:
+        """Cut a line."""
+        self.lines[line].line.lose("cut")
+
+    def lies(self, **said: Any) -> None:
+        """Let the first amplifier say something else in each status."""
+        far = self.far.a
+        status = far.status
+        said |= {"state": STATES[said["state"]]} if "state" in said else {}
+        far.status = lambda now: {**status(now), **said}
+
+    def obeys_instead(self, **instead: str) -> None:
+        """Let the first amplifier take requests of some names for others."""
+        far = self.far.a
+        handle = far.handle
+
+        def obey(name: str, values: Values, now: float, **options: bool) -> Any:
+            given = {} if name in instead else values
+            return handle(instead.get(name, name), given, now, **options)
+
+        far.handle = obey
+
+    def trips(self, name: str, fault: str) -> None:
+        """Let an amplifier trip."""
+        getattr(self.far, name).trip(fault, self.lines[0].loop.time())
+
+    def heats(self, celsius: float) -> None:
+        """Let the first amplifier be so warm."""
+        self.far.a.set_temperature(celsius, self.lines[0].loop.time())
+
+    def had_another_session(self) -> None:
+        """Let the first have been armed by another: that of these tests is not taken twice."""
+        self.far.a.session = 1
+
+    def asks(self, name: str, request: str, **values: int) -> None:
+        """Let another host ask something of an amplifier."""
+        getattr(self.far, name).handle(request, values, self.lines[0].loop.time())
+
+    def becomes(self, name: str, serial_number: str) -> None:
+        """Have another amplifier in its place."""
+        getattr(self.far, name).identity["serial_number"] = serial_number
+
+    def sleeps(self, seconds: float) -> None:
+        """Let this machine sleep."""
+        self.lines[0].loop.now += seconds  # type: ignore[attr-defined]
+
+    async def waits_for_the_loss(self) -> None:
+        """Wait until an amplifier is lost, for the host."""
+        await asyncio.sleep(self.group.members.lost_from - self.lines[0].loop.time())
+
+
+@asynccontextmanager
+async def on_lines(*names: str, **options: Any) -> AsyncIterator[OnLines]:
+    """An armed group; names: of the amplifiers on each line, a letter each; wire, is_armed."""
+    wire = options.pop("wire")
+    made = OnLines(lines=[MemoryLine(wire, *each) for each in names])
+    made.group = await group_of(*made.lines, **options)
+    yield made
+
+
+COURSES = courses(Path(__file__).with_name("courses.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [(name, kind) for name, each in COURSES.items() for kind in each.get("wires", KINDS)],
+)
+def test_group_keeps_to_its_course(name: str, kind: str) -> None:
+    """Every step is as it is in the file, on every kind of wire that it names, or on all."""
+    course = {key: value for key, value in COURSES[name].items() if key != "wires"}
+    follow({**course, "wire": kind}, on_lines)

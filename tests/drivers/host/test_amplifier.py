@@ -1,0 +1,720 @@
+"""Readings of sensors: whole ones, and replies that contradict themselves or the request.
+
+Who is at an address: the expected amplifier, another one, or several.
+
+What an amplifier says it plays, compared with what it was sent.
+
+Amplifiers of protocol 4 by their URLs, on real terminals, TCP connections and CAN adapters.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any
+
+import pytest
+
+from drivers.errors import (
+    CommandError,
+    CommandRefused,
+    DriverError,
+    FrameError,
+    LinkError,
+    LinkTimeout,
+)
+from drivers.host.amplifier import Amplifier as AmplifierAmplifier
+from drivers.host.amplifier import Amplifier as Host
+from drivers.host.amplifier import Sensor, measure_tones, read_measured, read_sensors, start_reading
+from drivers.host.group import Group
+from drivers.opening import Lines
+from drivers.playing import Layer, Tone
+from drivers.ports import PORT_OPENER, Port
+from drivers.protocol.definition import MESSAGES, READING_STATES, UNKNOWN_PLACE, sensor_reading
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
+from drivers.wires.can_frames import unpack_frames
+from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame
+from drivers.wires.serial_line import SerialWire
+from drivers.wires.wire import Reply
+from real_wires import WORD_WIRES
+from registry.limits import GuardLimits
+from sim.amplifier.readings import capabilities
+from sim.amplifier.simulated_amplifier import Amplifier
+from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual
+from virtual_lines import LIMITS as VIRTUAL_LINES_LIMITS
+from virtual_lines import unaltered as virtual_lines_unaltered
+
+FREQUENCIES = [110.0, 173.5]
+ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}
+Alter = Callable[[str, Values], Values]
+
+
+class Sensors:
+    """Sensors of a far end, with a reading of theirs; alter: changes each reply."""
+
+    def __init__(self, count: int, alter: Alter) -> None:
+        self._count, self._alter = count, alter
+        self._number = self._tones = 0
+        self._reads = 0
+
+    def handle(self, name: str, values: Values, now: float) -> Values:
+        """Reply to a request."""
+        return self._alter(name, self._reply(name, values))
+
+    def _reply(self, name: str, values: Values) -> Values:
+        if name == "GetSensors":
+            rows = [ROW] * min(self._count - values["first"], 10)
+            return {"all": self._count, "count": len(rows), "sensors": rows}
+        if name == "Measure":
+            self._number, self._tones = values["reading"], values["tones"]
+        head = {"reading": self._number, "window_start": 0, "token": 0, "tones": self._tones}
+        if name == "Measure":
+            state = READING_STATES["RUNNING"]
+            return {**head, "state": state, "window_left": 100, "count": 0, "sensors": []}
+        count = min(self._count - values["first"], 16)
+        tones = [{"amplitude": float(each + 1), "phase": -9000} for each in range(self._tones)]
+        words: list[int] = []
+        for _ in range(count):
+            sensor_reading(self._tones).append(words, {"flags": 1, "tones": tones})
+        done = {"state": READING_STATES["COMPLETE"], "window_left": 0}
+        return {**head, **done, "count": count, "sensors": words}
+
+    def changed(self, moment: float) -> None:
+        """Nothing."""
+
+    def forget(self) -> None:
+        """Nothing."""
+
+
+def unaltered(name: str, reply: Values) -> Values:
+    """A reply as it should be."""
+    return reply
+
+
+def changed(which: str, name: str, reply: Values, **changes: Any) -> Values:
+    """A reply with changes, if it is to this request."""
+    return {**reply, **changes} if name == which else reply
+
+
+async def opened(alter: Alter = unaltered, count: int = 20) -> MemoryLine:
+    """A line with an amplifier, identified, that has sensors."""
+    line = MemoryLine("serial", "a")
+    line.far["a"].attach(Sensors(count, alter))
+    await line.hosts["a"].open()
+    return line
+
+
+@in_virtual_time
+async def test_sensors_and_their_tones_come_in_several_replies() -> None:
+    """Twenty: ten descriptions and sixteen readings in a reply, in the units of the wire."""
+    line = await opened()
+    sensors = await read_sensors(line.hosts["a"])
+    assert sensors == (Sensor("ACCELERATION", None, 0.1, 0.2, 512.0, 1000.0),) * 20
+    reading = await measure_tones(line.hosts["a"], FREQUENCIES, 0.1)
+    assert reading.state == "COMPLETE"
+    assert [one.tones for one in reading.sensors] == [((1.0, -90.0), (2.0, -90.0))] * 20
+    assert all(one.is_overloaded for one in reading.sensors)
+
+
+@in_virtual_time
+async def test_place_that_is_unknown_is_none() -> None:
+    """As at the foot of a channel's actuator."""
+    row = {**ROW, "channel": 1, "x": UNKNOWN_PLACE, "y": UNKNOWN_PLACE}
+    line = await opened(partial(changed, "GetSensors", sensors=[row]), 1)
+    (sensor,) = await read_sensors(line.hosts["a"])
+    assert (sensor.channel, sensor.x, sensor.y) == (1, None, None)
+
+
+@in_virtual_time
+async def test_reading_of_another_host_is_not_taken_for_the_one_begun() -> None:
+    """The reply to Measure, or to GetReading, is of another number."""
+    for name in ("Measure", "GetReading"):
+
+        def alter(request: str, reply: Values, name: str = name) -> Values:
+            return changed(name, request, reply, reading=reply.get("reading", 0) % 65535 + 1)
+
+        line = await opened(alter)
+        with pytest.raises(CommandRefused, match="replaced"):
+            await measure_tones(line.hosts["a"], FREQUENCIES, 0.1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"state": READING_STATES["RUNNING"]},
+        {"count": 0, "sensors": []},
+        {"count": 17},
+        {"tones": 1},
+        {"tones": 60_000},
+    ],
+    ids=["never ends", "no sensors", "too few words", "other tones", "absurd tones"],
+)
+@in_virtual_time
+async def test_incomplete_reading_is_an_error(changes: dict[str, Any]) -> None:
+    """A reading that never ends, or has other sensors or tones than were begun."""
+    line = await opened(partial(changed, "GetReading", **changes))
+    with pytest.raises(FrameError):
+        await measure_tones(line.hosts["a"], FREQUENCIES, 0.1)
+
+
+@in_virtual_time
+async def test_tones_that_the_window_does_not_tell_apart_are_not_sent() -> None:
+    """110 and 112 Hz need half a second; no tone and seventeen are none."""
+    line = await opened()
+    for frequencies in ([110.0, 112.0], [], [20.0 * each for each in range(1, 18)]):
+        with pytest.raises(CommandError):
+            await start_reading(line.hosts["a"], frequencies, 0.4)
+    with pytest.raises(CommandError):
+        await start_reading(line.hosts["a"], [110.0], 11.0)
+
+
+def loud(level: float) -> Layer:
+    """A tone of 100 Hz on the first channel."""
+    return Layer(0, (Tone(0, 100.0, level),), 0.001)
+
+
+def restart(end: MemoryLine, **changes: object) -> None:
+    """Switch the amplifier off and on again, as one with other capabilities: it boots on CAN."""
+    far = end.far["a"]
+    far.capabilities = {**far.capabilities, **changes}
+    far.restart(end.loop.time())
+    far.latch = 0
+    if end.kind is KINDS["can"]:
+        end.boot(1)
+
+
+@in_virtual_time
+async def test_amplifier_that_was_switched_off_is_armed_with_its_new_limits(wire: str) -> None:
+    """It plays at most 0.3 since: 0.4 is refused here, before anything is sent."""
+    end = MemoryLine(wire, "a")
+    group = await group_of(end, is_armed=False)
+    restart(end, level_max=3000)
+    await group.arm()
+    end.sent.clear()
+    with pytest.raises(CommandRefused):
+        await group.apply({"a": [loud(0.4)]})
+    assert end.sent == []
+    await group.apply({"a": [loud(0.3)]})
+
+
+@in_virtual_time
+async def test_amplifier_that_restarts_amid_a_session_can_be_cleared_and_armed(wire: str) -> None:
+    """Its latches begin anew, so that the stop is not confirmed; clear and arm know it again."""
+    end = MemoryLine(wire, "a")
+    group = await group_of(end)
+    assert (await group.stop())["a"].is_confirmed
+    await group.clear()
+    group._draw = lambda low, high: 78
+    await group.arm()
+    await group.apply({"a": [loud(0.5)]})
+    restart(end)
+    with pytest.raises(DriverError):
+        await group.beat()
+    await group.stop()
+    group._draw = lambda low, high: 79
+    await group.clear()
+    await group.arm()
+    await group.apply({"a": [loud(0.5)]})
+    await group.stop()
+    assert end.levels("a") == [0.0, 0.0]
+
+
+@in_virtual_time
+async def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> None:
+    """The same amplifier's, doubled on its way."""
+    end = MemoryLine(wire, "a")
+    end.outward = lambda name, data: [(0.0002, data), (0.004, data)]
+    await end.hosts["a"].open()
+
+
+def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
+    """Of a request that came twice, and late: each of its replies is of its own moment."""
+    line, far = SerialWire(921_600, sequence=1), Amplifier("a", channels=2)
+    (asked,) = FrameReader().feed(line.request(1, "GetStatus", {}))
+    arrivals = []
+    for temperature in (250, 251):
+        words = MESSAGES["GetStatus"].reply.pack({**far.status(0.0), "temperature": temperature})
+        arrivals += line.received(encode_frame(asked._replace(kind=asked.kind | REPLY), words))
+        line.request(1, "Hello", {})
+    assert [type(each) for each in arrivals] == [Reply]
+
+
+@pytest.mark.parametrize("is_output", [True, False])
+@in_virtual_time
+async def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) -> None:
+    """A linear amplifier where the rig has a stiff source, and the other way round."""
+    end = MemoryLine(wire, "a")
+    end.far["a"].capabilities = capabilities(2, is_output=not is_output)
+    host = Host(end.line, 1, VIRTUAL_LINES_LIMITS, name="a", is_output=is_output)
+    with pytest.raises(LinkError, match="full level"):
+        await host.open()
+    end.far["a"].capabilities = capabilities(2, is_output=is_output)
+    await host.open()
+
+
+def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> None:
+    """It waits 25 ms, ten times what the line needs, before it feeds; two statuses follow.
+
+    Answered or not: a watchdog that was fed later has more left.
+    """
+
+    async def run(is_answered: bool) -> None:
+        end = MemoryLine(wire, "a")
+        await group_of(end)
+        (host,) = end.hosts.values()
+        end.inward = lambda name, data: [(0.025, data)]
+        if is_answered:
+            await host.ping()
+        else:
+            end.outward = lambda name, data: []
+            with pytest.raises(LinkTimeout):
+                await host.ping()
+        end.inward = end.outward = virtual_lines_unaltered
+        for _ in range(2):
+            await host.read_status()
+            await asyncio.sleep(0.02)
+
+    for is_answered in (True, False):
+        run_virtual(run(is_answered))
+
+
+@in_virtual_time
+async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
+    """It arrives 0.2 s late: the amplifier plays for longer than its watchdog after the last one.
+
+    By hand: the last of three attempts goes out at 60 ms and feeds at 260 ms, for 250 ms.
+    """
+    end = MemoryLine("tcp", "a")
+    group = await group_of(end)
+    await group.apply({"a": [loud(0.5)]})
+    (host,) = end.hosts.values()
+    end.inward = lambda name, data: [(0.2, data)]
+    end.outward = lambda name, data: []
+    began = end.loop.time()
+    with pytest.raises(LinkTimeout):
+        await host.ping()
+    await asyncio.sleep(began + 0.5 - end.loop.time())
+    assert end.levels("a") == [0.5, 0.0]
+    assert began + 0.515 < host.feeding.may_play_until < began + 1.4
+    await asyncio.sleep(0.02)
+    assert end.levels("a") == [0.0, 0.0]
+
+
+class Twins:
+    """Two amplifiers at each address, which hear and reply at the same time."""
+
+    def __init__(self, line: MemoryLine, others: Mapping[int, Amplifier]) -> None:
+        self._first = line._end
+        self._second = line.kind.far_end(others, line._send)
+        line._end = self
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host at a time [s]."""
+        for end in (self._first, self._second):
+            end.receive(data, now)
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"tcp"}))
+@in_virtual_time
+async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
+    """Both reply to Hello, with their serial numbers; it names the remedy."""
+    line = MemoryLine(kind, "a", "b")
+    Twins(line, {2: Amplifier("c", channels=2)})
+    with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
+        await line.hosts["b"].open()
+    await line.hosts["a"].open()
+
+
+@in_virtual_time
+async def test_amplifier_that_is_not_identified_plays_nothing_and_is_silenced(wire: str) -> None:
+    """It is named by what is planned for it; what it plays is silenced as before."""
+    end = MemoryLine(wire, "a")
+    group = await group_of(end)
+    await group.apply({"a": [loud(0.5)]})
+    end.hosts["a"].capabilities = {}  # as of a stop that found its line closed
+    refusal = group.sets.refusal_of({"a": [loud(0.5)]})
+    assert "a must be identified" in str(refusal)
+    with pytest.raises(CommandRefused, match="a must be identified"):
+        await group.apply({"a": [loud(0.4)]})
+    await group.silence(0.005)
+    await asyncio.sleep(0.01)
+    assert end.levels("a") == [0.0, 0.0]
+
+
+SENT = LayerSet(2, 20, 0, (Command(0, 2000, 5000, 17_990), Command(1, 2000, 0, 0)))
+CAN = {**capabilities(2), "frequency_step": 3, "level_step": 5, "phase_step": 41}
+PLAYED = SENT.commands[0]
+SAME = [
+    *(PLAYED, replace(PLAYED, frequency=2002), replace(PLAYED, level=4997)),
+    replace(PLAYED, phase=-17_989),  # 21 steps beyond 179.9 degrees, across 180
+]
+OTHER = {
+    "frequency": [replace(PLAYED, frequency=2003)],
+    "level": [replace(PLAYED, level=4996)],
+    "phase": [replace(PLAYED, phase=-17_988)],
+    "level of channel 0": [],
+    "level of channel 1": [PLAYED, Command(1, 2000, 1, 0)],
+    "channels that are not driven": [PLAYED, Command(2, 2000, 1, 0)],
+}
+
+
+def shown(*commands: Command) -> Values:
+    """The reply to GetAchieved of a layer with these tones."""
+    return {**asdict(SENT), "commands": [asdict(each) for each in commands]}
+
+
+@pytest.mark.parametrize("played", SAME)
+def test_half_a_step_and_what_the_wire_rounds_is_no_contradiction(played: Command) -> None:
+    """Half of the steps of the amplifier and of the wire: 2, 3 and 21 steps of the wire."""
+    assert achieved_problem(SENT, shown(played), CAN, is_exact=False, slack=0.5) is None
+
+
+@pytest.mark.parametrize("name", OTHER)
+def test_more_than_that_is_one(name: str) -> None:
+    """Of frequency, level and phase, and channels that are missing or too many."""
+    problem = achieved_problem(SENT, shown(*OTHER[name]), CAN, is_exact=False, slack=0.5)
+    assert problem is not None
+    assert name in problem[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
+    """An amplifier of steps of 10 % plays 0.6 for 0.58: 0.41 beside it is refused, 0.4 plays."""
+    end = MemoryLine(kind, "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "level_step": 1000}
+    group = await group_of(end)
+    commit = far.playback.commit
+
+    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
+        commands = [
+            tuple(replace(each, level=round(each.level, -3)) for each in layer.commands)
+            for layer in layers
+        ]
+        made = [replace(one, commands=each) for one, each in zip(layers, commands, strict=True)]
+        commit(made, token, time)
+
+    far.playback.commit = rounded  # type: ignore[method-assign]
+    played = await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.58),), 0.001)]})
+    achieved = await host.read_achieved(played.layers["a"][0], played.token)
+    assert achieved.commands[0].level == 6000
+    with pytest.raises(CommandRefused):
+        await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.41),), 0.001)]})
+    await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.4),), 0.001)]})
+
+
+@in_virtual_time
+async def test_phase_is_kept_of_a_frequency_that_the_amplifier_rounds() -> None:
+    """101.3 Hz in steps of 1.5 Hz from 0 on are 102: sent so from then on, the tone goes on."""
+    end = MemoryLine("serial", "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "frequency_step": 30}
+    group = await group_of(end)
+    commit, take = far.playback.commit, far._take
+
+    def rounded(layers: tuple[LayerSet, ...], token: int, time: float) -> None:
+        (one,) = layers
+        (only,) = one.commands
+        exact = replace(only, frequency=30 * round(only.frequency / 30))
+        commit([replace(one, commands=(exact,))], token, time)
+
+    far.playback.commit = rounded  # type: ignore[method-assign]
+    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
+    for level in (0.5, 0.4):
+        again = Tone(0, 101.3, level, keep_phase=True)
+        played = await group.apply({"a": [Layer(0, (again,), 0.02)]})
+        assert played.layers["a"][0].commands[0].frequency == 2040
+        for playback in (far.playback, host.ledger.playback):
+            assert [voice.frequency for voice in playback.all_voices[0]] == [102.0]
+
+
+@pytest.mark.parametrize("said", [0, 1200])
+@in_virtual_time
+async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None:
+    """A pulse of 170 Hz leads to level 0, which does not drive: none of its kind plays at 60 Hz."""
+    end = MemoryLine("serial", "a")
+    far = end.far["a"]
+    group = await group_of(end)
+    take, handle = far._take, far.handle
+
+    def handled(name: str, values: Values, now: float) -> Values:
+        reply = handle(name, values, now)
+        if name == "GetAchieved":
+            reply["commands"] = [{**each, "frequency": said} for each in reply["commands"]]
+        return reply
+
+    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
+    far.handle = handled  # type: ignore[method-assign]
+    pulse = Tone(0, 170.0, 0.0, onset=Envelope(100, ((300, 0),)))
+    for _ in range(2):
+        played = await group.apply({"a": [Layer(0, (pulse,), 0.001)]})
+        assert played.layers["a"][0].commands[0].frequency == 3400
+        assert {voice.frequency for voice in far.playback.all_voices[0]} == {170.0}
+
+
+@in_virtual_time
+async def test_layers_that_play_on_are_no_contradiction_where_sets_are_inexact() -> None:
+    """Renewed, or still waiting for an onset: they show an earlier set, however often."""
+    end = MemoryLine("serial", "a")
+    far = end.far["a"]
+    group = await group_of(end)
+    onset = Envelope(1000, ((1000, 0),) * 9)
+    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
+    await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.1, onset=onset),), 0.001)]})
+    take = far._take
+    far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
+    for _ in range(3):
+        await group.apply({"a": [Layer(0, renew=True)]})
+        await group.apply({"a": [Layer(1, (Tone(0, 200.0, 0.1),), 0.001, after=True)]})
+    assert group.is_armed
+
+
+@in_virtual_time
+async def test_levels_that_are_measured_have_an_error() -> None:
+    """0.002 of full level, a quarter at most: 0.5 measured as 0.498 agrees, as 0.497 does not.
+
+    The tolerance of two steps of 1e-4 comes on top.
+    """
+    end = MemoryLine("serial", "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    far.capabilities = {**far.capabilities, "features": far.capabilities["features"] | 1 << 2}
+    group = await group_of(end)
+    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
+    status = far.status
+
+    def measured(level: int) -> None:
+        far.status = lambda now: {**status(now), "levels": [level, 0]}  # type: ignore[method-assign]
+
+    for level, count in ((4978, 0), (4977, 1)):
+        measured(level)
+        end.loop.now += 0.02  # type: ignore[attr-defined]
+        await host.ping()
+        assert host._contradictions == count
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@in_virtual_time
+async def test_voltage_and_current_of_each_channel(kind: str) -> None:
+    """In volts and amperes; none without the feature."""
+    end = MemoryLine(kind, "a")
+    far, (host,) = end.far["a"], end.hosts.values()
+    values: Values = {
+        "count": 2,
+        "channels": [
+            {"channel_voltage": 12_345, "channel_current": 250},
+            {"channel_voltage": 0, "channel_current": 0},
+        ],
+    }
+    handle = far.handle
+    far.handle = lambda name, given, now, **options: (  # type: ignore[method-assign]
+        values if name == "GetMeasured" else handle(name, given, now, **options)
+    )
+    await host.open()
+    assert await read_measured(host) == [(1234.5, 250e-6), (0.0, 0.0)]
+    far.capabilities = {**far.capabilities, "features": 0}
+    await host.open()
+    assert await read_measured(host) == []
+
+
+LIMITS = GuardLimits(20.0, 1000.0, 1.0)
+SERVED = [name for name in WORD_WIRES if name.endswith(("tcp", "server", "socketcand"))]
+CUT = [name for name in WORD_WIRES if "python-can" not in name]
+
+
+@asynccontextmanager
+async def opened_lines() -> AsyncIterator[Lines]:
+    """Lines that are closed at the end."""
+    lines = Lines()
+    try:
+        yield lines
+    finally:
+        await lines.close()
+
+
+async def read_for_ever(amplifier: AmplifierAmplifier) -> None:
+    """Read the status until an error, for a minute at most."""
+    async with asyncio.timeout(60.0):
+        while True:
+            await amplifier.read_status()
+
+
+class SlowPort:
+    """Opens and closes in half a second; opened, closed: how many were."""
+
+    is_blocked = False
+    opened = closed = 0
+
+    async def open(self, *_: object) -> Port:
+        """Open a port, which is this one."""
+        await asyncio.sleep(0.5)
+        self.opened += 1
+        return self
+
+    def write(self, data: bytes) -> None:
+        """Nothing is there."""
+
+    def poll(self) -> None:
+        """Nothing has come."""
+
+    def close(self) -> None:
+        """Count it."""
+        self.closed += 1
+
+    async def wait_closed(self) -> None:
+        """It takes its time."""
+        await asyncio.sleep(0.5)
+
+
+@in_virtual_time
+async def test_lines_are_closed_before_a_second_close_returns() -> None:
+    """A reconnection closes them as well; opened before that, the port would still be taken."""
+    PORT_OPENER.set(SlowPort().open)
+    lines, loop = Lines(), asyncio.get_running_loop()
+    await lines.amplifier("serial:///dev/x?address=1", LIMITS, name="x")
+    first = asyncio.create_task(lines.close())
+    await asyncio.sleep(0.1)
+    began = loop.time()
+    first.cancel()
+    await lines.close()
+    assert loop.time() - began == pytest.approx(0.4)
+
+
+@in_virtual_time
+async def test_line_that_is_closed_while_it_is_opened_stays_closed() -> None:
+    """As by a shutdown during a reconnection; else the port would stay open, and taken."""
+    port = SlowPort()
+    PORT_OPENER.set(port.open)
+    lines = Lines()
+    opening = [
+        asyncio.ensure_future(lines.amplifier(f"serial:///dev/x?address={n}", LIMITS, name=f"{n}"))
+        for n in (1, 2)
+    ]
+    await asyncio.sleep(0.1)
+    await lines.close()
+    for each in opening:
+        with pytest.raises(LinkError, match="closed"):
+            await each
+    assert port.closed == port.opened
+
+
+@in_virtual_time
+async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
+    """An amplifier of a bus discards what has an older number, for 0.1 s: 1 follows 255."""
+    PORT_OPENER.set(SlowPort().open)
+    numbers, lines = list[int](), Lines()
+    for _ in range(2):
+        amplifier = await lines.amplifier("can+slcan:///dev/x#5", LIMITS, name="x")
+        sent = amplifier.line.wire.request(5, "GetStatus", {})
+        numbers.append(unpack_frames(sent)[0].data[0])
+        await lines.close()
+        lines = Lines(lines)
+    assert numbers[1] == numbers[0] % 255 + 1
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_group_plays_over_a_wire_and_stops(
+    wire: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two amplifiers on one line: 0.5 on both after one commit, silent after the stop.
+
+    A busy machine may keep the commit waiting for longer than a host allows.
+    """
+    monkeypatch.setattr("drivers.host.dialogue.COMMIT_DELAY", 10.0)
+    async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
+        amplifiers = {
+            str(number): await lines.amplifier(far.url(number), LIMITS, name=str(number))
+            for number in far.amplifiers
+        }
+        assert len({each.line for each in amplifiers.values()}) == 1
+        group = Group(amplifiers, watchdog=2.0)
+        await group.open()
+        await group.arm()
+        layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
+        await group.apply(dict.fromkeys(amplifiers, layers))
+        levels = [far.level(number) for number in far.amplifiers]
+        assert levels == pytest.approx([0.5, 0.5], abs=1e-9)
+        await group.beat()
+        stopped = await group.stop()
+        assert all(each.is_confirmed for each in stopped.values())
+        assert [far.level(number) for number in far.amplifiers] == [0.0, 0.0]
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", CUT)
+async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
+    """Requests of both amplifiers fail with the same message, and those of a new line do not."""
+    async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
+        both = [
+            await lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers
+        ]
+        for amplifier in both:
+            await amplifier.open()
+        far.unplug()
+        messages = set()
+        for amplifier in both:
+            with pytest.raises(LinkError) as lost:
+                await read_for_ever(amplifier)
+            messages.add(str(lost.value))
+        assert messages == {both[0].line.loss}
+        assert "was lost" in messages.pop()
+        if wire in SERVED:  # whose server listens on
+            again = await asyncio.gather(
+                *(lines.amplifier(far.url(number), LIMITS, name="a") for number in far.amplifiers)
+            )
+            for amplifier in again:
+                await amplifier.open()
+            assert len({each.line for each in (*again, both[0])}) == 2
+        else:
+            with pytest.raises(LinkError, match=r"cannot be opened|refused"):
+                await lines.amplifier(far.url(1), LIMITS, name="a")
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("wire", WORD_WIRES)
+async def test_amplifier_that_does_not_reply_leaves_the_line(wire: str) -> None:
+    """Nobody has the second address; the first one replies as before."""
+    async with WORD_WIRES[wire](1) as far, opened_lines() as lines:
+        first, second = [
+            await lines.amplifier(far.url(number), LIMITS, name="a") for number in (1, 2)
+        ]
+        await first.open()
+        with pytest.raises(LinkTimeout):
+            await second.read_status()
+        await first.read_status()
+
+
+async def test_ports_are_for_one_program_alone() -> None:
+    """A second host of the same terminal is refused, and a second user of the same address."""
+    async with WORD_WIRES["serial"](1) as far, opened_lines() as first, opened_lines() as second:
+        await first.amplifier(far.url(1), LIMITS, name="a")
+        with pytest.raises(LinkError, match="in use by another program"):
+            await second.amplifier(far.url(1), LIMITS, name="a")
+        with pytest.raises(LinkError, match="used once"):
+            await first.amplifier(far.url(1), LIMITS, name="b")
+        with pytest.raises(LinkError, match="baud must be 921600"):
+            await first.amplifier(far.url(2) + "&baud=115200", LIMITS, name="b")
+
+
+@pytest.mark.parametrize(
+    ("url", "error"),
+    [
+        ("serial:///dev/none-such?address=1", LinkError),
+        ("serial:///dev/ttyS0?address=248", CommandError),
+        ("serial://nonsense", CommandError),
+        ("modbus+tcp://127.0.0.1:1/1", LinkError),
+        ("can+slcan:///dev/none-such#1", LinkError),
+        ("can+slcan:///dev/ttyACM0?bitrate=300000#1", CommandError),
+        ("can+socketcand://127.0.0.1:1/can0#1", LinkError),
+        ("can+socketcan://none-such0#1", LinkError),
+        ("can+python-can://none-such/0#1", LinkError),
+        ("carrier+pigeon://roof", CommandError),
+    ],
+)
+async def test_line_that_cannot_be_opened_is_refused(url: str, error: type[Exception]) -> None:
+    """No such port or server, an address that cannot be, an unknown wire."""
+    with pytest.raises(error):
+        await Lines().amplifier(url, LIMITS, name="a")

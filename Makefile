@@ -99,7 +99,7 @@ pages: .venv/installed-test
 
 # A million damaged frames on every kind of line; `make test` takes a few thousand.
 fuzz: .venv/installed-test
-	FRAMES=1000000 $(BIN)/pytest -q tests/drivers/wires/test_damaged_frames.py
+	FRAMES=1000000 $(BIN)/pytest -q tests/drivers/wires/test_frames.py
 
 # Every planted fault (tests/faults) in a copy of the tree, under the tests that must find it;
 # `make test` takes five. Others: make faults FAULTS='--only wire/ --json out/faults.json'

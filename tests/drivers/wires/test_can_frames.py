@@ -1,0 +1,498 @@
+"""CAN frames as text of adapters: golden lines, and what is no frame.
+
+Messages of protocol 4 in CAN frames: bytes worked out by hand from the decision, and losses.
+
+A bus of python-can as a port: a transmit queue that is full, and error frames.
+
+CAN adapters that speak text, as they open: socketcand's greeting, slcan's commands.
+"""
+
+import asyncio
+import errno
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+
+import can
+import pytest
+
+from drivers.errors import LinkError, WireCounters
+from drivers.opening import Lines
+from drivers.ports import PORT_OPENER
+from drivers.protocol.definition import MESSAGES
+from drivers.protocol.records import Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers
+from drivers.wires import can_bus
+from drivers.wires.can_bus import BusPort, SlcanAddress, TextPort
+from drivers.wires.can_frames import (
+    SLCAN,
+    SOCKETCAND,
+    Assembler,
+    CanFrame,
+    Message,
+    TextFormat,
+    TextReader,
+    frames_of,
+    pack_frames,
+    segments,
+    unpack_frames,
+)
+from drivers.wires.known import address_of
+from registry.limits import GuardLimits
+from virtual_lines import in_virtual_time
+
+FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
+LINES = {
+    SLCAN: b"t18180102030405060708\r",
+    SOCKETCAND: b"< frame 181 1.5 0102030405060708 >",
+}
+NO_LINES = (
+    *(b"t1818010203", b"t18190102030405060708090A", b"tFFF8" + b"00" * 8, b"t18"),
+    *(b"T000001818" + b"00" * 8, b"r1810", b"d18180102030405060708", b"z", b"", b"\x07"),
+)
+"""Too short, too long, a large or long identifier, remote and FD frames, replies."""
+NO_ELEMENTS = (
+    *(b"< ok >", b"< error unknown command >", b"< frame 1FFFFFFF 1.5 00 >", b"< frame 181 >"),
+    *(b"< frame 181 1.5 0 >", b"< frame 181 x 00 >", b"frame 181 1.5 00 >", b"<<<>"),
+    *(b"< frame 181 1.5 000000000000000000 >", b"< fdframe 181 00 1.5 00 >"),
+)
+"""Replies, long identifiers, missing parts, too much data, FD frames."""
+
+
+def test_frames_are_encoded_as_text() -> None:
+    """One of eight bytes and an empty one, against text by hand."""
+    assert SLCAN.encode(FRAME) == b"t18180102030405060708\r"
+    assert SLCAN.encode(CanFrame(0x80, b"")) == b"t0800\r"
+    assert SOCKETCAND.encode(FRAME) == b"< send 181 8 01 02 03 04 05 06 07 08 >"
+
+
+@pytest.mark.parametrize(
+    ("form", "text"),
+    [*((SLCAN, line + b"\r") for line in NO_LINES), *((SOCKETCAND, each) for each in NO_ELEMENTS)],
+)
+def test_text_without_a_frame_is_skipped(form: TextFormat, text: bytes) -> None:
+    """The next frame is understood."""
+    reader = TextReader(form)
+    assert list(reader.feed(text)) == []
+    assert list(reader.feed(LINES[form])) == [FRAME]
+
+
+def test_slcan_timestamp_is_skipped() -> None:
+    """Four digits after the data, from adapters that are configured to send them."""
+    assert list(TextReader(SLCAN).feed(b"t18180102030405060708ABCD\r")) == [FRAME]
+
+
+SET = ("1300050a34120700", "1301020081000100", "130200002000d007", "13038813d8dc0000")
+"""Session 1234, token 7, part 0 of 1; layer 1 along 1 ms: channel 2, 100 Hz, 0.5, -90 degrees."""
+REQUESTS: dict[str, tuple[int, Values, tuple[str, ...]]] = {
+    "GetStatus": (0x11, {}, ("1100090000000000",)),
+    "Arm": (
+        0x12,
+        {"session": 0x1234, "watchdog": 250, "shift": 0},
+        ("120003033412fa00", "1201000000000000"),
+    ),
+    "Set": (
+        0x13,
+        {
+            **{"session": 0x1234, "token": 7, "index": 0, "parts": 1, "now": 0},
+            "stream": pack_layers(
+                [LayerSet(1, ramp=1, valid_for=0, commands=(Command(2, 2000, 5000, -9000),))]
+            ),
+        },
+        SET,
+    ),
+    "Commit": (
+        0,
+        {"session": 0x1234, "token": 7, "at": 0x0102},
+        ("0000060334120700", "0001020100000000"),
+    ),  # a broadcast
+}
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_requests_have_the_bytes_of_the_decision(name: str) -> None:
+    """Number, index, type, count and two words, then three words each, low byte first."""
+    number, values, expected = REQUESTS[name]
+    message = MESSAGES[name]
+    made = segments(number, message.number, message.request.pack(values))
+    assert [data.hex() for data in made] == [*expected]
+
+
+@pytest.mark.parametrize("words", [0, 1, 2, 3, 5, 6, 119, 120])
+def test_frames_of_every_length_hold_all_words(words: int) -> None:
+    """Two words in the first frame and three in each other; 120 words are 41 frames."""
+    made = segments(9, 5, range(words))
+    assert len(made) == frames_of(words) == 1 + max(0, -(-(words - 2) // 3))
+    whole = Assembler(WireCounters())
+    *_, last = (whole.add(data, 0.0) for data in reversed(made))
+    assert last == Message(9, 5, tuple(range(words)))
+
+
+@pytest.mark.parametrize(
+    ("last", "number", "is_taken"),
+    [(1, 2, True), (255, 1, True), (1, 128, True), (1, 129, False), (2, 1, False), (1, 255, False)],
+)
+def test_numbers_wrap_from_255_to_1(last: int, number: int, is_taken: bool) -> None:
+    """Newer is one that follows by at most 127; after 0.1 s without a frame any is."""
+    whole = Assembler(WireCounters())
+    (before,), (data,) = segments(last, 9, []), segments(number, 9, [])
+    assert whole.add(before, 0.0) is not None
+    assert (whole.add(data, 0.05) is not None) is is_taken
+    assert whole.add(data, 0.2) is not None
+
+
+def test_incomplete_message_is_forgotten() -> None:
+    """A frame 0.11 s later is no part of it, though its number is the same."""
+    whole = Assembler(WireCounters())
+    first, second = segments(5, 5, range(5))
+    assert whole.add(first, 0.0) is None
+    assert whole.add(second, 0.11) is None
+
+
+def test_frames_of_two_senders_make_no_message() -> None:
+    """Two that differ under one number and index are believed neither way."""
+    counters = WireCounters()
+    whole = Assembler(counters)
+    mine, other = segments(5, 5, range(8)), segments(5, 5, range(1, 9))
+    for data in (mine[0], other[0], *mine[1:], *other[1:]):
+        assert whole.add(data, 0.0) is None
+    assert counters.invalid_frames == 1
+
+
+def test_frames_of_number_0_begin_anew_with_each_first() -> None:
+    """An event that lost its end is followed by a whole one."""
+    whole = Assembler(WireCounters(), is_numbered=False)
+    first, second = segments(0, 30, [4, 0, 255, 1])
+    lost, _ = segments(0, 30, [5, 0, 255, 1])
+    assert [whole.add(data, 0.0) for data in (second, lost, first)] == [None] * 3
+    assert whole.add(second, 0.0) == Message(0, 30, (4, 0, 255, 1))
+
+
+BUS_PORT_SET = [CanFrame(0x201, bytes([number])) for number in range(22)]
+STOP = [CanFrame(0x201, b"stop")]
+COMMIT = [CanFrame(0x200, b"commit")]
+
+
+class Adapter(can.BusABC):
+    """An adapter with room for some frames; incoming: what is received next."""
+
+    def __init__(self) -> None:
+        self.room = 10  # txqueuelen of Linux
+        self.taken: list[bytes] = []
+        self.incoming: list[can.Message] = []
+        self.ends = os.pipe()
+        super().__init__(channel="0")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if not self.room:
+            raise can.CanOperationError("no buffer space", error_code=errno.ENOBUFS)
+        self.room -= 1
+        self.taken.append(bytes(msg.data))
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return (self.incoming.pop(0) if self.incoming else None), False
+
+    def fileno(self) -> int:
+        return self.ends[0]
+
+
+@asynccontextmanager
+async def opened(
+    heard: Callable[[bytes], None] = lambda data: None, *, is_watched: bool = True
+) -> AsyncIterator[tuple[BusPort, Adapter, list[str]]]:
+    """A port, its adapter, and its losses; heard: called with what it receives."""
+    adapter, losses = Adapter(), list[str]()
+    port = BusPort(adapter, is_watched, "can0", heard, losses.append)
+    try:
+        yield port, adapter, losses
+    finally:
+        port.close()
+        await port.wait_closed()
+        for each in adapter.ends:
+            os.close(each)
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Let the event loop turn until a condition holds, for a minute at most."""
+    async with asyncio.timeout(60.0):
+        while True:
+            if condition():
+                return
+            await asyncio.sleep(0)
+
+
+async def test_long_set_is_sent_as_the_queue_takes_it() -> None:
+    """All 22 frames in order, of which there is room for ten; blocked until then."""
+    async with opened() as (port, adapter, losses):
+        port.write(pack_frames(BUS_PORT_SET))
+        assert port.is_blocked
+        while port.is_blocked:
+            await asyncio.sleep(0)
+            adapter.room = 1
+        assert adapter.taken == [frame.data for frame in BUS_PORT_SET]
+        assert not losses
+
+
+async def test_stop_replaces_the_rest_of_a_set_but_no_broadcast() -> None:
+    """Ten frames of the set were taken; of the others only the commit of all precedes the stop."""
+    async with opened() as (port, adapter, _):
+        port.write(pack_frames(BUS_PORT_SET))
+        for frames in (COMMIT, BUS_PORT_SET, STOP):
+            port.write(pack_frames(frames))
+        adapter.room = 30
+        await until(lambda: not port.is_blocked)
+        assert adapter.taken[10:] == [b"commit", b"stop"]
+
+
+async def test_frames_of_a_stuck_queue_are_dropped() -> None:
+    """Nobody acknowledges on the bus: what waited is not sent when it is mended much later."""
+    async with opened() as (port, adapter, losses):
+        adapter.room = 0
+        port.write(pack_frames(COMMIT + BUS_PORT_SET))
+        await until(lambda: not port._unsent)
+        assert port.is_blocked
+        adapter.room = 30
+        port.write(pack_frames(STOP))
+        assert adapter.taken == [b"stop"]
+        assert not losses
+
+
+async def test_broadcast_waits_no_longer_while_others_are_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A commit amid requests that are repeated every 20 ms: gone after the 30 ms of a reply."""
+    async with opened() as (port, adapter, _):
+        now = port.loop.time()
+        monkeypatch.setattr(port.loop, "time", lambda: now)
+        adapter.room = 0
+        port.write(pack_frames(COMMIT))
+        for _ in range(2):
+            now += 0.02
+            port.write(pack_frames(STOP))
+        adapter.room = 30
+        port.write(pack_frames(STOP))
+        monkeypatch.undo()
+        assert adapter.taken == [b"stop"]
+
+
+async def test_bus_off_is_a_loss_and_other_error_frames_are_none() -> None:
+    """Error class 0x40 of linux/can/error.h; told once."""
+    async with opened() as (port, adapter, losses):
+        adapter.incoming.append(can.Message(arbitration_id=0x04, is_error_frame=True))
+        port.poll()
+        assert not losses
+        adapter.incoming += [can.Message(arbitration_id=0x40, is_error_frame=True)] * 2
+        port.poll()
+        (loss,) = losses
+        assert "bus-off" in loss
+
+
+async def test_failed_send_is_a_loss() -> None:
+    """The adapter is unplugged: LinkError for the request, and the line is lost with its text."""
+    async with opened() as (port, adapter, losses):
+        adapter.send = _unplugged  # type: ignore[method-assign]
+        with pytest.raises(LinkError) as failed:
+            port.write(pack_frames(STOP))
+        assert losses == [str(failed.value)]
+
+
+async def test_reader_thread_hands_over_frames_in_order_until_the_adapter_is_gone() -> None:
+    """Frames that came before are handed over first; the thread ends, and the loss is told once."""
+    heard: list[bytes] = []
+    async with opened(heard.append, is_watched=False) as (port, adapter, losses):
+        port.poll()  # left to the thread
+        frames = [CanFrame(0x181, bytes([number])) for number in range(3)]
+        adapter.incoming += [
+            *(can.Message(arbitration_id=0x181, is_extended_id=False, data=f.data) for f in frames),
+            can.Message(arbitration_id=0x40, is_error_frame=True),
+        ]
+        await until(lambda: bool(losses))
+        assert heard == [pack_frames([frame]) for frame in frames]
+        assert port._thread is not None
+        port._thread.join(10.0)
+        assert not port._thread.is_alive()
+    assert len(losses) == 1
+
+
+def _unplugged(msg: can.Message, timeout: float | None = None) -> None:
+    raise can.CanOperationError("No such device", error_code=errno.ENODEV)
+
+
+TEXT_ADAPTERS_FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
+ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
+SLCAN_SPOKEN = b"\rC\rS5\rO\rt18580102030405060708\r\rC\r"
+
+
+@asynccontextmanager
+async def server(*replies: bytes, accepted: asyncio.Event | None = None) -> AsyncIterator[str]:
+    """A server that greets with the first text, and replies to each element with the next.
+
+    Its URL, of node 5. After the last text it closes the connection if that is empty.
+    """
+
+    ended = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if accepted is not None:
+            accepted.set()
+        with suppress(EOFError, ConnectionError):
+            for reply in replies:
+                writer.write(reply)
+                if reply:
+                    await reader.readuntil(b">")
+            if replies[-1]:
+                await reader.read()
+        writer.close()
+        ended.set()
+
+    listening = await asyncio.start_server(serve, "127.0.0.1", 0)
+    try:
+        yield f"can+socketcand://127.0.0.1:{listening.sockets[0].getsockname()[1]}/can0#5"
+    finally:
+        listening.close()
+        async with asyncio.timeout(60.0):
+            await ended.wait()
+        await asyncio.sleep(0)  # the connection ends
+
+
+async def open_port(url: str, on_data: Callable[[bytes], None]) -> None:
+    """Open a URL's port, and close it once it has handed something over."""
+    done = asyncio.Event()
+
+    def received(data: bytes) -> None:
+        on_data(data)
+        done.set()
+
+    port = await address_of(url).open_port(received, lambda cause: done.set())
+    await done.wait()
+    port.close()
+    await port.wait_closed()
+
+
+async def test_frames_amid_the_greeting_do_not_disturb_it() -> None:
+    """A bus on which others speak; what follows the last reply at once is handed over, too."""
+    heard: list[CanFrame] = []
+    long = b"< frame 1FFFFFFF 1.000000 01 >"
+    greeting = (b"< hi >", ELEMENT + long + b"< ok >", ELEMENT + b"< ok >" + ELEMENT)
+    async with server(*greeting) as url:
+        await open_port(url, lambda data: heard.extend(unpack_frames(data)))
+    assert heard == [TEXT_ADAPTERS_FRAME] * 3
+
+
+@pytest.mark.parametrize(
+    ("replies", "problem"),
+    [
+        ((b"< error no such bus >",), "no such bus"),
+        ((b"< hi >", b"< error could not open bus >"), "could not open"),
+        ((b"< hi >", b""), "was lost"),
+        ((b"nonsense",), "no reply within"),
+    ],
+)
+async def test_server_that_does_not_open_the_bus_is_told(
+    replies: tuple[bytes, ...], problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error, a closed connection, or no reply at all: with the remedy."""
+    monkeypatch.setattr(can_bus, "_GREETING_TIMEOUT", 0.2)
+    async with server(*replies) as url:
+        with pytest.raises(LinkError, match=rf"(?s){problem}.*check address and port"):
+            await open_port(url, lambda data: None)
+
+
+async def test_opening_that_is_given_up_leaves_nothing() -> None:
+    """The server has accepted, and says nothing: the connection ends with the caller."""
+    lines = Lines()
+    limits = GuardLimits(20.0, 1000.0, 1.0)
+    accepted = asyncio.Event()
+    async with server(b" ", accepted=accepted) as url:  # which ends with its connection
+        opening = asyncio.ensure_future(lines.amplifier(url, limits, name="a"))
+        await accepted.wait()
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+    await lines.close()
+
+
+async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end() -> None:
+    """LAWICEL's commands: C, S5 for 250 kbit/s, O; a frame as t with its bytes in hexadecimal."""
+    master, slave = os.openpty()
+    try:
+        url = f"can+slcan://{os.ttyname(slave)}?bitrate=250000#5"
+        port = await address_of(url).open_port(lambda data: None, lambda cause: None)
+        port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+        port.close()
+        await port.wait_closed()
+        text = b""
+        async with asyncio.timeout(60.0):
+            while len(text) < len(SLCAN_SPOKEN):
+                text += await asyncio.to_thread(os.read, master, 100)
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert text == SLCAN_SPOKEN
+
+
+@in_virtual_time
+async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> None:
+    """Commands go before frames until one has come, and again when none has come for a second.
+
+    Text with BEL at its end is an error of the adapter, as frames have no such identifier.
+    """
+
+    class Below:
+        is_blocked = False
+        written = b""
+
+        def write(self, data: bytes) -> None:
+            self.written += data
+
+    heard: list[CanFrame] = []
+    port = TextPort(SLCAN, lambda data: heard.extend(unpack_frames(data)), hello=b"O\r")
+    port.below = below = Below()  # type: ignore[assignment]
+    for came in (b"\r\nrst:0x1 (POWERON_RESET)\r\n", b"\r\x07", b"t18580102030405060708\r", b"\r"):
+        port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+        port.received(came)
+    await asyncio.sleep(1.1)
+    port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+    sent = b"t18580102030405060708\r"
+    assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
+    assert heard == [CanFrame(0x800, b"\r\x07"), TEXT_ADAPTERS_FRAME]
+
+
+async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
+    """Replies, frames of other kinds and line ends CR LF are none; a modem's or a shell's text is.
+
+    By LAWICEL's CANUSB manual: V, N, F and z.
+    """
+
+    class Below:
+        is_blocked = False
+
+    async def opener(name: str, on_data: object, on_loss: object) -> object:
+        return Below()
+
+    PORT_OPENER.set(opener)  # type: ignore[arg-type]
+    heard: list[CanFrame] = []
+    port = await SlcanAddress("can+slcan:///dev/ttyACM0#5").open_port(
+        lambda data: heard.extend(unpack_frames(data)), lambda cause: None
+    )
+    replies = b"V1013\rNA123\r\nF40\rz\r\r\nT0000018100\rr1230\rt18580102030405060708\r\n"
+    port.received(replies)  # type: ignore[attr-defined]
+    assert heard == [TEXT_ADAPTERS_FRAME]
+    port.received(b"AT\r\nERROR\r\n")  # type: ignore[attr-defined]
+    assert [(frame.id, frame.data) for frame in heard[1:]] == [(0x800, b"AT"), (0x800, b"ERROR")]
+
+
+async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
+    """A port that has not taken all drops the rest of a line: a CR of its own ends that."""
+
+    class Blocked:
+        is_blocked = True
+        written = b""
+
+        def write(self, data: bytes) -> None:
+            self.written += data
+
+    port = TextPort(SLCAN, lambda data: None, cut_off=b"\r")
+    port.below = below = Blocked()  # type: ignore[assignment]
+    port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+    assert below.written == b"\rt18580102030405060708\r"

@@ -1,0 +1,547 @@
+"""Silence before each frame of Modbus RTU, in virtual time.
+
+Readers of streams without a length: frames in any pieces, after any noise, in bounded memory.
+
+Frames of serial lines by their specification.
+
+Frames and messages of Modbus: what is one, what answers what, and what a library must not do.
+
+Every interface of python-can, by its name in the URL of an amplifier.
+
+A device that hangs while it is opened, read or closed delays nothing else.
+"""
+
+import asyncio
+import itertools
+import logging
+import os
+import random
+import struct
+import threading
+import zlib
+from collections.abc import Callable, Coroutine, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import can
+import pytest
+from can.interfaces import BACKENDS
+from hypothesis import given
+from hypothesis import strategies as st
+from pymodbus.logging import Log
+
+from drivers import ports
+from drivers.errors import CommandError, LinkError
+from drivers.ports import Port
+from drivers.urls import Place
+from drivers.wires import can_bus, modbus_frames
+from drivers.wires.can_bus import PythonCanAddress
+from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextReader
+from drivers.wires.known import address_of
+from drivers.wires.modbus import ModbusWire, SilentPort
+from drivers.wires.modbus_frames import (
+    Adu,
+    AduReader,
+    Read,
+    Response,
+    Write,
+    exception_to,
+    parse_request,
+    response_to,
+)
+from drivers.wires.serial_frames import PAYLOAD_MAX, Frame, FrameReader, encode_frame, frame_length
+from registry import threads
+from virtual_lines import in_virtual_time
+
+BYTE = 11 / 19_200  # s
+SILENCE = 3.5 * BYTE  # Modbus over serial line V1.02, 2.5.1.1
+
+
+class Below:
+    """A port that keeps when what was written."""
+
+    is_blocked = False
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[float, bytes]] = []
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((asyncio.get_running_loop().time(), data))
+
+    def poll(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    async def wait_closed(self) -> None:
+        """Return at once."""
+
+
+async def opened() -> tuple[SilentPort, Below]:
+    """A port at 19 200 baud."""
+    assert ModbusWire(19_200, is_rtu=True, number=0).silence == pytest.approx(SILENCE)
+    below = Below()
+    port = SilentPort(SILENCE, BYTE, lambda data: None)
+    port.below = below
+    await asyncio.sleep(1.0)
+    return port, below
+
+
+@in_virtual_time
+async def test_frame_waits_for_the_line_to_be_silent() -> None:
+    """After a frame of 8 bytes for 11.5 characters, after what is heard for 3.5 from there on."""
+    port, below = await opened()
+    loop = asyncio.get_running_loop()
+    port.write(b"\1first")
+    port.write(b"\0second ")
+    port.write(b"\1third")
+    await asyncio.sleep(0.1)
+    assert [data for _, data in below.sent] == [b"\1first", b"\0second ", b"\1third"]
+    (first, _), (second, _), (third, _) = below.sent
+    assert second - first == pytest.approx((6 + 3.5) * BYTE)
+    assert third - second == pytest.approx((8 + 3.5) * BYTE)
+    port.received(b"reply")
+    heard = loop.time()
+    port.write(b"\1fourth")
+    await asyncio.sleep(0.1)
+    assert below.sent[-1][0] - heard == pytest.approx(SILENCE)
+
+
+@in_virtual_time
+async def test_newer_request_replaces_one_that_waits_but_no_broadcast() -> None:
+    """A stop need not wait behind the request that it has preempted."""
+    port, below = await opened()
+    for frame in (b"\1first", b"\0commit", b"\1read", b"\1stop"):
+        port.write(frame)
+    await asyncio.sleep(0.1)
+    assert [data for _, data in below.sent] == [b"\1first", b"\0commit", b"\1stop"]
+    assert all(after > before for (before, _), (after, _) in pairwise(below.sent))
+
+
+@in_virtual_time
+async def test_noise_does_not_keep_a_stop_waiting_for_ever() -> None:
+    """It goes after the longest frame, of 256 characters, and one that follows after that."""
+    port, below = await opened()
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    port.received(b"?")
+    port.write(b"\0stops")
+    port.write(b"\1stop")
+    while len(below.sent) < 2:
+        assert loop.time() < begin + 1.0
+        await asyncio.sleep(BYTE)
+        port.received(b"?")
+    (first, _), (second, _) = below.sent
+    assert first - begin == pytest.approx((256 + 3.5) * BYTE, abs=BYTE)
+    assert second - first == pytest.approx((6 + 3.5) * BYTE)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A kind of stream.
+
+    feed: makes a reader, its method; sent: a frame as the far end writes it; frame, frames: one
+    frame, and any; end: ends what noise may have begun.
+    """
+
+    feed: Callable[[], Callable[[bytes], Iterable[object]]]
+    sent: Callable[[Any], bytes]
+    frame: object
+    frames: st.SearchStrategy[Any]
+    end: bytes
+
+
+def slcan_sent(frame: CanFrame) -> bytes:
+    """A frame as a serial adapter writes it."""
+    return f"t{frame.id:03X}{len(frame.data):X}{frame.data.hex()}\r".encode()
+
+
+def socketcand_sent(frame: CanFrame) -> bytes:
+    """A frame as the daemon writes it."""
+    return f"< frame {frame.id:03X} 1700000000.123456 {frame.data.hex().upper()} >".encode()
+
+
+CAN_FRAMES = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
+FRAMES = st.builds(
+    Frame,
+    kind=st.sampled_from([1, 7, 12, 31, 0x81, 0x9F]),
+    address=st.integers(0, 255),
+    sequence=st.integers(0, 65535),
+    payload=st.binary(max_size=PAYLOAD_MAX),
+    version=st.integers(0, 255),
+)
+CAN_FRAME = CanFrame(0x181, bytes(range(8)))
+STREAMS = {
+    "serial": Stream(
+        *(lambda: FrameReader().feed, encode_frame, Frame(12, 1, 1, b"x", 3), FRAMES, b"\0")
+    ),
+    "slcan": Stream(lambda: TextReader(SLCAN).feed, slcan_sent, CAN_FRAME, CAN_FRAMES, b"\r"),
+    "socketcand": Stream(
+        *(lambda: TextReader(SOCKETCAND).feed, socketcand_sent, CAN_FRAME, CAN_FRAMES, b">")
+    ),
+}
+of_every_kind = pytest.mark.parametrize("stream", STREAMS.values(), ids=STREAMS)
+
+
+@of_every_kind
+@given(data=st.data())
+def test_any_split_of_the_stream_gives_the_same_frames(stream: Stream, data: st.DataObject) -> None:
+    """However it is cut."""
+    frames = data.draw(st.lists(stream.frames, max_size=5))
+    text = b"".join(map(stream.sent, frames))
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(text)), max_size=8)))
+    pieces = itertools.starmap(slice, itertools.pairwise([0, *cuts, len(text)]))
+    feed = stream.feed()
+    assert [one for piece in pieces for one in feed(text[piece])] == frames
+
+
+@of_every_kind
+def test_stream_without_an_end_takes_no_memory(stream: Stream) -> None:
+    """A megabyte is one frame that is damaged, or none."""
+    feed = stream.feed()
+    assert [one for _ in range(256) for one in feed(b"t1818" * 820)] == []
+    reader = feed.__self__  # type: ignore[attr-defined]
+    assert len(reader.rest) <= 512
+
+
+def cobs_by_hand(data: bytes) -> bytes:
+    """COBS of blocks below 254 bytes, by its definition."""
+    return b"".join(bytes([len(part) + 1]) + part for part in data.split(b"\0"))
+
+
+def frame_by_hand(kind: int, version: int, address: int, sequence: int, payload: bytes) -> bytes:
+    """A frame from the specification, without the code under test."""
+    body = struct.pack("<BBBH", kind, version, address, sequence) + payload
+    return b"\0" + cobs_by_hand(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+
+
+@given(FRAMES)
+def test_frame_equals_its_specification(frame: Frame) -> None:
+    """Bytes and length; it is decoded again."""
+    wire = encode_frame(frame)
+    head = (frame.kind, frame.version, frame.address, frame.sequence)
+    assert wire == frame_by_hand(*head, frame.payload)
+    assert len(wire) == frame_length(len(frame.payload))
+    assert FrameReader().feed(wire) == [frame]
+
+
+def test_damaged_frames_are_counted() -> None:
+    """By CRC, length and truncation; the next good frame is understood."""
+    good = frame_by_hand(12, 2, 1, 7, b"")
+    bad_crc = bytearray(frame_by_hand(12, 2, 1, 7, b"abc"))
+    bad_crc[-2] ^= 0x40
+    too_long, truncated = b"\0" + b"\x01" * 1000 + b"\0", good[:5] + b"\0"
+    damaged = (bytes(bad_crc), too_long, truncated)
+    invalid: list[bytes] = []
+    reader = FrameReader(on_invalid=invalid.append)
+    for count, data in enumerate(damaged, start=1):
+        assert reader.feed(data) == []
+        assert len(invalid) == count
+    assert len(reader.feed(good)) == 1
+
+
+# A write to unit 3; minimalmodbus makes its CRC DD 00, and 00 DD fits what is before them, too.
+WHOLE = bytes.fromhex("0310050000070E1FEFA085D0790003000000140000DD00")
+
+
+def test_frame_is_not_taken_before_it_is_whole() -> None:
+    """The CRC of its first 22 bytes is valid; the length that is in it is 23."""
+    reader = AduReader(is_rtu=True, of_requests=True, waits=True)
+    assert reader.feed(WHOLE[:-1]) == []
+    (adu,) = reader.feed(WHOLE[-1:])
+    assert (adu.unit, adu.pdu, adu.raw, reader.rest) == (3, WHOLE[1:-2], WHOLE, b"")
+
+
+@pytest.mark.parametrize("is_host", [True, False])
+@pytest.mark.parametrize("unit", [1, 2])
+def test_frame_behind_damaged_bytes_is_found(unit: int, is_host: bool) -> None:
+    """That of docs/reference/modbus.md; a host takes none there that is not its response."""
+    noise, response = b"\x01\x03", bytes.fromhex("01 10 06 00 00 03 80 80")
+    reader = AduReader(is_rtu=True, of_requests=False, is_host=is_host)
+    request = Write(dev_id=unit, address=0x600, registers=[3, 9, 7])
+    found = reader.feed(noise + response, request) + reader.end()
+    is_taken = unit == 1 or not is_host
+    assert [each.raw for each in found if each.pdu] == [response] * is_taken
+    assert b"".join(each.raw for each in found) == noise + response
+
+
+@pytest.mark.parametrize(
+    ("pdu", "expected"),
+    [
+        ("04 0980 007D", (0x980, 125, [])),
+        ("03 0980 0001", (0x980, 1, [])),
+        ("04 0980 0000", None),
+        ("04 0980 007E", None),
+        ("04 0980 0001 00", None),
+        ("04 0980 00", None),
+        ("04", None),
+        ("10 0300 0002 04 0007 FFFF", (0x300, 2, [7, 0xFFFF])),
+        ("10 0300 0000 00", None),
+        ("10 0300 007C F8" + "0000" * 124, None),
+        ("10 0300 0002 06 0007 FFFF", None),
+        ("10 0300 0002 05 0007 FFFF 00", None),
+        ("10 0300 0002 04 0007 FF", None),
+        ("10 0300 0002 04", None),
+        ("10 0300 0002 04 0007 FFFF 00", None),
+        ("10 0300 FFFF 04 0007 FFFF", None),
+        ("06 0300 0002", None),
+        ("17 0980 0001 0C00 0001 02 0001", None),
+        ("84 01", None),
+    ],
+)
+def test_requests_are_those_of_the_standard(
+    pdu: str, expected: tuple[int, int, list[int]] | None
+) -> None:
+    """Read 1 to 125 registers or write 1 to 123, the bytes as many as are counted."""
+    request = parse_request(Adu(1, bytes.fromhex(pdu)))
+    if expected is None or request is None:
+        assert expected is request
+        return
+    assert (request.address, request.count) == expected[:2]
+    if expected[2]:
+        assert [*request.registers] == expected[2]
+
+
+READING, WRITING = Read(dev_id=1, address=9, count=2), Write(dev_id=1, address=9, registers=[5, 6])
+
+
+@pytest.mark.parametrize(
+    ("request_sent", "pdu", "expected"),
+    [
+        (READING, "04 04 0001 FFFF", Response([1, 0xFFFF])),
+        (READING, "04 02 0001", None),
+        (READING, "04 05 0001 FFFF", None),
+        (READING, "04 03 0001 FFFF", None),
+        (READING, "04 04 0001 FFFF 00", None),
+        (READING, "03 04 0001 FFFF", None),
+        (READING, "04", None),
+        (READING, "84 02", Response(exception=2)),
+        (READING, "84 00", None),
+        (READING, "84 02 00", None),
+        (READING, "84", None),
+        (READING, "90 02", None),
+        (WRITING, "10 0009 0002", Response()),
+        (WRITING, "10 0008 0002", None),
+        (WRITING, "10 0009 0003", None),
+        (WRITING, "10 0009 0002 00", None),
+        (WRITING, "10 0009", None),
+        (None, "04 04 0001 FFFF", None),
+    ],
+)
+def test_response_is_that_of_its_request(
+    request_sent: Read | Write | None, pdu: str, expected: Response | None
+) -> None:
+    """By unit, transaction, function, and registers or their address and count."""
+    found = response_to(request_sent, Adu(1, bytes.fromhex(pdu)))
+    assert (found and ([*found.registers], found.exception)) == (
+        expected and ([*expected.registers], expected.exception)
+    )
+    assert response_to(request_sent, Adu(2, bytes.fromhex(pdu))) is None
+    assert response_to(request_sent, Adu(1, bytes.fromhex(pdu), transaction=1)) is None
+
+
+def test_damaged_bytes_raise_and_log_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Bytes of every function, as requests, responses and frames; exceptions are no errors."""
+    caplog.set_level(logging.DEBUG)
+    chance = random.Random(5)
+    readers = [
+        AduReader(is_rtu=True, of_requests=of_requests, waits=waits)
+        for of_requests in (True, False)
+        for waits in (True, False)
+    ]
+    for number in range(256 * 40):
+        data = bytes([1, number % 256]) + chance.randbytes(chance.randrange(12))
+        parse_request(Adu(1, data[1:]))
+        for request in (READING, WRITING):
+            response_to(request, Adu(1, data[1:]))
+        for reader in readers:
+            reader.feed(data)
+            reader.end()
+    assert exception_to(16, 3) == b"\x90\x03"
+    Log.error("of a library")
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("noise", [b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"])
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("part", [250, 1 << 18])
+def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
+    noise: bytes, waits: bool, part: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of its bytes is there once, and the frame behind it is found."""
+    tried = 0
+
+    def counted(frame: bytes) -> Adu | None:
+        nonlocal tried
+        tried += 1
+        return checked(frame)
+
+    checked = modbus_frames._checked
+    monkeypatch.setattr(modbus_frames, "_checked", counted)
+    reader = AduReader(is_rtu=True, of_requests=waits, waits=waits)
+    data = (noise * (1 << 18))[: 1 << 18]
+    found: list[Adu] = []
+    for at in range(0, len(data), part):
+        tried = 0
+        found += reader.feed(data[at : at + part])
+        assert len(reader.rest) <= 256
+        assert tried <= 1024
+    response = bytes.fromhex("01 10 06 00 00 03 80 80")
+    found += reader.end() + reader.feed(WHOLE if waits else response)
+    assert b"".join(each.raw for each in found) == data + found[-1].raw
+    assert [each.raw for each in found if each.pdu] == [WHOLE if waits else response]
+
+
+OWN = ("slcan", "socketcan", "socketcand")
+CHANNELS = {
+    "etas": "ETAS://ETH/ES910:abcd/CAN:1",
+    "nixnet": "CAN1",
+    "pcan": "PCAN_USBBUS1",
+    **dict.fromkeys(("robotell", "seeedstudio", "serial"), "/dev/no-such-port"),
+    "udp_multicast": "239.74.163.2",
+    "usb2can": "ED000200",
+}
+OPTIONS = {
+    "canalystii": {"device": 1},
+    "ixxat": {"unique_hardware_id": "HW107711"},
+    "neousys": {"device": 1},
+    "neovi": {"serial": 4711},
+    "pcan": {"device_id": 5},
+    "systec": {"device_number": 2},
+    "udp_multicast": {"port": 43114},
+    "vector": {"app_name": "plate", "serial": 4711},
+}
+INTERFACES = sorted(set(BACKENDS) - set(OWN))
+
+
+def address(interface: str, query: str = "") -> PythonCanAddress:
+    """Node 3 on a channel as the interface names it."""
+    found = address_of(f"can+python-can://{interface}/{CHANNELS.get(interface, '0')}{query}#3")
+    assert isinstance(found, PythonCanAddress)
+    return found
+
+
+@pytest.mark.parametrize("interface", INTERFACES)
+async def test_interface_is_opened_by_its_name(
+    interface: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its channel, a number as one, the bit rate and the options that tell adapters apart."""
+    opened: dict[str, Any] = {}
+
+    def open_bus(**how: object) -> None:
+        opened.update(how)
+        raise OSError("no adapter")
+
+    monkeypatch.setattr(can, "Bus", open_bus)
+    options = OPTIONS.get(interface, {})
+    more = "".join(f"&{name}={value}" for name, value in options.items())
+    found = address(interface, f"?bitrate=250000{more}")
+    with pytest.raises(LinkError, match="no adapter"):
+        await found.open_port(lambda data: None, lambda cause: None)
+    assert found.number == 3
+    assert (opened["interface"], opened["channel"]) == (interface, CHANNELS.get(interface, 0))
+    assert (opened["bitrate"], opened["receive_own_messages"]) == (250_000, False)
+    assert options.items() <= opened.items()
+
+
+@pytest.mark.parametrize("interface", sorted(set(INTERFACES) - {"virtual", "udp_multicast"}))
+async def test_missing_adapter_is_a_link_error(interface: str) -> None:
+    """Whatever the driver of a vendor raises where it is missing."""
+    with pytest.raises(LinkError, match="cannot be opened"):
+        await address(interface).open_port(lambda data: None, lambda cause: None)
+
+
+def test_frames_are_those_of_classic_can() -> None:
+    """Version 3 has no CAN FD, and a node from 1 to 127."""
+    for query in ("?fd=2000000#1", "#128", "?bitrate=3#1"):
+        with pytest.raises(CommandError):
+            address_of(f"can+socketcan://can0{query}")
+
+
+class _Hanging:
+    """A port or adapter whose opening, reading and closing block until allowed."""
+
+    def __init__(self) -> None:
+        self.port = "/dev/ttyUSB9"
+        self.may_open, self.may_read, self.may_close = (threading.Event() for _ in range(3))
+        self.is_opening, self.is_closed = threading.Event(), threading.Event()
+        self._pipe = os.pipe()
+
+    def open(self, *_: object) -> "_Hanging":
+        self.is_opening.set()
+        self.may_open.wait(60)
+        return self
+
+    def fileno(self) -> int:
+        return self._pipe[0]
+
+    def recv(self, timeout: float) -> can.Message | None:
+        if not self.may_read.wait(timeout):
+            return None
+        return can.Message(arbitration_id=0x701, is_extended_id=False, data=[5])
+
+    def close(self) -> None:
+        self.may_close.wait(60)
+        for descriptor in self._pipe:
+            os.close(descriptor)
+        self.is_closed.set()
+
+    shutdown = close
+
+
+class _HangingRead(_Hanging):
+    def recv(self, timeout: float) -> can.Message | None:
+        return super().recv(20)
+
+
+HEARD: list[bytes] = []
+OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
+    "port": partial(
+        ports.open_port,
+        Place("/dev/ttyUSB9", baud=9600),
+        lambda data: None,
+        lambda what: None,
+    ),
+    "adapter": partial(
+        can_bus.open_bus,
+        "can+python-can://pcan/usb",
+        {"interface": "pcan"},
+        HEARD.append,
+        lambda what: None,
+    ),
+}
+
+
+@pytest.fixture(params=[_Hanging, _HangingRead])
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[_Hanging]:
+    """The device that is opened; released after the test."""
+    device: _Hanging = request.param()
+    monkeypatch.setattr(ports, "_open_device", device.open)
+    monkeypatch.setattr(can, "Bus", lambda **how: device.open())
+    monkeypatch.setattr(threads, "CLOSE_TIMEOUT", 0.05)
+    HEARD.clear()
+    yield device
+    for event in (device.may_open, device.may_read, device.may_close):
+        event.set()
+    assert device.is_closed.wait(60)
+
+
+@pytest.mark.parametrize("kind", OPENINGS)
+async def test_close_does_not_wait_for_a_device_that_hangs(
+    device: _Hanging, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It continues in its thread, with a log line; frames read then are discarded."""
+    device.may_open.set()
+    opened = await OPENINGS[kind]()
+    opened.close()
+    with caplog.at_level(logging.WARNING, "drivers"):
+        await asyncio.wait_for(opened.wait_closed(), 30)
+    assert not device.is_closed.is_set()
+    assert "era-close" in caplog.text
+    device.may_read.set()
+    device.may_close.set()
+    assert await asyncio.to_thread(device.is_closed.wait, 60)
+    assert HEARD == []

@@ -1,9 +1,16 @@
-"""What of content will be felt, beside the plate in time solved piece by piece."""
+"""Regions of a layout at the same time: what fingers in two and three of them are promised.
 
+What of content will be felt, beside the plate in time solved piece by piece.
+"""
+
+import asyncio
 import json
 import math
 import wave
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +18,20 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.content.pattern import Pattern, Transient
+from controller.effects.effect import Effect, Region
+from controller.effects.kinds import Buzz, Click
+from controller.effects.layout import SurfaceLayout
+from controller.effects.player import EffectPlayer
+from controller.play.intent import HapticIntent
+from controller.play.layer_contents import Prediction
+from controller.play.selection import Chooser, Selector
+from controller.sources.touch import Contact, ContactKey
+from era_haptics.lab.checks import layout_picture
 from era_haptics.lab.checks.content_check import check_content, kept_shares
 from era_haptics.lab.checks.layout_check import loaded_plate
+from era_haptics.lab.checks.layout_picture import Together, check_together, close_pairs, matrix_of
 from era_haptics.lab.cli import app
+from model.config.fields import Rectangle
 from model.errors import InputError
 from model.finger import (
     decibels,
@@ -27,8 +45,145 @@ from model.table.table_file import build_table, save_table
 from model.transients.base_motion import along_lines, raised_cosine
 from model.transients.shaping import SAMPLE_RATE, Transients
 from plates import smooth_rig
+from set_table import phased, wants
+from several_fingers import playable
+from several_fingers import table as several_fingers_table
 
-pytestmark = pytest.mark.usefixtures("plain_pictures")
+SIZE = 0.03
+WEST, EAST, NEXT, NORTH = (0.03, 0.06), (0.2448, 0.06), (0.075, 0.06), (0.1374, 0.18)
+"""South-west corners [m] of regions on a plate of 0.3048 m by 0.2286 m; west and east mirrored."""
+
+
+def region(name: str, corner: tuple[float, float]) -> Region:
+    """A square region with a buzz of its name."""
+    return Region(name, Rectangle(*corner, SIZE, SIZE), on_press=name)
+
+
+def layout(*regions: Region) -> SurfaceLayout:
+    """A layout of regions."""
+    effects = {each.name: Buzz(level=14.0) for each in regions}
+    return SurfaceLayout(regions, effects, elsewhere=None)
+
+
+def fingers_at(places: Sequence[tuple[float, float]]) -> list[Contact]:
+    """Fingers down at once."""
+    return [Contact(ContactKey("test", n), *at, since=0.0) for n, at in enumerate(places)]
+
+
+def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> list[float]:
+    """Contrast that the control loop promises each finger, of amplifiers with eight layers."""
+
+    async def predicted() -> tuple[Prediction, ...]:
+        arrived = asyncio.Event()
+        selector = Selector(Chooser(several_fingers_table()), arrived=arrived.set)
+        selector.select(contacts, intent, playable())
+        if selector.is_choosing:
+            await arrived.wait()
+        return selector.select(contacts, intent, playable()).predictions
+
+    found = asyncio.run(predicted())
+    by_key = {each.contact.key: each.promised_contrast_db or math.nan for each in found}
+    return [by_key[each.key] for each in contacts]
+
+
+def test_mirrored_regions_are_promised_the_same() -> None:
+    """The plate and its ERAs are symmetric: east and west of north alike, but for the draws."""
+    found = check_together(
+        layout(region("west", WEST), region("east", EAST), region("north", NORTH)),
+        several_fingers_table(),
+    )
+    worst = {each.regions: each.worst_db for each in found}
+    assert len(worst) == 4
+    assert worst["west", "north"] == pytest.approx(worst["east", "north"], abs=1.5)
+    # A third finger leaves no two more than they had.
+    assert worst["west", "east", "north"] < min(worst[pair] for pair in [*worst][:3]) + 0.5
+
+
+def test_places_are_the_worst_of_their_regions() -> None:
+    """Within both, and promised less than the centres, if anything; nearer regions less."""
+    west, near, east = region("west", WEST), region("near", NEXT), region("east", EAST)
+    found = check_together(layout(west, near, east), several_fingers_table())
+    by_name = {each.regions: each for each in found}
+    for pair, each in by_name.items():
+        shapes = [one.shape for one in (west, near, east) if one.name in pair]
+        assert all(shape.contains(*at) for shape, at in zip(shapes, each.at, strict=True))
+        if len(pair) == 2:
+            fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
+            centred = phased(several_fingers_table(), fingers, min_contrast_db=-math.inf)
+            assert centred.promised_worst_db is not None
+            assert each.worst_db <= centred.promised_worst_db
+            assert each.worst_db <= min(each.contrasts)
+    assert by_name["west", "near"].worst_db < by_name["west", "east"].worst_db
+
+
+def test_pairs_that_are_felt_as_one_are_named() -> None:
+    """Those below 6 dB, the rule's bound of what is mixed, the worst first; none of three."""
+    at, worst = (0.0, 0.0), {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
+    found = [Together((*names,), (at, at), (db, db), db, ()) for names, db in worst.items()]
+    said = close_pairs(found)
+    assert "2 of 3 pairs" in said
+    assert said.index("b with c -1.0 dB") < said.index("a with b 3.2 dB")
+    assert close_pairs(found[1:2]) == ""
+
+
+def test_verdicts_follow_the_rule_and_what_regions_say() -> None:
+    """Below 12 dB mixed; where a region requires its own or is protected another is held back."""
+    near = region("near", (0.12, 0.06))
+    (mixed,) = check_together(layout(region("west", WEST), near), several_fingers_table())
+    assert 6 < mixed.worst_db < 12
+    assert "mixed" in mixed.verdicts
+    for said in (replace(near, is_own=True), replace(near, is_protected=True)):
+        (found,) = check_together(
+            layout(region("west", WEST), replace(said, priority=1)), several_fingers_table()
+        )
+        assert found.verdicts[0] == "held back"
+        assert (found.at, found.worst_db) == (mixed.at, mixed.worst_db)
+
+
+@pytest.mark.parametrize(
+    "effect", [Buzz(level=14.0, modulation=20.0), Click(level=14.0)], ids=["rough", "click"]
+)
+def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effect) -> None:
+    """Side bands and short effects leak more than a steady tone, by what a selection says."""
+    steady = layout(region("west", WEST), region("north", NORTH))
+    changed = replace(steady, effects={**steady.effects, "west": effect})
+    (before,), (found,) = (
+        check_together(each, several_fingers_table()) for each in (steady, changed)
+    )
+    assert found.at == before.at
+    assert found.worst_db < before.worst_db - 0.2
+    contacts, player = fingers_at(found.at), EffectPlayer(changed)
+    promised = promised_by_the_loop(contacts, player.intent(contacts, 0.0))
+    assert found.contrasts[0] == pytest.approx(promised[0], abs=0.3)
+    assert promised[1] <= found.contrasts[1] + 0.3  # less while a click plays
+
+
+def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
+    """Of three above it the least with any third."""
+    regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
+    found = check_together(layout(*regions), several_fingers_table())
+    names, promised = matrix_of(found)
+    assert names == [*"abcd"]
+    assert np.isnan(np.diag(promised)).all()
+    for one, other in pairwise(range(4)):
+        (pair,) = (each for each in found if each.regions == (names[one], names[other]))
+        third = min(
+            each.worst_db
+            for each in found
+            if len(each.regions) == 3 and {names[one], names[other]} <= {*each.regions}
+        )
+        assert (promised[other, one], promised[one, other]) == (pair.worst_db, third)
+
+
+def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bound on what is computed keeps the pair that is hardest to tell apart."""
+    monkeypatch.setattr(layout_picture, "MAX_PAIRS", 1)
+    monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
+    regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
+    silent = Region("silent", Rectangle(0.03, 0.10, SIZE, SIZE))
+    (found,) = check_together(layout(*regions, silent), several_fingers_table())
+    assert found.regions == ("a", "c")
+
 
 AT, QUIET = (0.11, 0.13), (0.21, 0.06)
 SWELL = Pattern(
@@ -42,6 +197,7 @@ def table() -> LocalizationTable:
     return build_table(smooth_rig(), frequencies=np.arange(60.0, 321.0, 20.0), drive_mode="phased")
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_felt_level_is_that_of_the_plate_in_time() -> None:
     """A swell and a tap in it, also as terms of the bases, each between two knots by itself."""
     found = check_content(SWELL, table(), 20.0, at=AT)
@@ -78,6 +234,7 @@ def test_felt_level_is_that_of_the_plate_in_time() -> None:
         assert found.given[round(time / found.step)] == pytest.approx(float(expected), abs=0.3)
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_what_lasts_has_its_level_and_taps_theirs() -> None:
     """20 dB SL for a second, the plate's rise apart; then a tap of 15 dB SL alone."""
     pattern = Pattern(
@@ -91,6 +248,7 @@ def test_what_lasts_has_its_level_and_taps_theirs() -> None:
     assert found.delay <= 0.01
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_long_content_that_jumps_has_its_level() -> None:
     """Five seconds of 20 dB SL; by less than 2 dB more the plate overshoots after the jump."""
     pattern = Pattern(5.0, ((0.0, 0.0), (0.005, 1.0), (5.0, 1.0)))
@@ -99,6 +257,7 @@ def test_long_content_that_jumps_has_its_level() -> None:
     assert found.kept_share > 0.95
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_asked() -> None:
     """Of 100 steps 40 count; 10 of these are 4 dB off; given 3 steps late."""
     expected = np.concatenate([np.full(30, 20.0), np.full(10, 5.0), np.full(60, -1.0)])
@@ -107,6 +266,7 @@ def test_kept_share_counts_levels_within_3_db_where_20_below_the_highest_are_ask
     assert kept_shares(expected, given, 5).argmax() == 3
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:
     """Of two equal taps 50 ms apart the second is in what lasts, from 30 ms after the first on."""
     taps = Transient(0.1, 1.0, 0.5), Transient(0.15, 1.0, 0.5)
@@ -116,6 +276,7 @@ def test_taps_too_close_to_be_clicks_are_felt_in_what_lasts() -> None:
     assert "1 of 2 taps" in found.lost[0]
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
     """The course starts and ends at rest; each part has a promise, the least counts."""
     found = check_content(SWELL, table(), 20.0, at=AT, quiet=[QUIET])
@@ -126,6 +287,7 @@ def test_beside_a_quiet_finger_content_is_smoothed_and_promised() -> None:
     assert found.as_json()["promised_contrast_db"] == min(each for each in promises if each)
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> None:
     """Exit status 0 and 1 of the same content, its levels over time, and a picture."""
     save_table(table(), tmp_path / "table.npz")
@@ -156,6 +318,7 @@ def test_command_says_what_is_kept_and_fails_below_the_least(tmp_path: Path) -> 
     assert "dB above quiet fingers" in result.stdout
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_command_tries_several_places_and_says_what_a_tap_loses(tmp_path: Path) -> None:
     """The median of five is shown, never the worst; of all its time all that is off its level."""
     save_table(table(), tmp_path / "table.npz")
@@ -171,12 +334,14 @@ def test_command_tries_several_places_and_says_what_a_tap_loses(tmp_path: Path) 
     assert shares[0] == np.median(shares[1:])
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_level_beyond_all_is_refused_as_it_was_given() -> None:
     """Not as what becomes of it in the file."""
     with pytest.raises(InputError, match="level must be between -100 and 60 dB SL, got 70;"):
         check_content(Pattern(0.3, ((0.0, 0.5), (0.3, 0.5))), table(), 70.0, at=AT)
 
 
+@pytest.mark.usefixtures("plain_pictures")
 def test_what_is_felt_is_written_as_sound(tmp_path: Path) -> None:
     """Intensity 1 for a second at 20 dB SL: ten times the threshold at its frequency, sampled.
 

@@ -31,7 +31,7 @@ from several_fingers import WIRES, Felt, Pressed
 
 pytestmark = pytest.mark.usefixtures("plain_pictures")
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "panel_layout.yaml"
+EXAMPLE = Path(__file__).parents[4] / "examples" / "panel_layout.yaml"
 BUTTON = Rectangle(0.05, 0.04, 0.012, 0.012)
 SLIDER = Rectangle(0.02, 0.14, 0.26, 0.04)
 

@@ -1,15 +1,22 @@
-"""Layouts found for contrast, against enumeration, symmetry and the answers of tables."""
+"""Designs on several machines.
 
+Files that say where ERAs may stand and where fingers touch.
+
+Layouts found for contrast, against enumeration, symmetry and the answers of tables.
+"""
+
+import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.image import imsave
 
 from era_haptics.lab.design import problem as problem_module
-from era_haptics.lab.design.design_run import judge
+from era_haptics.lab.design.design_run import Design, Runner, judge, layout_keys, rank_layouts
 from era_haptics.lab.design.problem import (
     Area,
     ContactRule,
@@ -17,18 +24,213 @@ from era_haptics.lab.design.problem import (
     anywhere,
     area_of,
     candidates_of,
+    contact_rule,
     everywhere,
     layouts_of,
     shortfall,
 )
 from era_haptics.lab.design.score import LayoutSearch, Scorer
 from model.arrays import ComplexArray, FloatArray
+from model.config.document import parse_document
 from model.errors import InputError
 from model.finger import FIVE_POINTS, fingertips_on
+from model.processes import on_cluster, on_processes
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
-from model.rig.rig_file import example_rig_path, load_rig
+from model.rig.rig_file import example_rig_path, load_rig, parse_rig
 from model.structure.attachments import Era, attached_stiffness, drive_forces, static_loads
+from plates import exciter_rig_text, make_paper_rig
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few layouts together."""
+    monkeypatch.setattr("era_haptics.lab.design.design_run.CHUNK", 4)
+
+
+def ranked(runner: Runner, *, seed: int = 0) -> Design:
+    """Ten layouts of four ERAs, two of them judged by three contact sets."""
+    rig = make_paper_rig(12, 9)
+    few = tuple(anywhere(rig.plate).sets(3, seed=1))
+    contacts = replace(anywhere(rig.plate), given=few)
+    some = DesignProblem(rig, 4, area_of("edge", rig.plate), contacts, seed=seed)
+    return rank_layouts({some: layouts_of("random:10", some)}, finalists=2, runner=runner)
+
+
+def figures(design: Design) -> bytes:
+    """All numbers of a design."""
+    rows = [
+        [*each.found.positions.ravel(), each.found.score_db, each.mean_db if each.judged else 0]
+        for each in design.layouts
+    ]
+    return np.array(rows).tobytes()
+
+
+@pytest.mark.long
+def test_processes_and_a_cluster_find_the_same_to_the_bit() -> None:
+    """One process, two of this machine and two Dask workers."""
+    import dask  # takes a second
+    from distributed import LocalCluster
+
+    here = figures(ranked(Runner()))
+    assert figures(ranked(Runner(machines=partial(on_processes, 2)))) == here
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as running,
+    ):
+        there = Runner(machines=partial(on_cluster, running.scheduler_address))
+        assert figures(ranked(there)) == here
+
+
+def test_a_layout_is_judged_with_the_eras_of_its_problem(tmp_path) -> None:
+    """The same places with ERAs of two stiffnesses: each has the answers of its own rig."""
+    rig = make_paper_rig(12, 9)
+    few = tuple(anywhere(rig.plate).sets(3, seed=1))
+    contacts = replace(anywhere(rig.plate), given=few)
+    area = area_of("edge", rig.plate)
+    soft, stiff = (DesignProblem(rig, 4, area, contacts, stiffness=each) for each in (1e4, 3e4))
+    corners = {"corners": soft.own_positions}
+    found = rank_layouts({soft: corners, stiff: corners}, finalists=1, runner=Runner())
+    for each in found.layouts:
+        alone = judge(each.problem.rig_with(soft.own_positions), few)
+        assert sorted(each.answers.contrast_db) == pytest.approx(sorted(alone.contrast_db))
+
+
+def test_layouts_of_exciters_state_their_own_keys() -> None:
+    """A suspension by stiffness and damping takes the place of resonance and q, and reads back."""
+    text = exciter_rig_text("type: DAEX25CT-4, resonance: 300, resonance_is: free, q: 4")
+    rig = parse_rig("board.yaml", text)
+    area, contacts = area_of("edge", rig.plate), anywhere(rig.plate)
+    sought = DesignProblem(rig, 4, area, contacts, stiffness=5e3)
+    places = np.array([[0.05, 0.04], [0.25, 0.04], [0.25, 0.19], [0.06, 0.18]])
+    keys = layout_keys(sought, places, parse_document("board.yaml", text).data)
+    found = parse_rig("layout.yaml", json.dumps(keys))
+    assert [(era.x, era.y) for era in found.eras] == [tuple(at) for at in places.tolist()]
+    assert [era.stiffness for era in found.eras] == [5e3] * 4
+    assert [era.damping for era in found.eras] == pytest.approx([rig.eras[0].damping] * 4, rel=1e-5)
+
+
+PLATE = load_rig(example_rig_path()).plate
+
+
+def test_polygons_hold_their_points(tmp_path) -> None:
+    """Candidates and steps are in a triangle, its edges included."""
+    path = tmp_path / "where.yaml"
+    path.write_text("polygons:\n  left: [[0, 0], [12 cm, 0], [0, 12 cm]]\n")
+    area = area_of(str(path), PLATE)
+    places = area.candidates(0.02)
+    assert len(places) > 5
+    assert (places.sum(axis=1) <= 0.12 + 1e-9).all()
+    assert area.contains(np.array([[0.06, 0.06], [0.07, 0.06]])).tolist() == [True, False]
+    assert (area.moved(np.array([0.06, 0.06]), 0.01).sum(axis=1) <= 0.12 + 1e-9).all()
+
+
+def test_white_of_a_picture_is_where_eras_may_stand(tmp_path) -> None:
+    """The picture's top row is the plate's far side."""
+    pixels = np.zeros((21, 28))
+    pixels[:5, 14:] = 1.0
+    imsave(tmp_path / "mask.png", pixels, cmap="gray", vmin=0, vmax=1)
+    area = area_of(str(tmp_path / "mask.png"), PLATE)
+    x, y = area.candidates(0.01).T
+    assert x.min() >= PLATE.length / 2
+    assert y.min() >= 0.75 * PLATE.width
+    assert y.max() == PLATE.width
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "is_refused"),
+    [
+        (300, 400, False),
+        (306, 400, False),
+        (294, 400, False),
+        (307, 400, True),
+        (293, 400, True),
+        (400, 300, True),
+        (100, 100, True),
+        (22, 30, False),
+    ],
+)
+def test_picture_has_the_proportions_of_the_plate(tmp_path, rows, columns, is_refused) -> None:
+    """12 by 9 inches is 400 by 300 pixels, to 2 % of the height or half a pixel."""
+    path = tmp_path / "mask.png"
+    imsave(path, np.ones((rows, columns)), cmap="gray", vmin=0, vmax=1)
+    if not is_refused:
+        assert area_of(str(path), PLATE).contains(np.array([[0.1, 0.1]])).all()
+        return
+    with pytest.raises(InputError, match=rf"mask\.png.*0\.3048 m.*{columns} by {rows} pixels"):
+        area_of(str(path), PLATE)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "rectangle: {start: [25 cm, 5 cm], end: [31 cm, 10 cm]}",
+        "circle: {at: [2 cm, 10 cm], radius: 3 cm}",
+        "polygon: [[1 cm, 1 cm], [5 cm, 23 cm], [5 cm, 1 cm]]",
+        "circle: {at: [50 cm, 50 cm], radius: 2 cm}",
+    ],
+)
+def test_regions_off_the_plate_are_refused(tmp_path, shape) -> None:
+    """In part or wholly, of a plate of 12 by 9 inches, by file, line, name and size."""
+    path = tmp_path / "contacts.yaml"
+    path.write_text(
+        "regions:\n"
+        "  on: {rectangle: {start: [0, 0], end: [12 in, 9 in]}}\n"
+        f"  off: {{{shape}}}\n"
+    )
+    with pytest.raises(InputError, match=r"contacts\.yaml:3: regions\.off.*0\.3048 m by 0\.2286 m"):
+        contact_rule(path, PLATE)
+
+
+def test_contacts_in_regions_of_a_layout(tmp_path) -> None:
+    """Fingers are in the regions, so many of them, so far apart; effects are passed over."""
+    path = tmp_path / "layout.yaml"
+    path.write_text(
+        "quiet: [2, 2]\napart: 4 cm\nelsewhere: null\nregions:\n"
+        "  a: {rectangle: {start: [0, 0], end: [5 cm, 5 cm]}, on_press: click}\n"
+        "  b: {circle: {at: [20 cm, 10 cm], radius: 4 cm}}\n"
+    )
+    rule = contact_rule(path, PLATE)
+    for contacts in [*rule.sets(20, seed=1), *rule.pooled_sets(10, seed=1)]:
+        assert len(contacts) == 3
+        in_a = (contacts <= 0.05).all(axis=1)
+        in_b = np.hypot(*(contacts - [0.2, 0.1]).T) <= 0.04
+        assert (in_a | in_b).all()
+        gaps = np.linalg.norm(contacts[:, None] - contacts, axis=-1)
+        assert gaps[np.triu_indices(3, 1)].min() > 0.04
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "sets: []",
+        "regions: {}",
+        "quiet: [3, 1]\nregions: {a: {circle: {at: [0.1, 0.1], radius: 0.02}}}",
+        "regions: {a: {on_press: click}}",
+        "sets: [{target: [9, 0.1], quiet: [[0.2, 0.1]]}]",
+        "sets: [{target: [0.1, 0.1], quiet: []}]",
+        "fingers: 3",
+    ],
+)
+def test_files_of_contacts_that_say_nothing_are_refused(tmp_path, text) -> None:
+    """No region, an order turned round, no shape, a place off the plate, no quiet finger."""
+    path = tmp_path / "contacts.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"contacts\.yaml"):
+        contact_rule(path, PLATE)
+
+
+@pytest.mark.parametrize(
+    "name", ["nowhere.png", "broken.png", "nowhere.yaml", "empty.yaml", "inside"]
+)
+def test_area_that_cannot_be_read_is_refused(tmp_path, name) -> None:
+    """A missing file, a picture that is none, a word that is neither."""
+    (tmp_path / "broken.png").write_bytes(b"not a picture")
+    (tmp_path / "empty.yaml").touch()
+    with pytest.raises(InputError):
+        area_of(str(tmp_path / name), PLATE)
+
 
 GAINS = Uncertainty(0.05, 5.0, 0.0, 0.0, 1.0, 0.0)
 """Errors of the gains only, 5 % and 5 degrees."""

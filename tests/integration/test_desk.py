@@ -1,6 +1,6 @@
 """The desk without hardware: real JACK server, plate and commands.
 
-Its short forms have no server, or no plate: tests/sim/desk/test_measuring.py, test_jack_card.py.
+Its short forms have no server, or no plate: tests/era_haptics/lab/measuring/test_measuring.py, test_jack_card.py.
 """
 
 import subprocess

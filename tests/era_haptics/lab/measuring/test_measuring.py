@@ -1,8 +1,12 @@
-"""A plate measured through a sound card in memory, and what is refused."""
+"""A plate that is simulated in place of a desk, against the plate in time and its own seed.
+
+A plate measured through a sound card in memory, and what is refused.
+"""
 
 import ctypes
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +15,12 @@ from benchmarks.desk_plate.desk_plate import DeskPlate
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
+from controller.cli.main import run
 from drivers.errors import LinkError
+from era_haptics.lab.measuring import measure
 from era_haptics.lab.measuring.loopback import check_wiring, latency
-from era_haptics.lab.measuring.measure import STEPS, Measured, check_by_steps, measure, plot
+from era_haptics.lab.measuring.measure import STEPS, Measured, check_by_steps, plot
+from era_haptics.lab.measuring.measure import measure as measure_measure
 from era_haptics.lab.measuring.sound_card import (
     Desk,
     Estimate,
@@ -21,20 +28,76 @@ from era_haptics.lab.measuring.sound_card import (
     SoundCard,
     default_frequencies,
 )
-from model.calibration.responses import WiredSensor
+from examples.make_measured import record_responses
+from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.errors import InputError
 from model.processes import unseen
-from model.rig.rig import Rig
-from model.rig.rig_file import parse_rig
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import example_rig_path, load_rig, parse_rig
+from model.structure.attachments import PointLoad
+from sim.plant.fingers import Accelerometer
 from sim.soft_amp.engine import address_of
 from sound_cards import DeskCard
+
+PLACES = ((0.03, 0.05), (0.20, 0.11))
+FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 1e-3) for n, (x, y) in enumerate(PLACES, start=1))
+MOVED = tuple(replace(each, input=1, mass=20e-3) for each in FIXED)
+FREQUENCIES = np.array([61.0, 151.0, 311.0])
+
+
+@pytest.mark.parametrize("sensors", [FIXED, MOVED], ids=["fixed", "moved"])
+def test_responses_are_those_of_the_plate_in_time(sensors, monkeypatch, tmp_path) -> None:
+    """Of a plate that is the rig's, without noise; a sensor of 20 g weighs where it is moved to."""
+    monkeypatch.setattr(measure, "NOISE", 0.0)
+    rig = replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
+    output = tmp_path / "measured.csv"
+    measure.measured_by_simulation(Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0)
+    found = responses_of(read_measured(output), rig)
+    for number, each in enumerate(sensors):
+        load = PointLoad(each.x, each.y, mass=each.mass)
+        loaded = replace(rig, masses=(*rig.masses, load) if each.mass else rig.masses)
+        in_time = record_responses(loaded, [Accelerometer("", each.x, each.y)], FREQUENCIES)
+        error = found.values[:, :, number] - in_time.values[:, :, 0]
+        assert np.abs(error).max() < 0.03 * np.abs(in_time.values).max()
+
+
+def test_one_command_measures_a_plate_that_deviates_as_its_seed_draws_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same for the same seed, another one for another; it says where to calibrate to."""
+    sensors = tmp_path / "sensors.csv"
+    sensors.write_text("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.03,0.05,1,10\nP2,0.2,0.11,2,10\n")
+    rig = example_rig_path()
+    found = []
+    for seed in ("0", "0", "1"):
+        output = tmp_path / f"{len(found)}.csv"
+        options = ["--simulated", "--sensors", str(sensors), "-o", str(output), "--seed", seed]
+        status = run(["measure", str(rig), *options, "--frequencies", "61:301:40"])
+        assert status == 0
+        assert f"-o {tmp_path / 'calibrated.yaml'}" in capsys.readouterr().out
+        found.append(responses_of(read_measured(output), load_rig(rig)).values)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert np.abs(found[2] / found[0] - 1).max() > 0.05
+
+
+@pytest.mark.parametrize("option", [("--device", "jack"), ("--stepped",), ("--y-cable",)])
+def test_what_only_a_sound_card_does_is_refused(option: tuple[str, ...], tmp_path: Path) -> None:
+    """Exit status 2, and nothing is written."""
+    sensors, output = tmp_path / "sensors.csv", tmp_path / "measured.csv"
+    sensors.write_text("sensor,x_m,y_m,input,mv_per_m_s2\nP1,0.03,0.05,1,10\n")
+    arguments = ["measure", str(example_rig_path()), "--simulated", "--sensors", str(sensors)]
+    assert run([*arguments, "-o", str(output), *option]) == 2
+    assert not output.exists()
+
 
 RATE = 8_000.0
 DELAY = 73
 LEVEL = 0.3
-PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
-SENSORS = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
-FREQUENCIES = np.array([61.0, 151.0, 233.0, 311.0])
+MEASURING_PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
+SENSORS = tuple(
+    WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(MEASURING_PLACES, start=1)
+)
+MEASURING_FREQUENCIES = np.array([61.0, 151.0, 233.0, 311.0])
 
 
 def card(truth: Truth, *, noise: float = 0.0, is_shared: bool = False, **wires: object) -> DeskCard:
@@ -44,7 +107,7 @@ def card(truth: Truth, *, noise: float = 0.0, is_shared: bool = False, **wires: 
     return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
 
 
-def sines(desk: Desk, frequencies: np.ndarray = FREQUENCIES) -> Multisine:
+def sines(desk: Desk, frequencies: np.ndarray = MEASURING_FREQUENCIES) -> Multisine:
     """Multisines of all ERAs and of the loop-back."""
     return Multisine(frequencies, len(desk.eras) + 1, RATE, LEVEL)
 
@@ -53,7 +116,7 @@ def sines(desk: Desk, frequencies: np.ndarray = FREQUENCIES) -> Multisine:
 def undisturbed(rig: Rig, truth: Truth) -> Measured:
     """The plate measured with nothing wrong."""
     desk = Desk(rig, SENSORS)
-    return measure(desk, card(truth), sines(desk))
+    return measure_measure(desk, card(truth), sines(desk))
 
 
 SQUARE = """
@@ -99,9 +162,9 @@ def test_measured_responses_are_those_of_the_plate(
     What is left is the ringing of the start, 1 s before.
     """
     found = undisturbed
-    model = DeskModel(truth, np.array(PLACES)).under()
+    model = DeskModel(truth, np.array(MEASURING_PLACES)).under()
     strokes = np.array([era.stroke for era in rig.eras])
-    exact = model.response(FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
+    exact = model.response(MEASURING_FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
     loud = np.abs(exact) > 0.05 * np.abs(exact).max(axis=(1, 2), keepdims=True)
     # The filter of inputs at 8 kHz has a ripple over this band, which the loop-back takes out too.
     np.testing.assert_allclose(found.responses.values[loud], exact[loud], rtol=0.02)
@@ -118,9 +181,9 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
     Inputs exchanged, and another ERA's output in the cable, are reported with their places.
     """
     desk = Desk(rig, SENSORS, is_shared=True)
-    sines = Multisine(FREQUENCIES, 4, RATE, LEVEL)
+    sines = Multisine(MEASURING_FREQUENCIES, 4, RATE, LEVEL)
     sound = card(truth, is_shared=True)
-    found = measure(desk, sound, sines)
+    found = measure_measure(desk, sound, sines)
     difference = found.responses.values - undisturbed.responses.values
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
     assert (sound.runs, desk.output) == (4, 4)
@@ -130,14 +193,14 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
         ({"on_outputs": [0, 1, 2, 3, 1]}, "output 2 of ERA SE"),
     ):
         with pytest.raises(InputError, match=cause):
-            measure(desk, card(truth, **wires), sines)
+            measure_measure(desk, card(truth, **wires), sines)
 
 
 def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     """Single tones of single ERAs give the responses that all ERAs gave at once."""
     desk = Desk(rig, SENSORS)
     sound = card(truth)
-    found = measure(desk, sound, sines(desk, np.array([61.0, 233.0])))
+    found = measure_measure(desk, sound, sines(desk, np.array([61.0, 233.0])))
     check = check_by_steps(desk, sound, found, level=LEVEL, progress=unseen)
     assert check["frequencies_hz"] == [61.0, 233.0]
     assert check["level_rms_db"] < 0.1
@@ -159,7 +222,7 @@ def test_run_that_lost_a_block_is_played_again(
     """
     desk = Desk(rig, SENSORS)
     sound = card(truth, **wires)
-    found = measure(desk, sound, sines(desk))
+    found = measure_measure(desk, sound, sines(desk))
     assert (found.repeated, sound.runs) == (repeated, 5 + repeated)
     difference = found.responses.values - undisturbed.responses.values
     assert np.linalg.norm(difference) < 0.01 * np.linalg.norm(undisturbed.responses.values)
@@ -194,7 +257,7 @@ def test_wrong_desks_are_refused_with_their_cause(
     if "noise" in wires:
         played = replace(played, level=0.03)  # as loud as the noise, without clipping
     with pytest.raises(error, match=cause):
-        measure(desk, card(truth, **wires), played)  # type: ignore[arg-type]
+        measure_measure(desk, card(truth, **wires), played)  # type: ignore[arg-type]
 
 
 # Inputs of P1, P2, P3 and of the loop-back, by outputs 1 to 5; output 5 has the cable.
@@ -219,7 +282,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
     """One input is changed; its gains say by hand what is connected to it."""
     came = WIRED.copy()
     came[at - 1] = gains
-    each = np.broadcast_to(came, (len(FREQUENCIES), *came.shape)).astype(complex)
+    each = np.broadcast_to(came, (len(MEASURING_FREQUENCIES), *came.shape)).astype(complex)
     found = Estimate(each, abs(each), abs(each), np.zeros(4))
     with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
         check_wiring(found, Desk(rig, SENSORS))
@@ -228,7 +291,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
 def test_sensors_of_a_single_source_are_no_cables(rig: Rig) -> None:
     """One ERA with the loop-back beside it: all inputs have that output alone."""
     alone = Desk(replace(rig, eras=rig.eras[:1]), SENSORS, is_shared=True)
-    each = np.full((len(FREQUENCIES), 4, 1), 0.4 + 0j)
+    each = np.full((len(MEASURING_FREQUENCIES), 4, 1), 0.4 + 0j)
     check_wiring(Estimate(each, abs(each), abs(each), np.zeros(4)), alone)
     each[:, 3] = 1e-5
     with pytest.raises(InputError, match="connect them by a cable"):
@@ -241,7 +304,7 @@ def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:
     off[2] = replace(off[2], gain=0.0)
     desk = Desk(rig, SENSORS)
     with pytest.raises(LinkError, match=r"output 3.*NE"):
-        measure(desk, card(replace(truth, actuators=tuple(off)), noise=5e-3), sines(desk))
+        measure_measure(desk, card(replace(truth, actuators=tuple(off)), noise=5e-3), sines(desk))
 
 
 def test_levels_and_frequencies_that_cannot_be_played_are_refused(rig: Rig) -> None:
@@ -259,8 +322,8 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     evenly = np.arange(61.0, 500.0, 60.0)
     late = np.exp(-2j * np.pi * evenly * 3.7e-3)
     assert latency(late, evenly) == pytest.approx(3.7e-3)
-    response = 0.4 * np.exp(-2j * np.pi * FREQUENCIES * 3.7e-3)
-    assert latency(response, FREQUENCIES) == pytest.approx(3.7e-3)
+    response = 0.4 * np.exp(-2j * np.pi * MEASURING_FREQUENCIES * 3.7e-3)
+    assert latency(response, MEASURING_FREQUENCIES) == pytest.approx(3.7e-3)
     lines = default_frequencies(40, 500)
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):

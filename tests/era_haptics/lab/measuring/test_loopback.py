@@ -1,20 +1,192 @@
-"""A stepped sine that other programs have recorded or measured, against what made it."""
+"""Which output drives which actuator: told by a person, and by one accelerometer.
 
+A stepped sine that other programs have recorded or measured, against what made it.
+"""
+
+import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.io import wavfile
+from typer.testing import CliRunner
 
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth
+from era_haptics.lab.cli import app
 from era_haptics.lab.measuring.loopback import read_stepped
+from era_haptics.lab.measuring.outputs import Heard, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk
-from model.arrays import ComplexArray, FloatArray
+from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.responses import Responses, WiredSensor, responses_of
+from model.config.document import read_document
 from model.errors import InputError
+from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from plates import exciter_rig
+from sound_cards import DeskCard
 
-RATE = 12_000
+RATE = 8000.0
+EXAMPLE = Path(__file__).parents[4] / "examples" / "desk" / "rig.yaml"
+SENSITIVITY = 0.01  # that the command does not know
+
+
+class Cabled(DeskCard):
+    """Outputs wired to ERAs in another order, each with a gain; negative: wires exchanged.
+
+    One input, of an accelerometer that is moved from place to place.
+    """
+
+    order: Sequence[int]
+    gains: Sequence[float]
+    place = -1
+
+    def move(self, _name: str) -> None:
+        """To the next place."""
+        self.place += 1
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """The loop-back's output is silent."""
+        wired = np.zeros((len(played), 5))
+        wired[:, self.order] = played * np.asarray(self.gains)
+        return super().run(wired)[:, [self.place]]
+
+
+def cabled(
+    truth: Truth,
+    *,
+    order: Sequence[int] = (0, 1, 2, 3),
+    gains: Sequence[float] = (1, 1, 1, 1),
+    apart: float = 0.02,
+) -> Cabled:
+    """The deviating plate with a place as far [m] from each ERA, towards the middle."""
+    sensors = []
+    for n, era in enumerate(truth.rig.eras, start=1):
+        way = np.array([truth.rig.plate.length / 2 - era.x, truth.rig.plate.width / 2 - era.y])
+        x, y = np.array([era.x, era.y]) + min(apart / np.linalg.norm(way), 1) * way
+        sensors.append(WiredSensor(f"A{n}", x, y, n, SENSITIVITY))
+    plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
+    card = Cabled(plate, rate=RATE)
+    card.order, card.gains = order, gains
+    return card
+
+
+def heard(rig: Rig, card: Cabled) -> list[Heard]:
+    """What an accelerometer beside each ERA tells."""
+    return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
+
+
+def test_accelerometer_tells_swapped_and_backwards(rig: Rig, truth: Truth) -> None:
+    """Of a plate that deviates from the rig, with an unknown delay: as it was wired here."""
+    names = [era.name for era in rig.eras]
+    found = heard(rig, cabled(truth, order=(0, 2, 1, 3), gains=(1, 1, -1, 1)))
+    assert [each.era for each in found] == [names[n] for n in (0, 2, 1, 3)]
+    assert [each.polarity for each in found] == [1, 1, -1, 1]
+    assert [each.verdict == "ok" for each in found] == [True, True, False, True]
+
+
+def test_dead_and_weak_outputs_are_said(rig: Rig, truth: Truth) -> None:
+    """One plays nothing, another a quarter as loud: 12 dB, to the 3 dB that plates deviate by."""
+    found = heard(rig, cabled(truth, gains=(1, 0, 1, 0.25)))
+    assert [each.era for each in found] == ["SW", None, "NE", "NW"]
+    assert "dead" in found[1].verdict
+    assert "loose" in found[3].verdict
+    assert 20 * np.log10(found[3].relative_level) == pytest.approx(-12, abs=3)
+
+
+def test_accelerometer_that_stays_is_refused(rig: Rig, truth: Truth) -> None:
+    """In the middle all four corners of a symmetric plate are alike."""
+    with pytest.raises(InputError, match="was moved each time"):
+        heard(rig, cabled(truth, apart=1.0))
+
+
+def test_exciters_are_told_apart_on_a_board_of_the_shop() -> None:
+    """12 boards that deviate: 10 % of E, 20 % of springs, 40 % of gains, 10 degrees, 25 mm."""
+    nominal = exciter_rig()
+    frequencies = np.arange(81.0, 261.0, 20.0)
+    points = np.array([[each.x, each.y] for each in nominal.eras])
+    rng = np.random.default_rng(0)
+    model = _responses(nominal, points, frequencies)
+    for _ in range(12):
+        board = nominal.plate.material
+        plate = replace(
+            nominal.plate, material=replace(board, E=board.E * (1 + 0.1 * rng.normal()))
+        )
+        eras = tuple(each.varied(stiffness=np.exp(0.2 * rng.normal())) for each in nominal.eras)
+        away = 0.025 * np.exp(2j * np.pi * rng.uniform(size=4))
+        real = replace(nominal, plate=plate, eras=eras)
+        values = _responses(real, points + np.stack([away.real, away.imag], axis=1), frequencies)
+        order, signs = rng.permutation(4), rng.permutation([1, 1, 1, -1])
+        gains = rng.uniform(0.6, 1.4, 4) * np.exp(1j * np.radians(10) * rng.normal(size=4))
+        late = np.exp(-2j * np.pi * frequencies * 0.0042)
+        played = values[order] * (signs * gains)[:, None, None] * late[:, None]
+        rows, found, polarities = matched(played, model, frequencies)
+        assert rows.tolist() == [0, 1, 2, 3]
+        assert found.tolist() == order.tolist()
+        assert polarities.tolist() == signs.tolist()
+
+
+def _responses(rig: Rig, points: FloatArray, frequencies: FloatArray) -> ComplexArray:
+    """Of each exciter, each frequency, at each place."""
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0)
+    return free.acceleration(rig.eras, frequencies, points, loads=rig.masses).transpose(1, 0, 2)
+
+
+def test_tone_is_soft_on_one_output_within_the_limits(rig: Rig) -> None:
+    """Largest sample and steepest rise by hand, others silent; a forbidden frequency is refused."""
+    desk = Desk(rig, ())
+    played = tone(desk, 3, outputs=4, rate=48_000, level=0.1, frequency=160.0)
+    assert np.abs(played).max() == pytest.approx(0.1, rel=1e-3)
+    assert not played[:, [0, 1, 3]].any()
+    assert np.abs(np.diff(played, axis=0)).max() < 0.1 * 2 * np.pi * 160 / 48_000 * 1.01
+    assert played[0, 2] == 0
+    with pytest.raises(InputError, match="--frequency"):
+        tone(desk, 1, outputs=4, rate=48_000, level=0.1, frequency=5.0)
+
+
+@pytest.mark.parametrize(
+    ("said", "channels", "status"),
+    [
+        ("SE\nr\nsw\nxx\nNE\nNW\n", {"SE": 0, "SW": 1, "NE": 2, "NW": 3}, 0),
+        ("SW\nSE\n-\nNW\n", {"SW": 0, "SE": 1, "NW": 3}, 1),
+    ],
+)
+def test_said_channels_are_written(
+    truth: Truth,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    said: str,
+    channels: dict[str, int],
+    status: int,
+) -> None:
+    """As they were said, one asked again; with one that no output drives no file is written."""
+    card = cabled(truth)
+    monkeypatch.setattr("era_haptics.lab.measuring.outputs.open_card", lambda *_, **__: card)
+    output = tmp_path / "wired.yaml"
+    done = CliRunner().invoke(
+        app,
+        ["outputs", str(EXAMPLE), "--device", "jack", "-o", str(output), "--json"],
+        input=said,
+    )
+    assert done.exit_code == status
+    answer = json.loads(done.stdout.splitlines()[-1])  # what is typed is echoed before
+    assert answer["channels"] == channels
+    assert output.exists() == (status == 0)
+    if status == 0:
+        wiring = load_rig(output).wiring
+        assert {name: wired.number for name, wired in wiring.items()} == channels
+        after = output.read_text()
+        comments = [each for each in read_document(EXAMPLE).text.splitlines() if "#" in each]
+        assert all(each in after for each in comments)
+    else:
+        assert answer["missing"] == ["NE"]
+
+
+STEPPED_FILE_RATE = 12_000
 TONES = (61.0, 151.5, 311.0)
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
@@ -29,7 +201,7 @@ def ratio(tone: int, era: int, sensor: int) -> complex:
 def played(era: int, *, held: float) -> list[tuple[FloatArray, list[FloatArray]]]:
     """Reference and sensors of each tone of an ERA; sensors settle with a tenth of its time."""
     found = []
-    times = np.arange(round(held * RATE)) / RATE
+    times = np.arange(round(held * STEPPED_FILE_RATE)) / STEPPED_FILE_RATE
     for number, frequency in enumerate(TONES):
         angle = 2 * np.pi * frequency * times
         rise = 1 - np.exp(-times / (0.1 * held))
@@ -55,14 +227,16 @@ def recording(
     pieces = []
     for era in eras:
         for reference, heard in played(era, held=held):
-            piece = np.zeros((len(reference) + round(gap * RATE), len(sensors) + references))
+            piece = np.zeros(
+                (len(reference) + round(gap * STEPPED_FILE_RATE), len(sensors) + references)
+            )
             for column, sensor in enumerate(sensors):
                 piece[: len(reference), column] = heard[sensor]
             piece[: len(reference), len(sensors) + (era if references > 1 else 0)] = reference
             pieces.append(piece)
-    samples = np.concatenate([np.zeros((RATE // 3, pieces[0].shape[1])), *pieces])
+    samples = np.concatenate([np.zeros((STEPPED_FILE_RATE // 3, pieces[0].shape[1])), *pieces])
     samples += 1e-3 * rng.standard_normal(samples.shape)
-    wavfile.write(path, RATE, (32767 * samples).astype(np.int16))
+    wavfile.write(path, STEPPED_FILE_RATE, (32767 * samples).astype(np.int16))
 
 
 def expected(rig: Rig, sensor: int) -> ComplexArray:
@@ -215,7 +389,7 @@ def test_tones_that_cannot_be_told_are_refused_with_their_time(rig: Rig, tmp_pat
 
 def sweep() -> FloatArray:
     """A glide from 60 to 100 Hz in 10 s."""
-    times = np.arange(10 * RATE) / RATE
+    times = np.arange(10 * STEPPED_FILE_RATE) / STEPPED_FILE_RATE
     return np.asarray(0.4 * np.sin(2 * np.pi * (60 + 2 * times) * times))
 
 

@@ -1,0 +1,760 @@
+"""A board with exciters on the desk: in time against a direct solution, and identified.
+
+What a sound card of a real JACK server, or of PortAudio over it, is refused for, and lost by.
+
+A process has one server at a time, and PortAudio keeps it: commands try PortAudio.
+
+The plate on a desk against a direct solution, and identified behind its sound card.
+
+`era measure` with one sensor that is moved: its mass, its file, and what can go wrong.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.desk_plate.desk_plate import DeskPlate
+from benchmarks.desk_plate.lifted_blocks import sampled
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.sensing import Converters
+from benchmarks.desk_plate.truth import Truth, as_built, draw_truth
+from benchmarks.direct_plate import direct_responder
+from controller.cli.main import run
+from drivers.errors import LinkError
+from era_haptics.lab.measuring.measure import measure_through
+from era_haptics.lab.measuring.moved_sensor import PlacesFile, measure_places
+from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard, open_card
+from gateway_bench import wait_for
+from model.arrays import ComplexArray, Float32Array, FloatArray
+from model.calibration.fit import sensed_plate
+from model.calibration.responses import WiredSensor, read_measured, read_sensors, responses_of
+from model.errors import InputError
+from model.finger import fingertips_on
+from model.identification.identify import identify
+from model.identification.least_squares import MeasuredPlate
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, parse_rig
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.structure.attachments import PointLoad, fingertip_loads
+from sim.soft_amp.engine import Protocol, Settings
+from sim.soft_amp.output import open_output
+from sound_cards import DeskCard, JackServer, capture_on, jack_server
+from typed_page import ERA
+
+BOARD = """
+plate: {length: 300 mm, width: 230 mm, thickness: 5 mm, loss_factor: 0.01,
+  material: {E: 4.5 GPa, rho: 1190, nu: 0.37}}
+mesh: auto
+eras:
+  SW: {kind: exciter, type: DAEX25FHE-4, at: [54 mm, 55 mm], amplifier: card, channel: 0}
+  SE: {kind: exciter, type: DAEX25FHE-4, at: [237 mm, 39 mm], amplifier: card, channel: 1}
+  NE: {kind: exciter, type: DAEX25FHE-4, at: [252 mm, 179 mm], amplifier: card, channel: 2}
+  NW: {kind: exciter, type: DAEX25FHE-4, at: [81 mm, 186 mm], amplifier: card, channel: 3}
+amplifiers:
+  card: {url: "serial:///tmp/plate", full_level: output}
+limits: {frequency: [40 Hz, 300 Hz], level: 1.0}
+"""
+FREQUENCIES = np.array([41.0, 77.0, 150.0, 233.0, 291.0])
+FEET = tuple(
+    PointLoad(x, y, stiffness=2000.0, damping=2.0, foot=5e-3)
+    for x in (0.01, 0.29)
+    for y in (0.01, 0.22)
+)
+MESH = "9x8 Legendre"
+RATE = 24_000.0
+LINES_X, LINES_Y = (0.034, 0.112, 0.19, 0.259), (0.035, 0.114, 0.194)  # m
+POINTS = np.array([[0.05, 0.05], [0.15, 0.11], [0.27, 0.2]])
+
+
+@pytest.fixture(scope="module")
+def board() -> Rig:
+    """Acrylic on feet of foam, with four exciters."""
+    return replace(parse_rig("board.yaml", BOARD), masses=FEET)
+
+
+def test_exciters_in_time_are_those_of_the_direct_solution(board: Rig) -> None:
+    """Coil, magnet and back EMF, solved at each frequency: within 0.5 %.
+
+    What differs is damping, viscous here and hysteretic there, and the coil's inductance, of which
+    equations in time have the first order.
+    """
+    truth = draw_truth(board, seed=5, mesh=MESH)
+    found = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2)
+    exact = direct_spectral_acceleration(
+        truth.rig.plate, board.mesh, truth.rig.eras, FREQUENCIES, POINTS, loads=truth.rig.masses
+    )
+    for number, actuator in enumerate(truth.actuators):
+        exact[:, number] *= actuator.response(FREQUENCIES)[:, None]
+    wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+    assert wrong.max() < 0.005
+
+
+def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
+    """Each exciter has the gain of its file amid the band, but for a lag that all have alike."""
+    gains = {"SW": (1.2, 0.1), "SE": (0.8, -0.15), "NE": (1.0, 0.0), "NW": (0.9, 0.2)}
+    eras = [replace(era, gains=((100.0, *gains[era.name]),)) for era in board.eras]
+    truth = as_built(replace(board, eras=tuple(eras)), mesh=MESH)
+    assert truth.rig.plate == board.plate
+    assert [replace(era, gains=()) for era in eras] == [*truth.rig.eras]
+    middle = np.array([np.sqrt(40.0 * 300.0)])
+    found = np.array([each.response(middle)[0] for each in truth.actuators])
+    wanted = np.array([size * np.exp(1j * phase) for size, phase in gains.values()])
+    lag = found / wanted
+    np.testing.assert_allclose(lag, lag[0], rtol=1e-12)
+    assert abs(lag[0]) == pytest.approx(1)
+    assert -0.3 < np.angle(lag[0]) < 0
+
+
+def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: Path) -> None:
+    """5 g at twelve places: fields between them are known to 3 %, and worse without the mass.
+
+    Where no sensor was, and without it, up to the common gain that no measurement has: against the
+    board's own closed form. Of acrylic, which has a loss factor of 0.05.
+    """
+    lossy = replace(board, plate=replace(board.plate, loss_factor=0.05))
+    truth = draw_truth(lossy, seed=4, mesh=MESH)
+    sensors = tuple(
+        WiredSensor(f"P{n}", x, y, 1, 2e-3, 5e-3)
+        for n, (x, y) in enumerate(((x, y) for y in LINES_Y for x in LINES_X), start=1)
+    )
+    plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
+    desk = Desk(lossy, sensors)
+    sines = Multisine(np.arange(41.0, 300.0, 20.0), len(desk.eras) + 1, RATE, 0.3)
+    file = PlacesFile(tmp_path / "measured.csv", desk, sines)
+
+    def moved(text: str) -> str:
+        plate.move_sensor(text.split("sensor at ")[1].split(",")[0])
+        return ""
+
+    card = DeskCard(plate, rate=RATE)
+    measure_places(file, card, periods=2, ask=moved, tell=lambda text: None)
+    responses = responses_of(read_measured(file.path), lossy)
+    full = np.array([era.full_level for era in lossy.eras])
+    exact = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2) / full[:, None]
+    errors = []
+    for masses in (responses.masses, None):
+        found = identify(lossy, replace(responses, masses=masses).as_measurement())
+        gains = np.array([era.gain(FREQUENCIES) for era in found.rig.eras]).T
+        field = sensed_plate(found.rig, POINTS, FREQUENCIES).responses() * gains[:, :, None]
+        common = np.vdot(field, exact) / np.vdot(field, field)
+        errors.append(np.linalg.norm(common * field - exact) / np.linalg.norm(exact))
+    assert errors[0] < 0.03
+    assert errors[1] > 1.25 * errors[0]
+
+
+DESK = Path(__file__).parents[4] / "examples" / "desk"
+STALLED = 8.0  # s; without a message of the server it would be ten
+CHANNELS = 5  # of that desk: four ERAs and the loop-back
+SETTINGS = Settings(
+    device="jack:card", channels=CHANNELS, protocol=Protocol.SERIAL, serial_number="S"
+)
+
+
+@pytest.fixture
+def server() -> Iterator[JackServer]:
+    """A server with a client of this process, `card`, that takes as many channels."""
+    name = f"card{os.getpid()}"
+    with pytest.MonkeyPatch.context() as patch, jack_server(name) as running:
+        patch.setenv("JACK_DEFAULT_SERVER", name)
+        capture = capture_on(name, "card", CHANNELS)
+        yield running
+        capture.close()
+
+
+def card(device: str, *, outputs: int = CHANNELS, inputs: int = 0) -> SoundCard:
+    """A card that is opened."""
+    return open_card(device, outputs=outputs, inputs=inputs, limit=1.0)
+
+
+def refusal(server: JackServer, *arguments: str) -> tuple[int, str]:
+    """Exit status and message of a command."""
+    done = subprocess.run(
+        [ERA, *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        env=server.environment,
+        check=False,
+    )
+    assert done.stdout == ""
+    return done.returncode, done.stderr
+
+
+def measure(server: JackServer, device: str, folder: Path) -> tuple[int, str]:
+    """Exit status and message of a measurement that is refused."""
+    sensors, found = str(DESK / "sensors.csv"), str(folder / "m.csv")
+    return refusal(
+        server, "measure", str(DESK / "rig.yaml"), "--device", device, "--sensors", sensors,
+        "-o", found,
+    )  # fmt: skip
+
+
+@pytest.mark.real_time
+@pytest.mark.needs("jackd", "cc")
+@pytest.mark.needs("portaudio")
+def test_unsuitable_cards_are_refused(server: JackServer, tmp_path: Path) -> None:
+    """No such one; too few channels; no inputs: one message, exit status 2, and no file."""
+    for device, ports, cause in (
+        ("jack:nothing", {}, "5 outputs, got 0"),
+        ("jack:card", {"outputs": CHANNELS + 1}, "6 outputs, got 5"),
+        ("jack:card", {"inputs": 1}, "1 inputs, got 0"),
+    ):
+        with pytest.raises(InputError, match=cause):
+            card(device, **ports)
+    for device, cause in (("card", "inputs, got 0"), ("no such device", "no such device")):
+        status, message = measure(server, device, tmp_path)
+        assert (status, message.count("\n")) == (2, 1)
+        assert cause in message
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.real_time
+@pytest.mark.needs("jackd", "cc")
+@pytest.mark.needs("portaudio")
+def test_card_that_is_played_to_is_busy(server: JackServer) -> None:
+    """For measurement and amplifier, also by PortAudio: JACK would add up what two play.
+
+    A device that there is not is one message, too.
+    """
+    playing = card("jack:card")
+    with pytest.raises(LinkError, match="busy"):
+        card("jack:card")
+    with pytest.raises(LinkError, match="busy"):
+        open_output(SETTINGS)
+    for device, status, cause in (("card", 3, "busy"), ("no such device", 2, "no such device")):
+        done = refusal(server, "soft-amp", "--device", device, "--channels", "2")
+        assert (done[0], done[1].count("\n"), cause in done[1]) == (status, 1, True)
+    playing.close()
+
+
+@pytest.mark.real_time
+@pytest.mark.needs("jackd", "cc")
+def test_measurement_without_its_server_is_lost(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Ended while a run plays: one message and exit status 3 at once; then there is none."""
+    name = f"lost{os.getpid()}"
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
+    with jack_server(name, inputs=13, outputs=CHANNELS) as server:
+        looking = capture_on(name, "looking", 1)  # once the server is up
+        with ThreadPoolExecutor() as thread:
+            measuring = thread.submit(measure, server, "jack", tmp_path)
+            wait_for(lambda: looking.is_played_to("era-measure:in_13"))  # the last to be connected
+            looking.close()  # libjack does not bear to close a client of a server that is gone
+            server.process.terminate()  # one that is killed occupies one of JACK's eight places
+            ended = time.monotonic()
+            status, message = measuring.result()
+        assert (status, message.count("\n"), "lost" in message) == (3, 1, True)
+        assert time.monotonic() - ended < STALLED
+        status, message = measure(server, "jack", tmp_path)
+        assert (status, "no server" in message) == (3, True)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.real_time
+@pytest.mark.needs("jackd", "cc")
+@pytest.mark.needs("portaudio")
+def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """44.1 kHz of a server or device, for an amplifier; a measurement takes any whole one."""
+    name = f"rate{os.getpid()}"
+    monkeypatch.setenv("JACK_DEFAULT_SERVER", name)
+    with jack_server(name, rate=44_100) as server:
+        capture = capture_on(name, "card", CHANNELS)
+        with pytest.raises(InputError, match=r"multiple of 1000 Hz.*got 44100 Hz"):
+            open_output(SETTINGS)
+        status, message = refusal(server, "soft-amp", "--device", "card", "--channels", "2")
+        assert (status, "got 44100 Hz" in message) == (2, True)
+        measuring = card("jack:card")
+        assert measuring.rate == 44_100
+        measuring.close()
+        capture.close()
+
+
+DESK_PLATE_RATE = 48_000.0
+DESK_PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
+DESK_PLATE_FREQUENCIES = np.array([61.0, 150.0, 233.0, 410.0])
+FINGERS = [(0.1, 0.1), (0.25, 0.06)]
+
+
+@pytest.fixture(scope="module")
+def model(truth: Truth) -> DeskModel:
+    """That plate, solved."""
+    return DeskModel(truth, DESK_PLATE_POINTS)
+
+
+@pytest.mark.parametrize("places", [[], FINGERS])
+def test_model_agrees_with_the_direct_solution(
+    truth: Truth, model: DeskModel, places: list[tuple[float, float]]
+) -> None:
+    """Without and with fingers; what differs is damping, viscous here and hysteretic there."""
+    rig = truth.rig
+    fingers = fingertip_loads(rig.fingertip, places)
+    found = model.under(fingers).response(DESK_PLATE_FREQUENCIES).swapaxes(1, 2)
+    direct = direct_responder(rig.plate, rig.mesh)
+    exact = direct(
+        rig.eras, DESK_PLATE_FREQUENCIES, DESK_PLATE_POINTS, loads=[*rig.masses, *fingers]
+    )
+    # The actuator by its differential equation: gain w² / (w² - omega² + 2 i zeta w omega).
+    for number, actuator in enumerate(truth.actuators):
+        w, omega = 2 * np.pi * actuator.resonance, 2 * np.pi * DESK_PLATE_FREQUENCIES
+        moved = actuator.gain * w**2 / (w**2 - omega**2 + 2j * actuator.ratio * w * omega)
+        exact[:, number] *= moved[:, None]
+    wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+    assert wrong.max() < 0.005
+
+
+def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
+    """At all points of fingertips whose loads differ, as the direct solution of the loaded plate.
+
+    What differs is damping, viscous here and hysteretic there.
+    """
+    rig, factors, frequency = truth.rig, [0.3, 3.0], 150.0
+    sensors = [WiredSensor("P1", 0.03, 0.05, 1, 1e-3)]
+    desk = DeskPlate(truth, sensors, rate=DESK_PLATE_RATE, converters=Converters(), seed=1)
+    desk.set_fingers(FINGERS, factors)
+    played = np.zeros((48_000, 5))
+    played[:, 1] = np.sin(2 * np.pi * frequency * np.arange(len(played)) / DESK_PLATE_RATE)
+    desk.advance(played[:38_400])
+    desk.begin_feeling()
+    desk.advance(played[38_400:])
+    felt = desk.felt()
+    points, _ = fingertips_on(np.array(FINGERS), length=rig.plate.length, width=rig.plate.width)
+    assert felt.shape == (600, *points.shape[:2])
+    loads = [
+        replace(each, fingertip=each.fingertip.multiplied(factor))
+        for each, factor in zip(fingertip_loads(rig.fingertip, FINGERS), factors, strict=True)
+    ]
+    direct = direct_responder(rig.plate, rig.mesh)
+    places, hertz = points.reshape(-1, 2), np.array([frequency])
+    exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
+    exact = exact * truth.actuators[1].response(hertz)
+    times = (38_400 + 16 * np.arange(len(felt))) / DESK_PLATE_RATE
+    found = phasors(felt.reshape(len(felt), -1), times, frequency)
+    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
+
+
+def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:
+    """The vibration goes on where it was, and settles to that of the plate under fingers."""
+    sensors = [
+        WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(DESK_PLATE_POINTS)
+    ]
+    quiet = Converters(delay=0, noise=0.0)
+    desk = DeskPlate(truth, sensors, rate=DESK_PLATE_RATE, converters=quiet, seed=1)
+    times = np.arange(48_000) / DESK_PLATE_RATE
+    played = np.zeros((len(times), 5))
+    played[:, 0] = np.sin(2 * np.pi * 233 * times)
+    before = desk.advance(played[:9600])
+    desk.set_fingers(FINGERS)
+    after = desk.advance(played[9600:])
+    joined = np.concatenate([before[-48:], after[:48]])[:, :3]
+    steps = np.abs(np.diff(joined, n=2, axis=0)).max(axis=1)
+    # A contact mass that joins changes accelerations by a few percent, no more.
+    assert steps[46:49].max() < 0.1 * np.abs(joined).max()
+    loaded = model.under(fingertip_loads(truth.rig.fingertip, FINGERS))
+    (exact,) = sampled(loaded, rate=DESK_PLATE_RATE).response(np.array([233.0]))
+    found = phasors(after[-9600:, :3], times[-9600:], 233.0)
+    late = quiet.response(np.array([233.0]), rate=DESK_PLATE_RATE)[0]
+    np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
+
+
+def test_sensitivity_is_in_full_scale(rig: Rig, tmp_path: Path) -> None:
+    """A charge of 5 pC/(m/s²), amplified by 2 mV/pC, at 4 V full scale: 2.5e-3 a m/s²."""
+    path = tmp_path / "sensors.csv"
+    path.write_text("sensor,x_m,y_m,input,mv_per_m_s2,gain,full_scale_v\nP1,0.1,0.2,3,5,2,4\n")
+    (sensor,) = read_sensors(path, rig.plate)
+    assert (sensor.name, sensor.x, sensor.y, sensor.input) == ("P1", 0.1, 0.2, 3)
+    assert sensor.sensitivity == pytest.approx(2.5e-3)
+
+
+def phasors(samples: FloatArray, times: FloatArray, frequency: float) -> ComplexArray:
+    """Complex amplitudes a of Im[a exp(i omega t)] over whole periods."""
+    turning = np.exp(-2j * np.pi * frequency * times)
+    return np.asarray(2j * (samples * turning[:, None]).mean(axis=0))
+
+
+CARD_RATE, LEVEL = 8_000.0, 0.3
+PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20), (0.11, 0.19), (0.25, 0.03))
+SENSORS = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
+LINES = np.arange(51.0, 500.0, 40.0)
+
+
+def measured(
+    rig: Rig,
+    truth: Truth,
+    *,
+    frequencies: FloatArray = LINES,
+    **wires: object,
+) -> MeasuredPlate:
+    """The plate measured from rest."""
+    converters = Converters(delay=73, noise=5e-3)
+    plate = DeskPlate(truth, SENSORS, rate=CARD_RATE, converters=converters, seed=1)
+    card = DeskCard(plate, rate=CARD_RATE, **wires)  # type: ignore[arg-type]
+    desk = Desk(rig, SENSORS)
+    multisine = Multisine(frequencies, len(desk.eras) + 1, CARD_RATE, LEVEL)
+    return measure_through(desk, card, multisine, periods=2, progress=lambda done, of: None)
+
+
+def test_identified_plate_is_the_one_behind_the_card(rig: Rig, truth: Truth) -> None:
+    """Springs per mass, rigidity, gains over frequency: what drove the plate, with resonances.
+
+    Within four standard deviations of what is written, and that is less than before.
+    """
+    found = identify(rig, measured(rig, truth).measurement)
+    assert found.is_explained
+    mass = truth.rig.plate.thickness / found.rig.plate.thickness
+    std = found.rig.uncertainty
+    assert std.stiffness < rig.uncertainty.stiffness / 3
+    for era, real, actuator in zip(found.rig.eras, truth.rig.eras, truth.actuators, strict=True):
+        assert mass * era.stiffness == pytest.approx(real.stiffness, rel=4 * std.stiffness)
+        ratio = era.gain(LINES) / actuator.response(LINES)
+        assert np.abs(np.angle(ratio)).max() < 4 * np.radians(std.phase_deg)
+        np.testing.assert_allclose(np.abs(ratio), np.abs(ratio).mean(), rtol=4 * std.gain)
+
+
+@pytest.mark.parametrize(
+    ("amplified", "cause"),
+    [
+        (lambda played, run: played * (1 - 0.1 * (played / LEVEL) ** 2), "half the level"),
+        (lambda played, run: played * (0.97 if run == 6 else 1.0), "at the end"),
+    ],
+    ids=["compressed", "faded"],
+)
+def test_plate_that_is_not_the_same_twice_is_refused(
+    rig: Rig, truth: Truth, amplified: object, cause: str
+) -> None:
+    """Amplifiers that compress show at half the level, ones that fade in the run that is last."""
+    few = np.array([61.0, 151.0, 311.0])
+    found = measured(rig, truth, frequencies=few, amplified=amplified)
+    with pytest.raises(InputError, match=cause):
+        found.measurement.check()
+
+
+def test_block_that_is_lost_in_a_repeated_run_is_played_again(rig: Rig, truth: Truth) -> None:
+    """Once is repeated, three times is refused."""
+    few = np.array([61.0, 151.0, 311.0])
+    measured(rig, truth, frequencies=few, lost=[5]).measurement.check()
+    with pytest.raises(LinkError):
+        measured(rig, truth, frequencies=few, lost=[6, 7, 8])
+
+
+MOVED_SENSOR_RATE, GRAMS = 8_000.0, 5.0
+Places = Mapping[str, tuple[float, float]]
+MOVED_SENSOR_PLACES: Places = {"P1": (0.03, 0.05), "P2": (0.20, 0.11), "P3": (0.29, 0.20)}
+MOVED_SENSOR_FREQUENCIES = np.array([61.0, 141.0, 221.0, 301.0])
+HEAD = "sensor,x_m,y_m,input,mv_per_m_s2,mass_g\n"
+PLAIN = "sensor,x_m,y_m,input,mv_per_m_s2\n"
+KEPT = "of 3 places are measured, in measured"
+GO_ON = "go on with --resume"
+
+
+class PulledCard(DeskCard):
+    """Its plug is pulled in the run of that number, if any; muted: output 1 is, from that run."""
+
+    pulled: int | None = None
+    muted: int | None = None
+    closed = 0
+
+    def run(self, played: FloatArray) -> Float32Array:
+        """Advance the plate, or be gone."""
+        if self.runs == self.pulled:
+            raise DeviceLost("memory: the device was lost, or takes no samples")
+        if self.muted is not None and self.runs >= self.muted:
+            played = played * (np.arange(played.shape[1]) != 0)
+        return super().run(played)
+
+    def close(self) -> None:
+        """Count."""
+        self.closed += 1
+
+
+class Bench:
+    """The command with a plate in memory, and the person who moves its sensor as it says.
+
+    stays: places to which the person does not move it; said, out: standard error and output.
+    """
+
+    def __init__(
+        self,
+        truth: Truth,
+        patch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        *,
+        output: str = "measured.uff",
+        places: Places = MOVED_SENSOR_PLACES,
+        grams: float = GRAMS,
+        noise: float = 5e-3,
+        **wires: object,
+    ) -> None:
+        self.output, self._capsys, self.stays, self.said, self.out = output, capsys, [""], "", ""
+        self._keys: list[str] = []
+        Path("rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
+        rows = [f"{name},{x},{y},1,2,{grams}\n" for name, (x, y) in places.items()]
+        Path("sensors.csv").write_text(HEAD + "".join(rows), "utf-8-sig")
+        sensors = read_sensors(Path("sensors.csv"), truth.rig.plate, may_move=True)
+        converters = Converters(delay=73, noise=noise)
+        self._plate = DeskPlate(
+            truth, sensors, rate=MOVED_SENSOR_RATE, converters=converters, seed=1
+        )
+        self.card = PulledCard(self._plate, rate=MOVED_SENSOR_RATE, **wires)  # type: ignore[arg-type]
+        patch.setattr("era_haptics.lab.measuring.measure.open_card", lambda *_, **__: self.card)
+        patch.setattr(sys, "stdin", self)
+
+    def readline(self) -> str:
+        """Move the sensor as was said, and press the next key; nothing at their end."""
+        self.said += self._capsys.readouterr().err
+        if not self._keys:
+            return ""
+        key = self._keys.pop(0)
+        if key == "Ctrl-C":
+            raise KeyboardInterrupt
+        place = self.said.rpartition("sensor at ")[2].split(",")[0]
+        if place in self.stays:
+            self.stays.remove(place)
+        else:
+            self._plate.move_sensor(place)
+        return f"{key}\n"
+
+    def measure(self, *more: str, keys: Sequence[str] = ()) -> int:
+        """Exit status of a measurement with these keys."""
+        self._keys, self.said = [*keys], ""
+        words = ["measure", "rig.yaml", "--device", "memory", "--sensors", "sensors.csv", "-o"]
+        status = run([*words, self.output, "--frequencies", "61:301:80", *more])
+        self.out, said = self._capsys.readouterr()
+        self.said += said
+        return status
+
+    def measured(self, *more: str, keys: Sequence[str]) -> dict[str, list[str]]:
+        """Places that were measured with these keys, and those that are missing."""
+        assert self.measure("--json", *more, keys=keys) == 0
+        return json.loads(self.out)["places"]  # type: ignore[no-any-return]
+
+
+Make = Callable[..., Bench]
+
+
+@pytest.fixture
+def make(
+    truth: Truth,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Make:
+    """Make a bench; all is as it should be unless told otherwise."""
+    monkeypatch.chdir(tmp_path)
+    return lambda **options: Bench(truth, monkeypatch, capsys, **options)
+
+
+def test_each_place_is_measured_under_the_sensors_mass(rig: Rig, truth: Truth, make: Make) -> None:
+    """Against the plate's closed form with the mass at that place alone; the file has all of it.
+
+    5 g change responses by several percent, so that the bare plate can be distinguished from it.
+    """
+    bench = make()
+    assert bench.measure(keys=["", "", ""]) == 0
+    assert "x 30 mm, y 50 mm (place 1 of 3)" in bench.said
+    assert "Next: era calibrate rig.yaml measured.uff" in bench.out
+    found = responses_of(read_measured(Path(bench.output)), rig)
+    model = DeskModel(truth, np.array([*MOVED_SENSOR_PLACES.values()]))
+    strokes = np.array([era.stroke for era in rig.eras])
+    bare = model.under().response(MOVED_SENSOR_FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
+    for n, name in enumerate(MOVED_SENSOR_PLACES):
+        one = model.under(moved=(n, GRAMS / 1e3)).response(MOVED_SENSOR_FREQUENCIES)[:, 0] / strokes
+        measured = found.values[:, :, found.sensors.index(name)]
+        wrong = np.linalg.norm(measured - one) / np.linalg.norm(one)
+        assert wrong < 0.02
+        assert np.linalg.norm(measured - bare[:, :, n]) / np.linalg.norm(one) > 2 * wrong
+    assert found.masses is not None
+    np.testing.assert_allclose(found.masses, GRAMS / 1e3)
+
+
+@pytest.mark.parametrize("ending", ["uff", "csv"])
+def test_measurement_that_was_stopped_goes_on(make: Make, ending: str) -> None:
+    """Stopped at the end of the input, by Ctrl-C and by a pulled card: each says what is kept.
+
+    The rest is measured with --resume, which is needed for that, and no place twice.
+    """
+    bench = make(output=f"measured.{ending}")
+    assert (bench.measure(keys=[""]), bench.card.closed) == (0, 1)
+    assert f"1 {KEPT}.{ending}; {GO_ON}" in bench.out
+    assert "calibrate" not in bench.out
+    assert (bench.measure(), f"exists; {GO_ON}" in bench.said) == (2, True)
+    assert bench.measure("--resume", keys=["", "Ctrl-C"]) == 130
+    assert bench.said.rstrip().endswith(f"2 {KEPT}.{ending}; {GO_ON}")
+    before = Path(bench.output).read_bytes()
+    bench.card.pulled = bench.card.runs + 2
+    assert bench.measure("--resume", keys=[""]) == 3
+    last = bench.said.splitlines()[-1]
+    assert (last.count("lost"), f"2 {KEPT}" in last) == (1, True)
+    assert Path(bench.output).read_bytes() == before
+    bench.card.pulled = None
+    told = bench.measured("--resume", keys=[""])
+    assert told == {"measured": ["P3"], "missing": []}
+    assert json.loads(bench.out)["sensors"]["P3"]["coherence_min"] > 0.9
+    assert {each.sensor for each in read_measured(Path(bench.output))} == set(MOVED_SENSOR_PLACES)
+
+
+def test_files_of_another_measurement_are_not_gone_on_with(make: Make) -> None:
+    """Another level, frequency, mass, place and rig, each by its name."""
+    bench = make()
+    bench.measure(keys=[""])
+    changes = {
+        "sensors.csv": ("0.03,", "0.04,"),
+        "rig.yaml": ("loss_factor: 0.01", "loss_factor: 0.02"),
+    }
+    for more, cause in (
+        (["--level", "0.2"], "setting must be level 0.2"),
+        (["--frequencies", "61:301:120"], "frequencies must be 3"),
+        (["--sensor-mass", "1"], "sensor 1 g, .* got level 0.3, sensor 5 g"),
+        (["sensors.csv"], "places"),
+        (["rig.yaml"], "sensor 5 g, rig .* got level 0.3"),
+    ):
+        if more[0] in changes:
+            file = Path(more.pop())
+            old, new = changes[file.name]
+            assert old in file.read_text("utf-8")
+            file.write_text(file.read_text("utf-8").replace(old, new), "utf-8")
+        assert bench.measure("--resume", *more) == 2
+        assert re.search(cause, bench.said)
+
+
+def test_place_is_repeated_or_skipped(make: Make) -> None:
+    """r measures the last one again, s leaves one out, other keys and an early r do nothing."""
+    bench = make()
+    told = bench.measured(keys=["r", "x", "", "r", "", "s", ""])
+    assert told == {"measured": ["P1", "P3"], "missing": ["P2"]}
+    assert bench.card.runs == 15
+
+
+def test_sensor_that_was_not_moved_is_seen(make: Make) -> None:
+    """Its response is that of the place before; asked again, it is moved."""
+    bench = make()
+    bench.stays = ["P2"]
+    assert bench.measured(keys=["", "", "", ""])["measured"] == ["P1", "P2", "P3"]
+    assert bench.said.count("not kept") == 1
+    assert "the sensor is still there; move it to P2" in bench.said
+
+
+@pytest.mark.parametrize(
+    ("muted", "said"),
+    [(5, "P2 is not kept: output 1 is not heard here"), (0, "P1 is not kept: output 1 moves not")],
+)
+def test_output_that_was_heard_elsewhere_is_not_called_dead(
+    make: Make, muted: int, said: str
+) -> None:
+    """Silent from the second place on, it may be on a nodal line, which s skips; else dead."""
+    bench = make()
+    bench.card.muted = muted
+    assert bench.measured(keys=["", ""] if muted else [""])["measured"] == ["P1"] * bool(muted)
+    assert said in bench.said
+    assert ("; s skips it" in bench.said) == bool(muted)
+
+
+@pytest.mark.parametrize(
+    ("wires", "level", "cause"),
+    [
+        ({"on_inputs": [1, 0]}, "0.3", "silent|swapped|loop-back"),
+        ({"gain": 50.0}, "0.3", "clipping"),
+        ({"gain": 0.0}, "0.3", "all inputs are silent"),
+        ({"noise": 0.01}, "0.001", "higher --level"),
+        ({"noise": 0.3}, "0.03", "fix these sensors"),
+    ],
+)
+def test_place_that_fails_a_check_is_told_and_asked_for_again(
+    make: Make, wires: dict[str, object], level: str, cause: str
+) -> None:
+    """Swapped inputs, clipped, no supply: one line, nothing kept, no file.
+
+    As much noise as signal, of 0.3 % of full scale and of far more: louder, or fixed better.
+    """
+    bench = make(**wires)
+    assert bench.measured("--level", level, keys=["", "q"])["measured"] == []
+    assert bench.said.count("P1 is not kept") == 1
+    assert bench.said.count("Put the sensor at P1") == 2
+    assert re.search(cause, bench.said)
+    assert not Path(bench.output).exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "cause"),
+    [
+        (["--resume"], "to go on from"),
+        (["--stepped"], "--stepped needs sensors that stay"),
+        (["--sensor-mass", "900"], "mass_g must be from 0"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(make: Make, more: list[str], cause: str) -> None:
+    """Nothing to resume, single tones of a moved sensor, a mass in other units."""
+    bench = make()
+    assert bench.measure(*more) == 2
+    assert cause in bench.said
+
+
+def test_plate_is_identified_better_with_the_mass_of_the_sensor(
+    rig: Rig, truth: Truth, make: Make
+) -> None:
+    """2 g at 12 places of a plate that deviates: the model explains them with the mass alone.
+
+    Springs, per mass of the plate, are then within four of the standard deviations written.
+    """
+    grid = [(x, y) for y in (0.035, 0.114, 0.194) for x in (0.035, 0.114, 0.194, 0.264)]
+    places = {f"P{n}": place for n, place in enumerate(grid, start=1)}
+    bench = make(output="measured.csv", places=places, grams=2.0)
+    assert bench.measure("--frequencies", "51:471:60", keys=[""] * len(places)) == 0
+    found = responses_of(read_measured(Path(bench.output)), rig)
+    assert found.masses is not None
+    known, ignored = (
+        identify(rig, replace(found, masses=masses).as_measurement())
+        for masses in (found.masses, None)
+    )
+    assert (known.is_explained, ignored.is_explained) == (True, False)
+    mass = truth.rig.plate.thickness / known.rig.plate.thickness
+    for era, real in zip(known.rig.eras, truth.rig.eras, strict=True):
+        std = known.rig.uncertainty.stiffness
+        assert std < 0.01
+        assert mass * era.stiffness == pytest.approx(real.stiffness, rel=4 * std)
+
+
+def test_sensors_file_of_one_sensor(rig: Rig, tmp_path: Path) -> None:
+    """One input in all lines; its mass from the file or the option."""
+    path = tmp_path / "sensors.csv"
+    path.write_text(HEAD + "P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,10,2.5\n")
+    places = read_sensors(path, rig.plate, may_move=True)
+    assert [place.mass for place in places] == [2.5e-3, 2.5e-3]
+    assert read_sensors(path, rig.plate, may_move=True, mass=1.0)[1].mass == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "may_move", "cause"),
+    [
+        ("sensor,x_m,y_m,input\nP1,0,0,1\n", False, ":1:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,9,0.1,2,10\n", False, ":3:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10\nP2,0.2,0.1,1,10\n", False, ":3: input"),
+        (f"{PLAIN}P1,0.1,0.1,1,0\n", False, ":2:"),
+        (f"{PLAIN}P1,0.1,x,1,10\n", False, ":2:"),
+        (f"{PLAIN}P1,0.1,0.1,1,10,2\n", False, ":2:"),
+        (f"{HEAD}P1,0.1,0.1,2,10,2.5\nP2,0.2,0.1,2,11,2.5\n", True, ":3: .*sensitivity"),
+        (f"{HEAD}P1,0.1,0.1,1,10,2.5\nP2,0.2,0.1,2,10,0\n", True, ": mass_g"),
+        (f"{HEAD}P1,0.1,0.1,1,10,2500\n", True, ":2: mass_g .*grams"),
+    ],
+)
+def test_sensors_files_are_refused_with_their_line(
+    rig: Rig, tmp_path: Path, text: str, may_move: bool, cause: str
+) -> None:
+    """A missing column, off the plate, an input twice, no sensitivity, no number, one too many.
+
+    Two sensitivities of one sensor that is moved, several masses at once, a mass in other units.
+    """
+    path = tmp_path / "sensors.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"sensors.csv{cause}"):
+        read_sensors(path, rig.plate, may_move=may_move)

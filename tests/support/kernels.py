@@ -30,7 +30,7 @@ TESTS = (
     "tests/model",
     "tests/docs/test_pages.py",
     "tests/docs/test_pages.py",
-    "tests/examples/test_how_to_pages.py",
+    "tests/examples/test_examples.py",
     "tests/integration/test_demo.py",
 )
 MAX_CONTRAST = 1e-3

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "out" / "firmware"
-DAMAGED = "tests/firmware/test_firmware_damaged_frames.py"
+DAMAGED = "tests/firmware/test_firmware.py"
 
 
 def main() -> None:

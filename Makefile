@@ -135,7 +135,7 @@ desk-test: .venv/installed-test
 
 # The Qt application of the examples with PySide6, without a screen.
 qt-test: .venv/installed-qt
-	$(BIN)/pytest -q tests/integration/test_qt_application.py
+	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
 
 # The whole chain in virtual time, thousands of seeds; `make test` takes seven short ones.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'

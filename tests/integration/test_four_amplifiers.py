@@ -2,40 +2,96 @@
 
 The controller and its wires are the project's own; a table that always has the same pattern, in
 which every ERA plays, stands for the search.
+
+The dashboard in a real browser after losses.
+
+The whole chain as a user starts it: touches in over UDP, amplifier on a wire, fingertips out.
+
+The gateway flooded and killed, without effect on the daemon's control loop.
+
+The daemon is a process over a simulated amplifier, armed, with a finger down. Its amplifier faults
+without a heartbeat within its watchdog, the longest of the protocol here, so a control loop that
+stands still shows as another state than OPERATION_ENABLED.
 """
 
 import asyncio
+import contextlib
+import json
 import math
-from collections.abc import Awaitable, Callable, Mapping
-from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, suppress
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+import controller.demo.demonstration
+import controller.demo.recorder
+import dashboard_pictures
+import live_demonstration
 import model
 from chain import Chain
+from controller.api.client import Client
+from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.schema import ContactStatus, DaemonStateName
+from controller.api.server import Hub, LayoutEvent, PatternEvent, StateEvent
+from controller.cli.main import run
+from controller.demo.demonstration import Scene, layout_of_people
+from controller.demo.recorder import TouchRecorder
+from controller.gateway.app import MAX_SESSIONS
 from controller.plate_measurement import TonePlayer
-from daemons import READY, daemon_at, far_end, until_state
+from controller.sources.tuio import read_capture
+from daemons import PATIENCE, PLACE, READY, daemon_at, far_end, ready, running_daemon, until_state
+from dashboard_pictures import REASON, SCREENS, STATE, open_dashboard
 from drivers.by_hand import actions
 from drivers.errors import LinkError, LinkTimeout
 from drivers.host.group import GroupState
 from drivers.opening import Lines
 from era_haptics.lab.conformance.contract import opened
 from era_haptics.lab.witness.capture import TimeLimits
+from gateway_bench import ERA as GATEWAY_BENCH_ERA
+from gateway_bench import (
+    TOKEN,
+    UNCONFIRMED,
+    GatewayProcess,
+    Page,
+    RawWebSocket,
+    ScriptedDaemon,
+    frame,
+    gateway_process,
+    has_ended,
+    http,
+    real_daemon,
+    upgrade,
+    wait_for,
+    wait_for_daemon,
+    wait_for_state,
+)
 from long_form import in_turn, shortly
 from model.fem import Mesh
 from model.rig.rig import Rig
-from model.rig.rig_file import load_rig
+from model.rig.rig_file import example_rig_path, load_rig
 from model.vibration import Tone
+from patient_daemon import PROGRAM, wait_long
 from real_wires import WIRES, far_side
 from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
+from several_fingers import write_schedule
 from sim.far_ends.wire_assignment import Wire
 from sim.faults import FaultWindow
-from virtual_lines import in_virtual_time
+from typed_page import ERA
+from virtual_lines import in_virtual_time, run_virtual
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {
@@ -214,3 +270,480 @@ async def test_mute_amplifier_is_told_after_a_time(wire: str, told_after: float)
             await actions.identify(far.url)
         assert threads.now() - began == pytest.approx(told_after, abs=0.6)
         assert ("restarts" in str(told.value)) is (wire == "serial")
+
+
+DESKTOP = SCREENS[0]
+BANNER = "document.querySelector('#banner').innerText"
+EVENTS = "[...document.querySelectorAll('#log li')].map(e => e.innerText)"
+NOTES = "document.querySelectorAll('#log li:first-child .note').length"
+TILE = "document.querySelector('.tile')?.innerText ?? ''"
+PROBES = (Path(dashboard_pictures.__file__).with_name("page_probes.js")).read_text(encoding="utf-8")
+
+
+@pytest.mark.asyncio(loop_scope="module")
+async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Path) -> None:
+    """The banner has the watchdog time; outdated values are hidden; attempts and the return are
+    listed below the loss.
+    """
+    async with running_daemon(tmp_path) as bench, await bench.client() as era:
+        await ready(era)
+        with gateway_process(tmp_path, bench.socket) as gateway:
+            await open_dashboard(tab, gateway, DESKTOP)
+            # Disarmed: no watchdog can make it another fault on a busy machine.
+            assert "%" in await tab.until(TILE)
+            before = (await tab.evaluate(EVENTS))[
+                -1:
+            ]  # a short loss on a busy machine joins this one
+            bench.far.device.inject_fault(FaultWindow(fault="hang"))
+            await tab.until(f"{STATE} === 'COMM_LOST'")
+            assert await tab.evaluate(REASON) == "link-lost"
+            await tab.until(BANNER, lambda text: "after 2\u00a0s" in text)  # of the bench
+            await tab.until("document.querySelector('.tile.bad') !== null")
+            tile = await tab.evaluate(TILE)
+            assert "%" not in tile
+            assert "°C" not in tile
+            assert await tab.evaluate("document.querySelector('.plate.unknown') !== null")
+            ratios = await tab.evaluate(f"({PROBES}).contrasts()")
+            assert [each for each in ratios if each[0] < 4.5] == []
+            await tab.until(f"{NOTES} > 1")
+            retried = await tab.evaluate(EVENTS)
+            assert retried[1:] == before
+            bench.far.device.recover()
+            await tab.until(f"{STATE} === 'READY_TO_SWITCH_ON'")
+            back = await tab.evaluate(EVENTS)
+            assert back[1:] == before
+            assert await tab.evaluate(f"{NOTES} === 1")
+            assert await tab.evaluate(REASON) == "simulated"
+            await tab.until("document.querySelector('.tile.bad') === null")
+            assert "%" in await tab.evaluate(TILE)
+
+
+@pytest.mark.asyncio(loop_scope="module")
+async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> None:
+    """Which amplifiers a stop did not silence: beside the button and in the list of events.
+
+    Until a stop is confirmed. The end of the daemon after a loss is an event of its own. Regions
+    are those of the layout in use, and the level is that at the finger.
+    """
+    problem = "document.querySelector('#problem').innerText"
+    states: list[tuple[DaemonStateName, str]] = [
+        ("READY_TO_SWITCH_ON", ""),
+        ("COMM_LOST", "amplifier main: cut"),
+        ("NOT_READY", "told to end"),
+    ]
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await open_dashboard(tab, gateway, DESKTOP)
+        knob = {"name": "knob", "shape": "circle", "x_m": 0.1, "y_m": 0.1, "radius_m": 0.03}
+        daemon.publish("layout", LayoutEvent(layout={"regions": [knob]}))
+        await tab.until("document.querySelectorAll('.region').length === 1")
+        finger = ContactStatus(source="a", id=1, x_m=0.1, y_m=0.1, role="target", level_db_sl=18.0)
+        pattern = PatternEvent(
+            contacts=[finger],
+            drive={},
+            latency_ms=2.0,
+            predicted_level_db_sl=22.0,
+            predicted_contrast_db=None,
+        )
+        daemon.publish("pattern", pattern)
+        await tab.until("document.querySelector('#summary').textContent.includes('18 dB SL')")
+        daemon.silence = UNCONFIRMED
+        await tab.click("#stop")
+        shown = await tab.until(problem, lambda text: "side" in text)
+        assert "main" not in shown
+        assert shown in (await tab.evaluate(EVENTS))[0]
+        daemon.silence = {}
+        await tab.click("#stop")
+        await tab.until(f"{problem} === ''")
+        for (old, _), (new, cause) in pairwise(states):
+            daemon.publish("state", StateEvent(old=old, new=new, cause=cause, remedy=None, epoch=1))
+            events = await tab.until(EVENTS, lambda events, cause=cause: cause in events[0])
+        assert "told to end" in events[0]
+        assert events[1].endswith("amplifier main: cut")
+
+
+@pytest.mark.asyncio(loop_scope="module")
+async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
+    """Not as unreachable."""
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        others = [RawWebSocket(gateway) for _ in range(MAX_SESSIONS)]
+        await tab.show(f"{gateway.url}#token={gateway.token}")
+        await tab.until(f"{REASON} === 'gateway-full'")
+        others.pop().connection.close()
+        await tab.until(f"{REASON} === 'simulated'")
+        for other in others:
+            other.connection.close()
+
+
+@pytest.mark.asyncio(loop_scope="module")
+async def test_page_without_a_place_at_the_daemon_connects_again(
+    tab: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Instead of showing a state that no event changes."""
+    busy = RpcError(ErrorCode.BUSY, "too many clients", remedy="try again later")
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        with monkeypatch.context() as full:
+            full.setattr(Hub, "subscribe", Mock(side_effect=busy))
+            await tab.show(f"{gateway.url}#token={gateway.token}")
+            async with asyncio.timeout(PATIENCE / 6):
+                await tab.until(f"{REASON} === 'gateway-full'")
+        await tab.until(f"{REASON} === 'simulated'")
+
+
+@pytest.mark.asyncio(loop_scope="module")
+async def test_stop_without_an_answer_is_reported(tab: Page, tmp_path: Path) -> None:
+    """As not confirmed, after the time in which an answer may come: the gateway hangs."""
+    with ScriptedDaemon(tmp_path) as daemon, gateway_process(tmp_path, daemon.socket) as gateway:
+        await tab.show(f"{gateway.url}#token={gateway.token}")
+        await tab.until(f"{REASON} === 'simulated'")
+        gateway.process.send_signal(signal.SIGSTOP)
+        await tab.click("#stop")
+        async with asyncio.timeout(PATIENCE / 6):
+            await tab.until("document.querySelector('#problem').textContent.includes('by hand')")
+
+
+ERA_NAMES = {"SW", "SE", "NE", "NW"}
+
+# (id, down [s], up [s], x, y in TUIO's coordinates): one finger, then a second beside it, a pause,
+# and a third one alone.
+SCHEDULE = [
+    (1, 0.1, 1.2, 0.30, 0.35),
+    (2, 0.6, 1.2, 0.80, 0.70),
+    (3, 1.4, 2.0, 0.65, 0.20),
+]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A TUIO capture of the schedule."""
+    path = tmp_path_factory.mktemp("touches") / "touches.tuio"
+    return write_schedule(path, SCHEDULE, 2.1)
+
+
+@pytest.fixture(scope="module")
+def environment(table_cache):
+    """The tests' own cache folder."""
+    return os.environ | {"XDG_CACHE_HOME": str(table_cache)}
+
+
+@pytest.fixture
+def demo(environment, tmp_path, monkeypatch, capsys):
+    """Run `era demo --json` in this process; returns exit status, output and errors."""
+    monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
+    monkeypatch.chdir(tmp_path)
+
+    def run_demo(*arguments):
+        status = run(["demo", *map(str, arguments), "--out", str(tmp_path), "--json"])
+        printed = capsys.readouterr()
+        return status, printed.out, printed.err
+
+    return run_demo
+
+
+def test_demo_contacts_feel_the_prediction(capture, demo, monkeypatch):
+    """Each touch has its row; level within 3 dB of the promise, contrast at least the promised.
+
+    Of the first plate that is drawn, on which these touches keep it. Then the same as two people,
+    by another layout of the daemon: both that are down together have a content each. Each
+    scene is sent from a port of its own, which is no second program.
+    In virtual time; what differs on wires is a far end of its own, see below.
+    """
+    monkeypatch.setattr(asyncio, "run", run_virtual)
+    plate = load_rig(example_rig_path()).plate
+    layout = layout_of_people(plate, {"left": None, "right": None})
+    recorded = read_capture(capture)
+    scenes = [Scene(recorded), Scene(recorded, layout)]
+    monkeypatch.setattr(controller.demo.demonstration, "example_scenes", lambda rig: scenes)
+    status, out, said = demo("--wire", "sim")
+    assert (status, said) == (0, "")  # no hint either
+    result = json.loads(out)
+    rows, people = result["touches"][: len(SCHEDULE)], result["touches"][len(SCHEDULE) :]
+    assert len(people) == len(SCHEDULE)
+    assert not any("fingers" in row for row in (*rows, people[2]))
+    one, other = people[1]["fingers"]
+    assert [one["at_m"]] == people[0]["targets_m"]
+    assert [other["at_m"]] == people[1]["targets_m"]
+    assert abs(one["frequency_hz"] - other["frequency_hz"]) >= 30
+    for finger in (one, other):
+        assert finger["verdict"] in ("own", "mixed")
+        promised, measured = finger["promised_contrast_db"], finger["measured_contrast_db"]
+        assert 6 < promised < measured + 3 < promised + 23  # nine of ten plates keep it
+        assert finger["measured_level_db_sl"] == pytest.approx(20, abs=3)
+    for row, (_, _, _, x, y) in zip(rows, SCHEDULE, strict=True):
+        assert row["targets_m"] == [[pytest.approx(x * 0.3048), pytest.approx((1 - y) * 0.2286)]]
+        assert row["mode"] == "phased"
+        assert row["drive"].keys() <= ERA_NAMES
+        for tone in row["drive"].values():
+            assert tone["frequency_hz"] in range(40, 501, 10)
+            assert 0 < tone["level"] <= 1
+        assert row["steady"]
+        assert row["measured_level_db_sl"] == pytest.approx(row["predicted_level_db_sl"], abs=3)
+        assert row["latency_ms"] > 0
+    alone, beside, last = rows
+    assert (alone["quiet_m"], last["quiet_m"]) == ([], [])
+    assert alone["predicted_contrast_db"] is None
+    # One is alone, and the other one's pattern took the place of another.
+    assert alone["predicted_transient_contrast_db"] is None
+    assert beside["measured_transient_contrast_db"] is None
+    assert beside["quiet_m"] == alone["targets_m"]
+    promised, measured = beside["promised_contrast_db"], beside["measured_contrast_db"]
+    assert 3 < promised < beside["predicted_contrast_db"]
+    assert promised <= measured < promised + 20
+    pictures = [*map(Path, result["files"])]
+    assert [each.name for each in pictures] == ["touches.png", "contents.png"]
+    for picture in pictures:
+        assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.real_time
+def test_demo_reports_a_far_end_that_ended(capture, demo, monkeypatch):
+    """Killing the amplifiers' process midway ends the run with status 3 and one paragraph."""
+    wait_long(monkeypatch)
+    far_ends = []
+
+    async def start(*arguments, **options):
+        far_ends.append(await start_far_end(*arguments, **options))
+        return far_ends[-1]
+
+    def killing(*arguments, on_row):
+        return TouchRecorder(*arguments, on_row=lambda row: far_ends[0].kill())
+
+    start_far_end = controller.demo.recorder._start
+    monkeypatch.setattr(controller.demo.recorder, "_start", start)
+    monkeypatch.setattr(controller.demo.demonstration, "TouchRecorder", killing)
+    status, out, said = demo("--touches", capture)
+    assert status == 3, said
+    assert len(said.strip().split("\n\n")) == 1
+    assert out == ""
+
+
+def test_far_end_ends_when_the_demo_is_killed(capture, environment, tmp_path):
+    """After SIGKILL of the command, the amplifiers' process ends by itself."""
+    with subprocess.Popen(
+        [str(ERA), "demo", "--touches", str(capture), "--out", str(tmp_path)],
+        env=environment,
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+    ) as process:
+        far_end = far_end_of(process.pid)
+        process.kill()
+    try:
+        wait_for(lambda: not is_running(far_end), timeout=60)
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(far_end, signal.SIGKILL)
+
+
+def is_running(pid):
+    """Whether a process exists and is no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def far_end_of(pid):
+    """The process that a running demonstration started for its amplifiers."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    return int(wait_for(lambda: children.read_text().split(), timeout=60)[0])
+
+
+def test_page_and_daemon(tmp_path: Path) -> None:
+    """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    socket = tmp_path / "era-haptics" / "daemon.sock"
+    with subprocess.Popen(
+        [sys.executable, live_demonstration.__file__],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            told = process.stdout.readline()
+            assert told.startswith("dashboard: http://127.0.0.1:")
+            assert told.endswith(f" (token in {socket.with_name('dashboard-token')})\n")
+            with Client.connect(socket, timeout=60) as daemon:
+                daemon.subscribe("state")
+                while (state := daemon.status().state) != "READY_TO_SWITCH_ON":
+                    assert state != "OPERATION_ENABLED"
+                    next(daemon.events(timeout=60))
+                assert daemon.hello("test").rig.simulated
+                assert daemon.status().watchdog_s == 2.0
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
+    assert not socket.exists()
+
+
+ENABLED = "OPERATION_ENABLED"
+
+IMPATIENT = """
+import sys
+from controller.cli.main import main
+from controller.gateway import app, bridge, connections
+app.CLIENT_TIMEOUT = connections.CLIENT_TIMEOUT = bridge.SEND_TIMEOUT = 1.0
+sys.exit(main())
+"""
+"""`era` with shorter timeouts of the gateway."""
+
+
+@dataclass
+class Watch:
+    """A client of the daemon that holds a finger down."""
+
+    looks: int = 0
+    has_failed: bool = False
+    over: threading.Event = field(default_factory=threading.Event)
+
+    def run(self, path: Path) -> None:
+        """Watch, and note a failure."""
+        try:
+            self._run(path)
+        except BaseException:
+            self.has_failed = True
+            raise
+
+    def _run(self, path: Path) -> None:
+        """Renew the lease, repeat the touch and read the status fifty times a second."""
+        with Client.connect(path, name="watch", timeout=PATIENCE) as era:
+            lease = era.arm("watch", lease_s=60).lease
+            while not self.over.wait(0.02):
+                era.touch([PLACE])
+                status = era.status()
+                assert status.state == ENABLED, status.cause
+                era.renew(lease)
+                self.looks += 1
+            era.disarm()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The socket of one daemon for all tests."""
+    with real_daemon(tmp_path_factory.mktemp("daemon"), program=PROGRAM) as path:
+        yield path
+
+
+@pytest.fixture
+def watched(daemon: Path) -> Iterator[Watch]:
+    """The daemon armed and watched; it must stay armed."""
+    watch = Watch()
+    thread = threading.Thread(target=watch.run, args=(daemon,))
+    with Client.connect(daemon, name="test") as era:
+        wait_for_state(era, "READY_TO_SWITCH_ON")
+        thread.start()
+        try:
+            wait_for(lambda: watch.looks > 5 or not thread.is_alive())
+            yield watch
+        finally:
+            watch.over.set()
+            thread.join()
+        assert not watch.has_failed
+
+
+@pytest.fixture
+def gateway(
+    request: pytest.FixtureRequest, watched: Watch, daemon: Path, tmp_path: Path
+) -> Iterator[GatewayProcess]:
+    """A gateway, which must not log anything; parameter: the command instead of `era`."""
+    program = getattr(request, "param", (GATEWAY_BENCH_ERA,))
+    with gateway_process(tmp_path, daemon, program=program) as made:
+        wait_for_daemon(made)
+        yield made
+        if made.process.poll() is None:
+            assert made.log() == ""
+
+
+def assert_served(gateway: GatewayProcess) -> None:
+    """A new client is served over HTTP and over a WebSocket."""
+    assert http(gateway, "/api/v1/effects", body=b"{}").status == 200
+    with RawWebSocket(gateway) as ws:
+        ws.call("effects", {})
+        assert ws.response()["result"]
+
+
+def deaf_connection(gateway: GatewayProcess) -> socket.socket:
+    """A connection with a small receive buffer."""
+    made = socket.socket()
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    made.settimeout(60)
+    made.connect(("127.0.0.1", gateway.port))
+    return made
+
+
+@pytest.mark.real_time
+def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayProcess) -> None:
+    """The oldest are closed until 128 are left."""
+    with contextlib.ExitStack() as held:
+        silent = [held.enter_context(gateway.connect()) for _ in range(2000)]
+        assert_served(gateway)
+        wait_for(lambda: sum(not has_ended(each) for each in silent) <= 128)
+        assert_served(gateway)
+
+
+def trickles(gateway: GatewayProcess) -> list[bytes]:
+    """Incomplete requests: a header, a body, a refused request, a second request."""
+    head = f"POST /api/v1/arm HTTP/1.1\r\nHost: {gateway.host}\r\n"
+    full = f"{head}Authorization: Bearer {TOKEN}\r\nContent-Type: application/json\r\n"
+    begun = (
+        head,
+        f"{full}Content-Length: 100\r\n\r\n",
+        f"{full}Transfer-Encoding: chunked\r\n\r\n",
+        f"{head}Content-Length: 100\r\n\r\n",  # refused at once, without a token
+        f"{full}Content-Length: 2\r\n\r\n{{}}{head}",
+    )
+    return [request.encode() for request in begun]
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("gateway", [(sys.executable, "-c", IMPATIENT)], indirect=True)
+def test_gateway_closes_connections_that_trickle_or_do_not_read(gateway: GatewayProcess) -> None:
+    """Single bytes do not extend a timeout; other clients are served meanwhile."""
+    page = f"GET /app.js HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
+    hello = frame(b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}')
+    with contextlib.ExitStack() as held:
+        left: list[tuple[socket.socket, bytes]] = []
+        for begun in trickles(gateway):
+            slow = held.enter_context(gateway.connect())
+            slow.sendall(begun)
+            left.append((slow, b"1"))
+        for number in range(20):
+            deaf = held.enter_context(deaf_connection(gateway))
+            if number % 2:
+                deaf.sendall(upgrade(gateway))
+            left.append((deaf, 20 * (hello if number % 2 else page)))
+        assert_served(gateway)
+        end = time.monotonic() + PATIENCE
+        while left:
+            assert time.monotonic() < end, f"{len(left)} are still there"
+            for each in list(left):
+                connection, more = each
+                connection.setblocking(False)
+                try:
+                    connection.send(more)
+                except BlockingIOError:
+                    pass
+                except ConnectionError:
+                    left.remove(each)
+            time.sleep(0.1)
+        assert_served(gateway)
+
+
+@pytest.mark.real_time
+def test_daemon_continues_when_gateways_are_killed_under_load(
+    watched: Watch, daemon: Path, tmp_path: Path
+) -> None:
+    """Three in turn, each under a flood; the next one serves again."""
+    for _ in range(3):
+        with gateway_process(tmp_path, daemon) as gateway:
+            wait_for_daemon(gateway)
+            with RawWebSocket(gateway) as ws:
+                ws.call("subscribe", {"topics": ["field", "pattern", "amplifiers"]})
+                with contextlib.suppress(OSError):
+                    for _ in range(200):
+                        ws.send(b'{"jsonrpc":"2.0","method":"status","params":{}}')
+                gateway.process.kill()
+                gateway.process.wait()
+    with Client.connect(daemon, name="test") as era:
+        # the watch's own; a busy machine may have it expire between two repetitions
+        wait_for(lambda: len({contact.source for contact in era.status().contacts}) == 1)

@@ -1,20 +1,107 @@
-"""Examples for several people in the shipped daemon, each finger with a vibration of its own."""
+"""Examples for several people in the shipped daemon, each finger with a vibration of its own.
+
+The benchmark of touch to wire: a real daemon on its lines, tapped in random places.
+
+From a modal test in time on the simulated plate, through a file, to a new rig: the commands.
+
+A sound server that is killed while the daemon plays through a software amplifier.
+
+Its short form has no daemon: tests/sim/desk/soft_amp/test_soft_amp_sound.py.
+
+Idle, unreading and insistent clients, in processes of their own, while fingers play.
+
+The control loop of the whole daemon must not be affected.
+
+Corrupt, foreign and malicious files wherever the daemon reads one.
+
+They are refused with file, line and key, and a running daemon keeps its configuration.
+
+Examples of eight, twelve and sixteen ERAs, from their files to fingertips in virtual time.
+
+The Qt application of the examples, without a screen.
+
+The desk without hardware: real JACK server, plate and commands.
+
+Its short forms have no server, or no plate: tests/era_haptics/lab/measuring/test_measuring.py, test_jack_card.py.
+"""
 
 import asyncio
 import contextlib
+import json
 import os
-from collections.abc import AsyncIterator
+import pickle
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import model
-from controller.api.client import AsyncClient
+from benchmarks.desk.chain import chain
+from benchmarks.desk.identified import identified_errors
+from benchmarks.desk.session import BLOCK, PLATE, Desk, desk
+from benchmarks.desk.session import EXAMPLES as SESSION_EXAMPLES
+from benchmarks.desk_plate.model_in_time import DeskModel
+from benchmarks.desk_plate.truth import draw_truth
+from benchmarks.latency.session import Taps, daemon_session, plain_session, taps
+from controller.api.client import AsyncClient, Client
+from controller.api.jsonrpc import RpcError
+from controller.api.link import Unreachable
 from controller.api.methods import StatusResult
-from daemons import PATIENCE, STARTING, holding, next_event, ready, until
+from controller.daemon.daemon import check_daemon
+from controller.demo.demonstration import Scene, example_scenes, run_demo
+from controller.effects.layout import load_layout
+from controller.sources.tuio import read_capture
+from daemons import (
+    ENABLED,
+    PATIENCE,
+    PLACE,
+    READY,
+    STARTING,
+    DaemonProcess,
+    daemon_at,
+    daemon_process,
+    far_end,
+    holding,
+    loudness,
+    next_event,
+    play,
+    playing_daemon,
+    plays_on,
+    ready,
+    ready_daemon,
+    run_era,
+    until_state,
+    write_daemon,
+)
+from daemons import until as daemons_until
+from examples.make_measured import record_responses, scanning_grid
+from floods import flood
+from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
 from long_form import shortly
-from patient_daemon import RESTING
+from model.calibration.responses import read_measured, responses_of, write_responses_csv
+from model.cli import app
+from model.errors import InputError
+from model.rig.rig import Rig
+from model.rig.rig_file import example_rig_path, load_rig
+from model.table.table_file import build_table
+from patient_daemon import RESTING, wait_long
+from plates import PERTURBED_PLATE_FREQUENCIES, perturbed
+from several_fingers import write_schedule
+from sim.plant.fingers import Accelerometer
+from sound_cards import SoftAmp, capture_on, jack_server
+from virtual_lines import in_virtual_time, run_virtual
 
 EXAMPLES = Path(model.__file__).parents[1] / "examples"
 
@@ -24,8 +111,6 @@ PEOPLE = {
     "table": {(0.30, 0.26): ANY, (0.90, 0.26): ANY, (0.90, 0.54): ANY, (0.30, 0.54): ANY},
 }
 """Where each person rests a finger, and the band [Hz] that the layout gives it."""
-
-pytestmark = [pytest.mark.real_time, pytest.mark.alone]
 
 
 @contextlib.asynccontextmanager
@@ -38,7 +123,7 @@ async def example_daemon(name: str, folder: Path, cache: Path) -> AsyncIterator[
     )
     socket = folder / "era-haptics" / "daemon.sock"
     try:
-        await until(lambda: socket.is_socket() or process.returncode, patience=STARTING)
+        await daemons_until(lambda: socket.is_socket() or process.returncode, patience=STARTING)
         async with await AsyncClient.connect(socket, name="test", timeout=PATIENCE) as era:
             await ready(era)
             yield era
@@ -59,6 +144,8 @@ async def until_all_feel(era: AsyncClient, level_db_sl: float) -> StatusResult:
             await asyncio.sleep(0.02)
 
 
+@pytest.mark.real_time
+@pytest.mark.alone
 @pytest.mark.parametrize("name", shortly(PEOPLE, ["car_display"]))
 async def test_everyone_at_an_example_feels_their_own(
     name: str, tmp_path: Path, table_cache: Path
@@ -85,3 +172,630 @@ async def test_everyone_at_an_example_feels_their_own(
         await era.subscribe("silence")
         await era.touch([])
         await next_event(era, "silence")
+
+
+COUNT, PLANTED = 10, 0.08  # s
+
+
+async def tapped_daemon(*, is_two: bool, planted: float) -> Taps:
+    """Taps of a daemon that takes a time [s] longer for every frame of the panel."""
+    program = (sys.executable, "-m", "benchmarks.latency.planted", planted)
+    running = daemon_session("paper_plate", program=program, is_two=is_two)
+    async with running as session:
+        return await taps(session, COUNT, is_two=is_two)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.parametrize("is_two", [False, True])
+async def test_time_of_every_touch_holds_a_delay_of_the_daemon(is_two: bool) -> None:
+    """Each set that is counted answers its own touch; with two contents, the later of both."""
+    found = await tapped_daemon(is_two=is_two, planted=PLANTED)
+    assert found.unanswered == 0
+    assert found.times.min() > PLANTED
+    assert found.times.min() > found.wire > 0
+
+
+@pytest.mark.long
+@pytest.mark.alone
+async def test_baseline_answers_every_touch() -> None:
+    """Plain asyncio, which computes nothing, on the same line."""
+    async with plain_session("paper_plate") as session:
+        found = await taps(session, COUNT)
+    assert found.unanswered == 0
+    assert 0 < found.times.min() < found.times.max()
+
+
+MESH = "16x12"
+SENSOR = Accelerometer("", 0, 0, noise_density=5e-3, reach=200.0, resolution=1e-3)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path(), mesh=MESH)
+
+
+@pytest.fixture(scope="module")
+def measured(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what twelve sensors recorded of the true plate, P3 wrong and P8 dead."""
+    scales = {"P3": 0.8, "P8": 0.0}
+    sensors = [
+        replace(sensor, scale=scales.get(sensor.name, 1.0))
+        for sensor in scanning_grid(rig.plate, 4, 3, like=SENSOR)
+    ]
+    responses = record_responses(perturbed(rig), sensors, PERTURBED_PLATE_FREQUENCIES)
+    folder = tmp_path_factory.mktemp("measured")
+    write_responses_csv(folder / "measured.csv", responses, rig)
+    return folder
+
+
+@pytest.mark.usefixtures("plain_pictures")
+def test_calibration_finds_the_true_parameters(rig: Rig, measured: Path, tmp_path: Path) -> None:
+    """Every parameter within 2 %, faults of the measurement named, and a rig that can be used."""
+    new = tmp_path / "new.yaml"
+    files = (example_rig_path(), measured / "measured.csv", "-o", new)
+    result = CliRunner().invoke(app, ["calibrate", *map(str, files), "--mesh", MESH, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    truth = perturbed(rig)
+    wanted = [truth.plate.material.E, truth.plate.loss_factor]
+    wanted += [v for era in truth.eras for v in (era.stiffness, era.damping, era.bolt_mass)]
+    np.testing.assert_allclose([row["after"] for row in told["parameters"]], wanted, rtol=0.02)
+    assert told["dead_sensors"] == ["P8"]
+    assert told["sensor_scales"]["P3"]["scale"] == pytest.approx(0.8, rel=0.01)
+    assert told["held_out"]["error_after"] < 0.03 < 0.3 < told["held_out"]["error_before"]
+    assert told["files"] == [str(new)]
+    back = load_rig(new, mesh=MESH)
+    gains = np.column_stack([era.gain(PERTURBED_PLATE_FREQUENCIES) for era in back.eras])
+    true_gains = np.column_stack([era.gain(PERTURBED_PLATE_FREQUENCIES) for era in truth.eras])
+    assert np.median(np.abs(gains / true_gains - 1)) < 0.01
+
+
+CHANNELS = 4
+SERVER_BACK = 20.0  # s
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+async def test_lost_server_is_a_fault_and_comes_back_disarmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon is in fault or has lost it; once the server is back, the device opens, and waits.
+
+    For arm, although the finger has never left.
+    """
+    wait_long(monkeypatch)
+    name = f"gone{os.getpid()}"
+    with jack_server(name, outputs=CHANNELS) as server:
+        capture_on(name, "looking", 1).close()  # once the server is up
+        options = ("--device", "jack", "--channels", str(CHANNELS), "--link", str(tmp_path / "amp"))
+        amp = SoftAmp(*options, environment=server.environment, log=tmp_path / "log")
+        far = SimpleNamespace(urls={})
+        change = ('main: {url: "sim://"}', f'main: {{url: "{amp.url}", full_level: output}}')
+        async with (
+            daemon_at(far, tmp_path, changes=(change,)) as daemon,
+            await daemon.client() as era,
+            holding(era, PLACE),
+        ):
+            await ready(era)
+            await era.arm("test", lease_s=60)
+            await _until_playing(era)
+            server.process.kill()
+            server.process.wait()
+            await until_state(era, "FAULT", "COMM_LOST")
+            assert not (await era.status()).drive
+            with jack_server(name, outputs=CHANNELS):
+                await daemons_until(lambda: "open again" in amp.log, patience=SERVER_BACK)
+                await until_state(era, "FAULT", "COMM_LOST", READY)
+                assert not (await era.status()).drive
+                await ready(era)
+                await era.arm("test", lease_s=60)
+                await _until_playing(era)
+        amp.end()
+
+
+async def _until_playing(era: AsyncClient) -> None:
+    end = time.monotonic() + PATIENCE
+    while not (await era.status()).drive:
+        assert time.monotonic() < end
+        await asyncio.sleep(0.01)
+
+
+MAX_GROWTH = 64  # MiB; 32 clients with 256 KiB each to read, and as much to parse, are less
+
+
+def resident(pid: int) -> float:
+    """Return the resident memory of a process [MiB]."""
+    with open(f"/proc/{pid}/statm", encoding="ascii") as stream:  # noqa: PTH123
+        return int(stream.read().split()[1]) * 4096 / 2**20
+
+
+async def stop_by_new_client(daemon: DaemonProcess) -> None:
+    """Connect a new client and stop the daemon by it."""
+    async with asyncio.timeout(PATIENCE):
+        while True:
+            try:
+                async with await daemon.client() as other:
+                    await other.stop()
+                    break
+            except (RpcError, Unreachable, ConnectionError):  # too many clients
+                await asyncio.sleep(0.05)
+    await daemons_until(lambda: loudness(daemon.far) == 0)
+
+
+@pytest.mark.alone
+async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
+    """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
+    async with playing_daemon(tmp_path) as (daemon, era, journal):
+        before = resident(daemon.process.pid)
+        async with (
+            flood("unreading", daemon.socket, 10),
+            flood("idle", daemon.socket, 2000) as idle,
+        ):
+            await plays_on("clients connecting", daemon, era, journal)
+            assert idle.stdout is not None
+            line = await asyncio.wait_for(idle.stdout.readline(), 3 * PATIENCE)
+            assert int(line) == 2000
+            await plays_on("2000 idle, 10 unreading", daemon, era, journal)
+            await stop_by_new_client(daemon)
+            assert resident(daemon.process.pid) - before < MAX_GROWTH
+        await play(era, daemon.far)
+
+
+@pytest.mark.alone
+async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: Path) -> None:
+    """Of 25 new clients each, beside 2000 connections in a second, and of the command."""
+    async with far_end(tmp_path) as far, daemon_process(tmp_path, far) as daemon:
+        async with flood("again", daemon.socket, 200):
+            served = 0
+            for _ in range(25):
+                with contextlib.suppress(RpcError, Unreachable):
+                    async with await daemon.client() as era:
+                        await era.stop()
+                        served += 1
+            status, _, problem = await run_era("stop", "--socket", daemon.socket)
+        assert (served, status, problem) == (25, 0, "")
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("kind", shortly(["garbage", "asking"], ["asking"]))
+async def test_daemon_plays_on_when_clients_flood(tmp_path: Path, kind: str) -> None:
+    """With malformed or endless requests any client can stop it, and the log stays short."""
+    async with playing_daemon(tmp_path) as (daemon, era, journal):
+        before = resident(daemon.process.pid)
+        async with flood(kind, daemon.socket, 4), flood(kind, daemon.socket, 5):
+            await plays_on(f"clients flood: {kind}", daemon, era, journal)
+            await stop_by_new_client(daemon)
+        await play(era, daemon.far)
+        assert resident(daemon.process.pid) - before < MAX_GROWTH
+        assert not daemon.has_logged("Traceback")
+        assert not daemon.has_logged("no json")
+        assert len(daemon.log) < 200  # invalid requests do not fill the disk
+
+
+MAX_TIME = 5.0  # s; expanded aliases would take minutes, and gigabytes
+
+
+class Opened:
+    """Runs a command when it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, ("touch pickled",)
+
+
+BOMB = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)]
+)
+LAYOUT = """effects: {hum: {kind: buzz}}
+regions:
+  pad: {rectangle: {start: [1 cm, 1 cm], end: [20 cm, 18 cm]}, on_press: hum}
+"""
+
+
+INVALID = [
+    pytest.param(b"", "", id="empty"),
+    pytest.param(pickle.dumps({"rig": Opened()}), "", id="pickle"),
+    pytest.param(BOMB.encode(), ":1: a0: ", id="aliases"),
+    pytest.param(b"x: !!python/object/apply:os.system ['touch pickled']\n", ":1: x: ", id="tag"),
+    pytest.param(b"a: " + b"[" * 900, ":1: a", id="nested"),
+    pytest.param(b"a: 1\n" + b"#" * (1 << 22), "", id="large"),
+    pytest.param(b"a: 1\na: 2\n", ":2: a: ", id="duplicate key"),
+    pytest.param(random.Random(5).randbytes(3000), "", id="noise"),
+    pytest.param(None, "", id="endless device"),
+]
+
+
+@pytest.mark.parametrize("role", ["daemon.yaml", "rig.yaml", "layout.yaml"])
+@pytest.mark.parametrize(("content", "place"), INVALID)
+def test_daemon_refuses_files_that_are_no_plain_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, role: str, content: bytes | None, place: str
+) -> None:
+    """As configuration, rig or layout: with the file's name, at once and without executing it."""
+    monkeypatch.chdir(tmp_path)
+    path = write_daemon(tmp_path, {"main": "sim://"}, "layouts: {panel: layout.yaml}\n")
+    (tmp_path / "layout.yaml").write_text(LAYOUT, encoding="utf-8")
+    check_daemon(path)
+    (tmp_path / role).unlink()
+    if content is None:
+        (tmp_path / role).symlink_to("/dev/zero")
+    else:
+        (tmp_path / role).write_bytes(content)
+    begin = time.process_time()
+    with pytest.raises(InputError) as caught:
+        check_daemon(path)
+    assert time.process_time() - begin < MAX_TIME
+    assert f"{tmp_path / role}{place}" in str(caught.value)
+    assert not (tmp_path / "pickled").exists()
+
+
+@in_virtual_time
+async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each invalid file: nothing is applied, not even valid changes beside it; it plays on."""
+    layout, config = tmp_path / "layout.yaml", tmp_path / "daemon.yaml"
+    layout.write_text(LAYOUT, encoding="utf-8")
+    async with ready_daemon(tmp_path, "layouts: {panel: layout.yaml}\n") as (bench, era):
+        await era.arm("test", lease_s=60)
+        effects = await era.effects()
+        async with holding(era, far=bench.far):
+            good = config.read_text("utf-8")
+            config.write_text(f"{good}dashboard: 127.0.0.1:1\n", encoding="utf-8")
+            invalid = [each.values[0] for each in INVALID if each.values[0] is not None]
+            for content in invalid:
+                layout.write_bytes(content)
+                await bench.daemon.reload()
+            rejected = [one for one in caplog.messages if "reload rejected" in one]
+            assert len(rejected) == len(invalid)
+            assert not any("reload failed" in one for one in caplog.messages)
+            assert await era.effects() == effects
+            assert any(bench.far.summary().levels)
+        status = await era.status()
+        assert (status.state, (status.lease_left_s or 0) > 5) == (ENABLED, True)
+    with pytest.raises(InputError, match=r"layout\.yaml"):
+        check_daemon(config)
+
+
+MANY_ERAS_CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
+SCHEDULE = ((1, 0.1, 0.9, 0.30, 0.35), (2, 0.15, 0.9, 0.80, 0.70))
+"""Fingers: id, down and up [s], place in TUIO's coordinates."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two fingers, the second of which shall feel it."""
+    path = tmp_path_factory.mktemp("touches") / "touches.tuio"
+    return write_schedule(path, SCHEDULE, 1.0)
+
+
+@pytest.mark.parametrize("name", shortly(MANY_ERAS_CHANNELS, ["eight_eras", "car_display"]))
+def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
+    """All ERAs on all amplifiers play, and the fingers feel at least the promised contrast.
+
+    On the first plate that is drawn, level within 3 dB; by fields of the plate in time. The levels
+    that its picture shows differ by the contrast in its title.
+    """
+    file = EXAMPLES / f"{name}.yaml"
+    rig = load_rig(file)
+    counts = Counter(wire.amplifier for wire in rig.wiring.values())
+    assert [counts[amplifier] for amplifier in rig.amplifiers] == MANY_ERAS_CHANNELS[name]
+    table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
+    rows = run_virtual(
+        run_demo(
+            file,
+            table,
+            wire="sim",
+            scenes=[Scene(read_capture(capture))],
+            on_row=lambda row: None,
+        )
+    )
+    row = rows[-1]
+    assert row.drive.keys() == {era.name for era in rig.eras}
+    x, y = SCHEDULE[1][3:]
+    assert row.targets_m == [pytest.approx((x * rig.plate.length, (1 - y) * rig.plate.width))]
+    assert row.steady
+    assert row.measured_contrast_db is not None
+    assert row.promised_contrast_db is not None
+    assert row.measured_contrast_db >= row.promised_contrast_db > 6
+    (quiet,) = row.quiet
+    shown = row.levels_db_sl[row.target_id] - row.levels_db_sl[quiet]
+    assert shown == pytest.approx(row.measured_contrast_db)
+    assert row.measured_level_db_sl == pytest.approx(row.predicted_level_db_sl, abs=3)
+
+
+def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leaves() -> None:
+    """In its band, and promised as its own; at least that on the first plate that is drawn.
+
+    The one that slides by a third of the plate feels it where it rests at last, and the rows of
+    all three are of that moment, with one set of figures.
+    """
+    file = EXAMPLES / "car_display.yaml"
+    rig = load_rig(file)
+    table = build_table(rig, frequencies=np.arange(70.0, 301.0, 10.0), drive_mode="phased")
+    scene = example_scenes(rig)[-1]
+    rows = run_virtual(run_demo(file, table, wire="sim", scenes=[scene], on_row=lambda row: None))
+    slid, stayed, left = rows
+    assert len(slid.fingers) == 3
+    assert slid.fingers == stayed.fingers == left.fingers
+    for row, finger in zip(rows, slid.fingers, strict=True):
+        assert row.measured_contrast_db == finger.measured_contrast_db
+        assert row.targets_m == [finger.at_m]
+    assert slid.targets_m == [pytest.approx((0.15 * 0.53, 0.65 * 0.30), abs=0.008)]
+    bands = [(70, 110), (180, 220), (250, 300)]
+    for finger, (low, high) in zip(slid.fingers, bands, strict=True):
+        assert finger.frequency_hz is not None
+        assert low <= finger.frequency_hz <= high
+        assert finger.verdict == "own"
+        assert finger.measured_contrast_db is not None
+        assert finger.promised_contrast_db is not None
+        assert finger.measured_contrast_db >= finger.promised_contrast_db >= 12
+        assert finger.measured_level_db_sl == pytest.approx(20.0, abs=3)
+    for row in rows:
+        assert row.steady
+        assert row.as_json()["fingers"]
+
+
+@pytest.mark.parametrize("name", MANY_ERAS_CHANNELS)
+def test_layout_lies_on_its_plate(name: str) -> None:
+    """Every control is where a finger can be, and no control covers the middle of another."""
+    plate = load_rig(EXAMPLES / f"{name}.yaml").plate
+    regions = load_layout(EXAMPLES / f"{name}_layout.yaml", plate).regions
+    assert len(regions) >= 6
+    for region in regions:
+        x, y = region.shape.centre
+        assert 0 < x < plate.length
+        assert 0 < y < plate.width
+        assert [each.name for each in regions if each.shape.contains(x, y)] == [region.name]
+
+
+FOLDER = Path(__file__).parents[2] / "examples" / "application"
+
+Until = Callable[[Callable[[], object]], None]
+
+
+@pytest.fixture
+def until(monkeypatch: pytest.MonkeyPatch) -> Until:
+    """Wait for a condition of PySide6 without a screen.
+
+    Its absence is a failure only where `make qt-test` installs it.
+    """
+    monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
+    monkeypatch.syspath_prepend(FOLDER)
+    try:
+        from PySide6.QtWidgets import QApplication
+    except ImportError as error:
+        reason = f"no PySide6 ({error}): make qt-test installs it, apt libegl1 and libgl1"
+        if (Path(sys.prefix) / "installed-qt").exists():
+            pytest.fail(reason)
+        pytest.skip(reason)
+    application = QApplication.instance() or QApplication([])
+
+    def wait(condition: Callable[[], object]) -> None:
+        def processed() -> object:
+            application.processEvents()
+            return condition()
+
+        wait_for(processed)
+
+    return wait
+
+
+@pytest.mark.real_time
+@pytest.mark.long
+def test_application_plays_and_comes_back_after_every_loss(tmp_path: Path, until: Until) -> None:
+    """By a mouse; after a new daemon, and a gateway that hangs, it follows and stays disarmed."""
+    from PySide6.QtCore import QPoint, Qt
+    from PySide6.QtTest import QTest
+    from qt_plate import Plate, Window
+
+    with gateway_process(tmp_path, tmp_path / "era.sock") as gateway:
+        window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
+        window.show()
+
+        def until_said(start: str) -> None:
+            until(lambda: window.state.text().startswith(start))
+
+        left, at = Qt.MouseButton.LeftButton, QPoint(100, 150)  # of 400 by 300
+        until_said("no connection: the daemon does not respond")
+        with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+            until_said("ready: ")
+            QTest.mouseClick(window.arm, left)
+            until_said("on: armed by 'my application'")
+            until(lambda: era.status().state == "OPERATION_ENABLED")
+            refused: list[str] = []
+            window.plate.refused.connect(refused.append)
+            QTest.mouseClick(window.arm, left)  # the lease is kept
+            until(lambda: any(each.startswith("armed by") for each in refused))
+            QTest.mousePress(window.surface, left, pos=at)
+            until(lambda: window.felt.text().startswith("played by "))
+            rig = era.hello("test").rig
+            found: list[Any] = []
+            until(lambda: found.extend(era.status().contacts) or found)  # repeated by its timer
+            contact = found[0]
+            assert contact.x_m == pytest.approx(rig.length_m / 4, abs=1e-3)
+            assert contact.y_m == pytest.approx(rig.width_m / 2, abs=1e-3)
+            until(lambda: (era.status().lease_left_s or 0) < 4.2)
+            until(lambda: (era.status().lease_left_s or 0) > 4.5)
+        until_said("no connection: ")
+        with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+            until_said("ready: ")
+            until(lambda: len(era.status().contacts) == 1)
+            assert era.status().armed_by is None
+            gateway.process.send_signal(signal.SIGSTOP)
+            until_said("no connection: ")
+            gateway.process.send_signal(signal.SIGCONT)
+            until_said("ready: ")
+            QTest.mouseRelease(window.surface, left, pos=at)
+            until(lambda: not era.status().contacts)
+            QTest.mouseClick(window.stop, left)
+            until_said("stopped: ")
+            assert era.status().state == "QUICK_STOP_ACTIVE"
+
+
+@pytest.mark.real_time
+@pytest.mark.long
+def test_application_without_its_user_or_connection_lifts_and_disarms(
+    tmp_path: Path, until: Until
+) -> None:
+    """A hidden window, a closed one, and Disarm without a WebSocket; no lease runs out."""
+    from PySide6.QtCore import QPoint, Qt
+    from PySide6.QtTest import QTest
+    from qt_plate import Plate, Window
+
+    with (
+        real_daemon(tmp_path) as socket,
+        gateway_process(tmp_path, socket) as gateway,
+        Client.connect(socket) as era,
+    ):
+        era.subscribe("state")
+        window = Window(Plate(gateway.url, TOKEN, ["state", "pattern", "silence"]))
+        left = Qt.MouseButton.LeftButton
+
+        def disarm() -> None:
+            window.plate._socket.abort()
+            QTest.mouseClick(window.disarm, left)
+
+        for leave in (window.hide, disarm, window.close):
+            window.show()
+            until(lambda: window.state.text().startswith("ready: "))
+            QTest.mouseClick(window.arm, left)
+            until(lambda: era.status().armed_by is not None)
+            until(lambda: window.state.text().startswith("on: "))
+            if leave is not disarm:
+                QTest.mousePress(window.surface, left, pos=QPoint(100, 150))
+                until(lambda: len(era.status().contacts) == 1)
+            leave()
+            until(lambda: era.status().armed_by is None and not era.status().contacts)
+            causes = [each.data["cause"] for each in era.events(timeout=0.1)]
+            assert "the arming lease was not renewed" not in causes
+            QTest.mouseRelease(window.surface, left, pos=QPoint(100, 150))
+
+
+SEED, DESK_MESH = 3, "6x4 Q3"
+
+
+@pytest.fixture(scope="module")
+def plate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    """A plate behind a JACK server of its own."""
+    with desk(tmp_path_factory.mktemp("desk"), seed=SEED, mesh=DESK_MESH) as running:
+        yield running
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+@pytest.mark.parametrize(("device", "late"), [("jack:desk", 0), ("desk", 512)])
+def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: int) -> None:
+    """Through JACK or PortAudio and files, against the plate's closed form, and its hidden delay.
+
+    73 samples of converters, a block of JACK, of PortAudio another of its own, and a filter's
+    third of a sample; known but for periods of 60 Hz, which the tones have in common.
+    """
+    told = plate.run(
+        "measure", "rig.yaml", "--device", device, "--sensors", "sensors.csv",
+        "-o", "measured.csv", "--frequencies", "61:481:60",
+    )  # fmt: skip
+    assert told["latency_s"] * 48_000 == pytest.approx((73 + BLOCK + late) % 800, abs=0.5)
+    rig = load_rig(plate.folder / "rig.yaml")
+    found = responses_of(read_measured(plate.folder / "measured.csv"), rig)
+    model = DeskModel(draw_truth(rig, seed=SEED, mesh=DESK_MESH), found.points).under()
+    exact = model.response(found.frequencies).swapaxes(1, 2) / rig.eras[0].stroke
+    loud = np.abs(exact) > 0.2 * np.abs(exact).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
+    """Few tones, through JACK and the command: what drives the plate, its springs, its places."""
+    plate.run(
+        "rig", "identify", "rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv",
+        "-o", "identified.yaml", "--frequencies", "61:481:60", "--yes",
+    )  # fmt: skip
+    rig = load_rig(plate.folder / "identified.yaml")
+    limits = {"stiffness": 0.03, "place": 5e-4, "gain": 0.02, "phase": np.radians(2)}
+    errors = [e for e in identified_errors(rig, plate.truth) if e.kind in limits]
+    assert len(errors) == 16
+    for error in errors:
+        assert abs(error.relative) < limits[error.kind], error
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    """The same plate with one sensor of 2 g, which is moved to the twelve places."""
+    folder = tmp_path_factory.mktemp("moved")
+    text = (SESSION_EXAMPLES / "sensors.csv").read_text("utf-8")
+    head, *lines = text.splitlines()
+    rows = (line.split(",") for line in lines)
+    one = [",".join([*row[:3], "1", *row[4:], "2"]) for row in rows]
+    with desk(
+        folder, seed=SEED, mesh=DESK_MESH, sensors="\n".join([f"{head},mass_g", *one, ""])
+    ) as it:
+        yield it
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+def test_plate_is_identified_by_one_sensor_of_known_mass(moved: Desk) -> None:
+    """Guided through twelve places, through JACK: with its mass the plate is explained, and known.
+
+    Without it is refused.
+    """
+    arguments = ["rig.yaml", "--device", "jack:desk", "--sensors", "sensors.csv"]
+    arguments += ["-o", "measured.uff", "--frequencies", "51:491:40"]
+    moved.measure_by_moving(*arguments)
+    identified = ("rig", "identify", "rig.yaml", "-o", "identified.yaml", "--measured")
+    told = moved.run(*identified, "measured.uff")
+    limits = {"stiffness": 0.03, "place": 1e-3, "gain": 0.03}
+    errors = identified_errors(load_rig(moved.folder / "identified.yaml"), moved.truth)
+    for error in (each for each in errors if each.kind in limits):
+        assert abs(error.relative) < limits[error.kind], error
+    bare = (moved.folder / "measured.uff").read_text("utf-8").replace("mass_g=2 ", "mass_g=0 ")
+    (moved.folder / "bare.uff").write_text(bare, "utf-8")
+    without = moved.run(*identified, "bare.uff", status=1)
+    assert (told["explained"], without["explained"]) == (True, False)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+def test_second_plate_of_a_name_is_refused(plate: Desk) -> None:
+    """It could not be told from the first, which would be measured in its place."""
+    done = subprocess.run(
+        [*PLATE, "--mesh", DESK_MESH],
+        cwd=plate.folder,
+        env=plate.environment,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert not done.stdout
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.needs("jackd", "cc")
+def test_chain_from_measurement_to_touches_keeps_its_promises() -> None:
+    """Values found are the plate's, promises are kept, and touches are felt where they are.
+
+    Stiffness and damping to some percent, as one plate shows; of one plate's promises some fail.
+    """
+    found = chain(seed=SEED, promises=6, touched=2)
+    assert found.held_out_error < 0.05
+    for error in found.errors:
+        assert abs(error.relative) < 0.1, error
+    assert sum(row["kept"] for row in found.promises) >= 3
+    for row in found.promises:
+        assert row["measured_level_db_sl"] == pytest.approx(row["promised_level_db_sl"], abs=1)
+        assert row["measured_contrast_db"] > row["promised_contrast_db"] - 6
+    for error in found.identified.errors:
+        limit = 1e-3 if error.kind == "place" else 0.1
+        assert abs(error.relative) < limit, error
+    assert len(found.touches) == 2
+    assert all(touch.measured_db > 6 for touch in found.touches)

@@ -1,31 +1,68 @@
-"""`era rig check --url` and `identify` as typed, beside a plate on a wire in virtual time."""
+"""`era rig check --url` and `identify` as typed, beside a plate on a wire in virtual time.
+
+A daemon whose plate changes: its estimator, a process of its own, and what touches get of it.
+
+Examples of an application: a page in a real browser through losses, a program in Python.
+"""
 
 import asyncio
+import functools
 import json
 import math
-from collections.abc import Callable, Coroutine
-from dataclasses import replace
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from controller.api.client import AsyncClient, Client
+from controller.api.schema import LearningSummary
+from controller.api.server import StateEvent
 from controller.cli.commands import app
+from controller.daemon.daemon import Daemon
+from controller.demo.recorder import FingerVibration, steady_contrast_db
+from controller.learning.estimator_process import EstimatorTimeouts
+from controller.learning.learning import Learning
 from controller.process.daemon_process import SocketLock
+from daemons import PATIENCE, daemon_at, far_end, ready
 from drivers.errors import CommandError, LinkError
 from examples.make_measured import record_responses, scanning_grid
+from gateway_bench import (
+    TOKEN,
+    Page,
+    ScriptedDaemon,
+    gateway_process,
+    open_browser,
+    real_daemon,
+    wait_for,
+    wait_for_state,
+)
 from model.calibration.responses import write_responses_csv, write_responses_uff
 from model.errors import InputError
+from model.identification.learned_plate import load_learned
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import SCALED
+from model.table.table import LocalizationTable
+from model.table.table_file import build_table
 from plates import write_rig
-from real_wires import WIRES, far_side
+from real_wires import WIRES, FarSide, far_side
+from registry import threads
 from sim.amplifier.simulated_amplifier import Amplifier
 from sim.plant.fingers import Accelerometer
-from virtual_lines import run_virtual
+from virtual_lines import VirtualLoop, run_virtual
 
 Typed = Callable[..., Result]
 PORT = "serial:///dev/memory0?baud=921600"
@@ -237,3 +274,498 @@ def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: 
     assert "SWAPPED: channel 1 of amplifier main (ERA SE in the rig) drives ERA NW" in result.stdout
     assert "PLATE" not in result.stdout
     assert "INVERTED" not in result.stdout
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Place = tuple[float, float]
+
+IDENTIFIED = (
+    "uncertainty: {gain: 1 %, phase_deg: 1, thickness: 0.2 %, stiffness: 1 %, damping: 1.05, "
+    "fingertip: 0.5}\n"
+)
+"""Of a rig's file: what an identification leaves."""
+
+NO_TIMEOUTS = EstimatorTimeouts(start=1e9, estimate=1e9)
+_APART, _MARGIN = 0.05, 0.02  # m
+_FELT = 0.2  # s
+_REAL_WAIT = 0.05  # s; for a reply of the process
+
+
+@dataclass
+class LearningBench:
+    """A daemon that learns, its far end, and an armed client."""
+
+    far: FarSide
+    era: AsyncClient
+    file: Path
+    daemon: Daemon
+    rng: np.random.Generator
+    stands: bool = True
+
+    @property
+    def estimator(self) -> int:
+        """Process number of the estimator."""
+        assert self.daemon.learning is not None
+        assert self.daemon.learning.estimator_pid is not None
+        return self.daemon.learning.estimator_pid
+
+    def is_estimating(self) -> bool:
+        """Whether the estimator works, so that time is to stand still."""
+        learning = self.daemon.learning
+        if learning is None or learning.estimator_pid is None or not self.stands:
+            return False
+        status = learning.status
+        is_starting = status.state in ("starting", "restarting")
+        return is_starting or status.estimates + status.discarded < status.readings
+
+    async def learning(self) -> LearningSummary:
+        """What it has learned."""
+        found = (await self.era.status()).learning
+        assert found is not None
+        return found
+
+    async def until(self, *states: str) -> LearningSummary:
+        """Wait until it is in one of these states."""
+        while True:
+            found = await self.learning()
+            if found.state in states:
+                return found
+            await asyncio.sleep(0.05)
+
+    def change(self, **stiffness: float) -> None:
+        """Multiply the stiffness of mounts, by ERA."""
+        plate = replace(self.far.bench.imperfections.plate, stiffness=stiffness)
+        self.far.bench.change_plate(plate, now=threads.now())
+
+    def places(self) -> list[Place]:
+        """Two or three fingers at random."""
+        plate = self.far.bench.rig.plate
+        size = np.array([plate.length, plate.width])
+        count = int(self.rng.integers(2, 4))
+        while True:
+            found = self.rng.uniform(_MARGIN, size - _MARGIN, (count, 2))
+            gaps = np.linalg.norm(found[:, None] - found, axis=-1)
+            if gaps[np.triu_indices(count, 1)].min() > _APART:
+                return [(float(x), float(y)) for x, y in found]
+
+    async def touch(self, *places: Place, seconds: float = 1.2) -> float | None:
+        """Fingers rest on the plate; contrast felt by the last one [dB], None if nothing plays."""
+        named = {f"finger {number}": place for number, place in enumerate(places)}
+        self.far.bench.place_fingers(named, now=threads.now())
+        end = threads.now() + seconds
+        while threads.now() < end:
+            await self.era.touch(list(places))
+            await asyncio.sleep(0.05)
+        is_playing = any(self.far.summary().levels)
+        self.far.bench.advance(threads.now())
+        felt = self.far.bench.felt(threads.now() - _FELT, threads.now())
+        *quiet, target = [
+            FingerVibration(np.array(f.frequencies), f.amplitude, f.peak, f.weights)
+            for f in (felt[name] for name in named)
+        ]
+        await self.era.touch([])
+        self.far.bench.place_fingers({}, now=threads.now())
+        await asyncio.sleep(0.3)
+        return steady_contrast_db(target, quiet) if is_playing else None
+
+    async def patterns(self, count: int) -> LearningSummary:
+        """Touch at random until so many patterns more are estimated."""
+        requested = (await self.learning()).estimates + count
+        while (found := await self.learning()).estimates < requested:
+            if found.readings < requested:
+                await self.touch(*self.places())
+            else:
+                await asyncio.sleep(0.05)
+        return found
+
+
+@asynccontextmanager
+async def learning_bench(
+    folder: Path, *, uncertainty: str = IDENTIFIED, timeouts: EstimatorTimeouts = NO_TIMEOUTS
+) -> AsyncIterator[LearningBench]:
+    """A daemon that learns of a plate; uncertainty: in its rig's text."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, _StandingLoop)
+    changes = [("\nplate:", f"\n{uncertainty}plate:")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(Learning.__init__.__kwdefaults__, "timeouts", timeouts)  # type: ignore[arg-type]
+        async with (
+            far_end(folder, changes=changes) as far,
+            daemon_at(far, folder, "learn: learned.npz\n", changes=changes, table=_table) as bench,
+            await bench.client() as era,
+        ):
+            await ready(era)
+            async with era.armed("test", lease_s=60):
+                rng = np.random.default_rng(0)
+                learning = LearningBench(far, era, folder / "learned.npz", bench.daemon, rng)
+                loop.stands = learning.is_estimating
+                try:
+                    yield learning
+                finally:
+                    loop.stands = _never
+
+
+def _table(rig: Rig) -> LocalizationTable:
+    return build_table(rig, drive_mode="phased")
+
+
+def _never() -> bool:
+    return False
+
+
+class _StandingLoop(VirtualLoop):
+    """Virtual time that stands still while `stands` says so; sockets and pipes are served."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stands: Callable[[], bool] = _never
+        jumping = self._selector.select
+
+        def select(timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            if timeout != 0 and self.stands():
+                return selectors.DefaultSelector.select(self._selector, _REAL_WAIT)
+            return jumping(timeout)
+
+        self._selector.select = select
+
+
+def beside_a_process(test: Callable[P, Coroutine[object, object, T]]) -> Callable[P, T]:
+    """Run a test in virtual time that passes while a real process works."""
+
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        with asyncio.Runner(loop_factory=_StandingLoop) as runner:
+            return runner.run(test(*args, **kwargs))
+
+    return run
+
+
+PAIRS = (
+    ((0.24, 0.06), (0.06, 0.17)),
+    ((0.07, 0.06), (0.22, 0.17)),
+    ((0.15, 0.19), (0.16, 0.05)),
+)
+PAIR = PAIRS[0]
+
+
+@pytest.mark.long
+@beside_a_process
+async def test_loose_mount_is_named_and_its_contrast_comes_back(tmp_path: Path) -> None:
+    """A mount 20 % softer is named; the same touches then get 3 dB more, and it is kept on disk."""
+    async with learning_bench(tmp_path) as bench:
+        await bench.until("following")
+        await bench.patterns(6)
+        bench.change(NE=0.8)
+        before = await contrast(bench)
+        while not (found := await bench.learning()).cause.startswith("the plate has changed"):
+            await bench.patterns(1)
+        assert "stiffness NE" in found.cause
+        assert found.corrections > 0
+        assert found.latency_ms.count > 0
+        assert await contrast(bench) > before + 3
+        while not bench.file.exists():  # written now and then
+            await bench.patterns(1)
+    table = _table(load_rig(bench.file.with_name("rig.yaml")))
+    assert load_learned(bench.file, table=table.fingerprint).names
+
+
+async def contrast(bench: LearningBench) -> float:
+    """Median contrast of some touches [dB]."""
+    found = [await bench.touch(*pair) for pair in PAIRS]
+    return float(np.median([each for each in found if each is not None]))
+
+
+@beside_a_process
+async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
+    """Killed, another follows; stopped, it is replaced; meanwhile and after touches play."""
+    timeouts = EstimatorTimeouts(start=1e9, estimate=3.0)
+    async with learning_bench(tmp_path, timeouts=timeouts) as bench:
+        await bench.until("following")
+        first = bench.estimator
+        os.kill(first, signal.SIGKILL)
+        await bench.until("restarting")
+        assert await bench.touch(*PAIR) is not None
+        await bench.until("following")
+        second = bench.estimator
+        assert second != first
+        bench.stands = False
+        os.kill(second, signal.SIGSTOP)
+        while (found := await bench.learning()).state == "following":
+            assert await bench.touch(*PAIR) is not None
+        assert "no reply within 3 s" in found.cause
+        await bench.until("following")
+        assert (await bench.learning()).restarts == 2
+
+
+@beside_a_process
+async def test_plate_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
+    """With the thickness of a drawing, to 2 %, answers stay as built, and the cause says so."""
+    async with learning_bench(tmp_path, uncertainty="uncertainty: {}\n") as bench:
+        found = await bench.until("only_alarms")
+        assert "thickness" in found.cause
+        found = await bench.patterns(1)
+        assert found.corrections == 0
+
+
+FOLDER = Path(__file__).parents[2] / "examples" / "application"
+GATEWAY = "http://127.0.0.1:8137/"
+SAID = "document.querySelector('#state').textContent"
+FELT = "document.querySelector('#felt').textContent"
+
+
+class Network:
+    """Between browser and gateway: passes bytes on, loses them, or refuses connections."""
+
+    def __init__(self) -> None:
+        self.port = 0
+        self.target = 0  # port of the gateway
+        self._is_muted = self._is_cut = False
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    @asynccontextmanager
+    async def serving(self) -> AsyncIterator["Network"]:
+        """Accept connections on a free port."""
+        async with await asyncio.start_server(self._accept, "127.0.0.1", 0) as server:
+            self.port = server.sockets[0].getsockname()[1]
+            yield self
+            self.cut()
+
+    def mute(self) -> None:
+        """Lose every byte from now on; nothing closes."""
+        self._is_muted = True
+
+    def cut(self) -> None:
+        """Close all connections and refuse others."""
+        self._is_cut = True
+        for writer in self._writers:
+            writer.transport.abort()
+
+    def restore(self) -> None:
+        """Close what has lost bytes, and pass everything on."""
+        self.cut()
+        self._is_muted = self._is_cut = False
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        if self._is_cut:
+            writer.transport.abort()
+            return
+        with suppress(OSError):
+            back, forth = await asyncio.open_connection("127.0.0.1", self.target)
+            self._writers.add(forth)
+            await asyncio.gather(self._pass(reader, forth), self._pass(back, writer))
+        if not self._is_muted:
+            writer.transport.abort()
+
+    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(1 << 16):
+            if not self._is_muted:
+                writer.write(data)
+        if not self._is_muted:
+            writer.close()
+
+
+@contextmanager
+def pages(folder: Path, network: Network) -> Iterator[str]:
+    """The origin of a server of the example's page, which is not the gateway but names it."""
+    page = (FOLDER / "plate.html").read_text(encoding="utf-8")
+    assert page.count(GATEWAY) == 1
+    own = page.replace(GATEWAY, f"http://127.0.0.1:{network.port}/")
+    (folder / "plate.html").write_text(own, encoding="utf-8")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@asynccontextmanager
+async def shown(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ExitStack, str]]:
+    """A tab, the network, what ends at the end, and the origin of the page."""
+    page = tmp_path / "page"
+    page.mkdir()
+    async with (
+        Network().serving() as network,
+        open_browser(tmp_path / "profile") as browser,
+        browser.open_page() as tab,
+    ):
+        with ExitStack() as ended:
+            yield tab, network, ended, ended.enter_context(pages(page, network))
+
+
+@asynccontextmanager
+async def shown_scripted(tmp_path: Path) -> AsyncIterator[tuple[Page, Network, ScriptedDaemon]]:
+    """A tab with the page, ready over the network on a scripted daemon."""
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        daemon = ended.enter_context(ScriptedDaemon(tmp_path))
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, daemon.socket, *options))
+        network.target = gateway.port
+        await tab.show(url(origin))
+        await tab.until(SAID, lambda text: text.startswith("ready: "))
+        yield tab, network, daemon
+
+
+def url(origin: str) -> str:
+    """The page's address; it takes no gateway from a link."""
+    return f"{origin}/plate.html?gateway=http://127.0.0.1:1/#{TOKEN}"
+
+
+@pytest.mark.real_time
+async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
+    """Armed and touched over a cut network; after a new daemon and gateway it follows, disarmed,
+    and says that its lease was lost.
+    """
+    async with shown(tmp_path) as (tab, network, ended, origin):
+
+        async def until_said(start: str) -> None:
+            await tab.until(SAID, lambda text: text.startswith(start))
+
+        with gateway_process(tmp_path, tmp_path / "era.sock", "--allow-origin", origin) as gateway:
+            network.target = gateway.port
+            with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+                wait_for_state(era, "READY_TO_SWITCH_ON")
+                await tab.show(url(origin))
+                await until_said("ready: ")
+                await tab.click("#arm")
+                await until_said("on: armed by 'my application'")
+                x, y, width, height = await tab.evaluate(
+                    "(({x, y, width, height}) => [x, y, width, height])"
+                    "(document.querySelector('#plate').getBoundingClientRect())"
+                )
+                await tab.touch("touchStart", [(x + width / 4, y + height / 2)])
+                await tab.until(FELT, lambda text: text.startswith("played by "))
+                rig = era.hello("test").rig
+                # what is felt may have expired on a busy machine, until the page repeats it
+                (contact,) = await asyncio.to_thread(wait_for, lambda: era.status().contacts)
+                assert contact.x_m == pytest.approx(rig.length_m / 4, abs=2e-3)
+                assert contact.y_m == pytest.approx(rig.width_m / 2, abs=2e-3)
+                network.cut()
+                await until_said("no connection: ")
+                network.restore()
+                await until_said("on: armed by 'my application'")
+                await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) < 4.2)
+                await asyncio.to_thread(wait_for, lambda: (era.status().lease_left_s or 0) > 4.5)
+                await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+            await until_said("no connection: daemon")
+            with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+                await until_said("ready: ")
+                await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+                await tab.until(FELT, lambda text: "lease" in text)
+                assert era.status().armed_by is None
+                gateway.terminate()
+                await until_said("no connection: unreachable")
+                again = ("--allow-origin", origin, "--listen", f"127.0.0.1:{gateway.port}")
+                ended.enter_context(gateway_process(tmp_path, socket, *again))
+                await until_said("ready: ")
+                await tab.touch("touchEnd", [])
+                await asyncio.to_thread(wait_for, lambda: not era.status().contacts)
+
+
+@pytest.mark.real_time
+def test_program_holds_fingers_and_prints_what_plays(tmp_path: Path) -> None:
+    """It arms, plays and leaves the daemon disarmed."""
+    with real_daemon(tmp_path) as socket, Client.connect(socket) as era:
+        wait_for_state(era, "READY_TO_SWITCH_ON")
+        done = subprocess.run(
+            [sys.executable, FOLDER / "follow.py", "0.22,0.16", "0.08,0.06"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "ERA_HAPTICS_SOCKET": str(socket)},
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "on: armed by 'follow'\n" in done.stdout
+        assert "played by " in done.stdout
+        assert era.status().state == "READY_TO_SWITCH_ON"
+        assert not era.status().contacts
+
+
+@pytest.mark.real_time
+async def test_page_leaves_a_silent_network_and_repeats_no_arm(tmp_path: Path) -> None:
+    """A pending arm is given up with the connection; the page subscribes anew."""
+    async with shown_scripted(tmp_path) as (tab, network, daemon):
+        with daemon.holding():
+            await tab.click("#arm")
+            await asyncio.to_thread(wait_for, lambda: "arm" in daemon.methods)
+            network.mute()
+            async with asyncio.timeout(PATIENCE / 6):
+                await tab.until(SAID, lambda text: "gateway" in text or "no connection" in text)
+            network.restore()
+            await tab.until(SAID, lambda text: text.startswith("ready: "))
+        cut = StateEvent(
+            old="READY_TO_SWITCH_ON", new="FAULT", cause="a cable was cut", remedy=None, epoch=1
+        )
+        daemon.publish("state", cut)
+        await tab.until(f"{SAID} === 'fault: a cable was cut'")
+        assert daemon.methods.count("arm") == 1
+
+
+@pytest.mark.real_time
+async def test_stop_of_a_page_needs_nothing_that_old_browsers_lack(tmp_path: Path) -> None:
+    """Without AbortSignal.timeout it goes both ways; where HTTP throws, over the WebSocket."""
+    async with shown_scripted(tmp_path) as (tab, _, daemon):
+        await tab.evaluate("delete AbortSignal.timeout")
+        await tab.click("#stop")
+        await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 2)
+        await tab.evaluate("window.fetch = () => { throw new Error('none'); }; undefined")
+        await tab.click("#stop")
+        await asyncio.to_thread(wait_for, lambda: daemon.methods.count("stop") == 3)
+
+
+@pytest.mark.real_time
+async def test_page_that_loses_its_user_lifts_and_disarms(tmp_path: Path) -> None:
+    """Lifted once hidden, disarmed once left or closed, and by its button without a WebSocket.
+
+    Before it has chosen a layout by the gateway's module.
+    """
+    async with shown(tmp_path) as (tab, network, ended, origin):
+        (tmp_path / "layout.yaml").write_text("elsewhere: null\n", "utf-8")
+        layouts = "layouts: {home: layout.yaml, climate: layout.yaml}\n"
+        socket = ended.enter_context(real_daemon(tmp_path, layouts))
+        era = ended.enter_context(Client.connect(socket))
+        wait_for_state(era, "READY_TO_SWITCH_ON")
+        era.subscribe("state")
+        options = ("--allow-origin", origin)
+        gateway = ended.enter_context(gateway_process(tmp_path, socket, *options))
+        network.target = gateway.port
+        opened = (
+            "(async () => {"
+            f"  const {{ Connection }} = await import('http://127.0.0.1:{network.port}/connection.js');"
+            "  await new Promise((opened) => {"
+            f"    window.own = new Connection('{TOKEN}', ['state'], {{ opened }}); }});"
+            "  await own.arm('own');"
+            "})()"
+        )
+
+        async def until_disarmed() -> None:
+            """By a call; a lease that runs out has another cause."""
+            causes = (told.data["cause"] for told in era.events(timeout=PATIENCE))
+            assert await asyncio.to_thread(any, (each.startswith("disarmed by") for each in causes))
+            await asyncio.to_thread(wait_for_state, era, "READY_TO_SWITCH_ON")
+
+        for end in ("own.socket.close(); own.disarm()", "own.close()"):
+            await tab.show(url(origin))
+            await tab.until(SAID, lambda text: text.startswith("ready: "))
+            await tab.evaluate(opened)
+            assert era.status().armed_by is not None
+            assert (await tab.evaluate("own.layout('climate')"))["layout"] == "climate"
+            await tab.evaluate(end)
+            await until_disarmed()
+        await tab.until("own.socket.readyState === WebSocket.CLOSED")
+        await tab.click("#arm")
+        await asyncio.to_thread(wait_for_state, era, "OPERATION_ENABLED")
+        x, y = await tab.evaluate(
+            "(({x, y}) => [x + 50, y + 50])"
+            "(document.querySelector('#plate').getBoundingClientRect())"
+        )
+        await tab.touch("touchStart", [(x, y)])
+        await asyncio.to_thread(wait_for, lambda: len(era.status().contacts) == 1)
+        await tab.evaluate(
+            "Object.defineProperty(document, 'hidden', { value: true });"
+            "document.dispatchEvent(new Event('visibilitychange'))"
+        )
+        await asyncio.to_thread(wait_for, lambda: not era.status().contacts)
+        await tab.call("Page.navigate", url="about:blank")
+        await until_disarmed()

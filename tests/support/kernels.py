@@ -31,7 +31,7 @@ TESTS = (
     "tests/docs/test_pages.py",
     "tests/docs/test_pages.py",
     "tests/examples/test_examples.py",
-    "tests/integration/test_demo.py",
+    "tests/integration/test_four_amplifiers.py",
 )
 MAX_CONTRAST = 1e-3
 """Difference of contrast [dB] that rounding may make."""

@@ -1,14 +1,28 @@
-"""Worker processes that die, and those whose program does."""
+"""Worker processes that die, and those whose program does.
 
+Versions of code and numbers that results carry.
+
+Clusters, choices and quantities.
+"""
+
+import json
+import math
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
+from model import caching, processes
+from model.arrays import NEARLY, best_along, best_by, best_first, best_of, best_rows, ranked_by
+from model.caching import NUMERICS_VERSION, code_version
 from model.errors import InputError
-from model.processes import on_processes
+from model.processes import on_cluster, on_processes
+from model.quantities import in_display_unit, percent, with_error
+from reference_figures import RECORD, reference_figures
 
 
 def die(shared: int, task: int) -> None:
@@ -38,3 +52,212 @@ def test_workers_end_with_a_program_that_is_killed() -> None:
         [sys.executable, "-c", program], capture_output=True, env=environment, timeout=60
     )
     assert done.returncode == -signal.SIGKILL
+
+
+REMEDY = "increase NUMERICS_VERSION and run python tests/support/reference_figures.py"
+
+
+def test_numerics_version_changes_when_figures_change():
+    """Recorded figures are those of this code to rounding, and of this NUMERICS_VERSION."""
+    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    assert record["numerics_version"] == NUMERICS_VERSION, REMEDY
+    found = reference_figures()
+    assert found.keys() == record["figures"].keys()
+    for name, values in record["figures"].items():
+        tolerance = {"atol": 2e-3} if name.endswith("_db") else {"rtol": 2e-6}
+        np.testing.assert_allclose(found[name], values, err_msg=f"{name}: {REMEDY}", **tolerance)
+
+
+def test_code_version_changes_with_the_source(monkeypatch, tmp_path):
+    """One more space in a module is another version."""
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "module.py").write_text("a = 1", encoding="utf-8")
+    monkeypatch.setattr(caching.resources, "files", lambda package: tmp_path)
+    first = code_version.__wrapped__()
+    (tmp_path / "inner" / "module.py").write_text("a =  1", encoding="utf-8")
+    assert code_version.__wrapped__() != first
+
+
+TASKS = {number: number for number in range(6)}
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """A scheduler with two workers, each a process of its own; no dashboard.
+
+    Forked off a process that has loaded Dask: loading takes each a second.
+    """
+    import dask
+    from distributed import LocalCluster
+
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as running,
+    ):
+        yield running.scheduler_address
+
+
+def test_cluster_yields_every_result_of_other_processes(address: str) -> None:
+    """Each task once, with its number, solved elsewhere with what all of them share."""
+    found = dict(on_cluster(address, divmod, 17, {n: n + 1 for n in TASKS}))
+    assert found == {n: (17 // (n + 1), 17 % (n + 1)) for n in TASKS}
+    assert os.getpid() not in dict(on_cluster(address, _process, None, TASKS)).values()
+
+
+def _process(shared: None, task: int) -> int:
+    return os.getpid()
+
+
+def test_cluster_without_workers_is_refused() -> None:
+    """Waiting for ever for a worker to come is no answer."""
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(n_workers=0, dashboard_address=":0") as empty,
+        pytest.raises(InputError, match="has no workers"),
+    ):
+        dict(on_cluster(empty.scheduler_address, divmod, 1, TASKS))
+
+
+@pytest.mark.long
+def test_cluster_gives_up_on_a_task_that_kills_its_workers(address: str, monkeypatch) -> None:
+    """A task that ends whichever worker takes it, as one does for which memory is too short."""
+    from distributed import Client
+
+    monkeypatch.setattr(
+        processes, "_run_same_code", lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    )
+    with Client(address, set_as_default=False) as client:
+        client.run_on_scheduler(_allow_failures, 0)
+    with pytest.raises(InputError, match="memory"):
+        dict(on_cluster(address, divmod, 1, {0: 1}))
+
+
+def _allow_failures(count, dask_scheduler):
+    """How many workers a task may cost, on the scheduler."""
+    dask_scheduler.allowed_failures = count
+
+
+def test_cluster_without_dask_names_the_extra(monkeypatch) -> None:
+    """The error names the extra to install."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"\[cluster\]"):
+        dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
+
+
+def test_cluster_without_scheduler_is_refused(monkeypatch) -> None:
+    """Nothing listens at the address: the error says so, and how to start one."""
+    monkeypatch.setattr(processes, "_CONNECT_TIMEOUT", 0.2)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1 "):
+        dict(on_cluster("tcp://127.0.0.1:1", divmod, 1, TASKS))
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "foo://x:1", "tcp://host", "tcp://host:port"])
+def test_address_that_dask_would_hang_over_is_refused(text: str) -> None:
+    """It never reaches Dask."""
+    with pytest.raises(InputError, match="dask scheduler"):
+        dict(on_cluster(text, divmod, 1, TASKS))
+
+
+def test_every_worker_checks_its_code() -> None:
+    """Nothing is called on a worker that joins later, with other code."""
+    with pytest.raises(InputError, match="same era-haptics"):
+        processes._run_same_code("0.0.1+123456789abc", pytest.fail, "called")
+
+
+def test_the_first_of_the_nearly_equal_best_is_chosen():
+    """Whatever rounding adds to scores that are equal, of any sign, along any axis."""
+    for scores in ([1.0, 3.0, 2.0, 3.0], [-5.0, -1.0, -2.0, -1.0], [0.0, np.inf, 1.0, np.inf]):
+        for seed in range(20):
+            rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 4)
+            rounded = np.array(scores) * rounding
+            assert best_of(rounded) == 1
+            assert best_along(np.column_stack([rounded, rounded[::-1]]), axis=0).tolist() == [1, 0]
+            assert best_along(rounded[None], axis=1).tolist() == [1]
+
+
+def test_what_is_better_by_more_than_rounding_is_chosen():
+    """However little more."""
+    assert best_of([1.0, 1 + 3 * NEARLY]) == 1
+    assert best_first([1.0, 1 + 3 * NEARLY]).tolist() == [1, 0]
+
+
+def test_an_order_keeps_nearly_equal_scores_as_they_came():
+    """Best first, and of none there is an empty one."""
+    for seed in range(20):
+        rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, 5)
+        assert best_first([2.0, 7.0, 2.0, 0.0, 7.0] * rounding).tolist() == [1, 4, 0, 2, 3]
+    assert best_first([1.0, np.inf, -np.inf, np.inf]).tolist() == [1, 3, 0, 2]
+    assert best_first([]).tolist() == []
+
+
+def test_best_rows_are_the_same_whatever_rounding_adds():
+    """Three of five in each column, the highest first, of nearly equal ones the first."""
+    scores = np.array([[2.0, -4.0], [7.0, -1.0], [2.0, -1.0], [0.0, -9.0], [7.0, -4.0]])
+    for seed in range(20):
+        rounding = 1 + NEARLY / 4 * np.random.default_rng(seed).uniform(-1, 1, scores.shape)
+        assert best_rows(scores * rounding, 3).T.tolist() == [[1, 4, 0], [1, 2, 0]]
+
+
+def test_items_are_chosen_and_ranked_by_their_scores():
+    """Of those with nearly equal lengths the first one first."""
+    items = ["aa", "b", "cc", "ddd", "eee"]
+    assert best_by(items, lambda item: len(item) + NEARLY * (item == "eee")) == "ddd"
+    assert ranked_by(items, lambda item: len(item) + NEARLY * (item == "cc")) == [
+        "ddd",
+        "eee",
+        "aa",
+        "cc",
+        "b",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "digits", "expected"),
+    [
+        (70e9, "Pa", 3, "70 GPa"),
+        (19041.2, "N/m", 5, "19.041 kN/m"),
+        (0.0015, "m", 3, "1.5 mm"),
+        (0.012006, "kg", 2, "12 g"),
+        (4.8489, "N s/m", 3, "4.85 N s/m"),
+        (0.01302, "", 2, "0.013"),
+        (1.2, "m", 3, "1200 mm"),
+        (0.9996, "m", 3, "1000 mm"),
+        (117e3, "N/m", 2, "117 kN/m"),
+    ],
+)
+def test_in_display_unit_scales_to_giga_kilo_or_milli(
+    value: float, unit: str, digits: int, expected: str
+) -> None:
+    """Giga, kilo and milli where plates have them; any other unit as it is, and none without."""
+    assert in_display_unit(value, unit, digits=digits) == expected
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(1.43, "143 %"), (0.124, "12 %"), (0.0999, "10 %"), (0.0123, "1.2 %"), (0.0, "0 %")],
+)
+def test_percent_has_two_significant_digits(share: float, expected: str) -> None:
+    """Whole per cents from ten on, below with two digits."""
+    assert percent(share) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "expected"),
+    [
+        (74.0241e9, 0.8712e9, "Pa", "74.02 ± 0.87 GPa"),
+        (0.0130284, 2.72e-5, "", "0.013028 ± 0.000027"),
+        (0.0119941, 0.000996, "kg", "12.0 ± 1.0 g"),
+        (1231.4, 217.0, "Hz", "1231 ± 217 Hz"),
+        (1.25, math.inf, "", "1.25 ± inf"),
+        (1.0, 0.0, "m", "1000 ± 0 mm"),
+    ],
+)
+def test_with_error_shows_no_digit_below_two_of_the_error(
+    value: float, error: float, unit: str, expected: str
+) -> None:
+    """Value and error have the same decimals, in the unit of plates."""
+    assert with_error(value, error, unit) == expected
+    assert with_error(value, error, unit, sign="+") == f"+{expected}"

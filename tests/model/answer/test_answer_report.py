@@ -1,0 +1,346 @@
+"""Exposure of fingers, weighted as for the hand.
+
+Concentration of a vibration: of fields with a known answer, and of a table's patterns.
+
+Onsets, endings and transient measures of a table's patterns.
+
+Questions to the table from the command line and from Python.
+"""
+
+import errno
+import json
+import re
+from dataclasses import replace
+from math import pi
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from model.answer.answer_report import (
+    Timing,
+    cell_centres,
+    concentration_of,
+    exposures,
+    hand_weighting,
+    measures,
+    query_batch,
+)
+from model.answer.plan import query
+from model.answer.stimulus import Finger, Placement
+from model.arrays import lattice
+from model.cli import app
+from model.commands.table_cli import query as table_cli_query
+from model.errors import InputError
+from model.finger import detection_threshold, fingertip_points, is_beyond
+from model.reduction.reduced_plate import reduce_plate
+from model.rig.rig import Uncertainty
+from model.structure.attachments import footprints_of
+from model.table.table_file import build_table, save_table
+from model.transients.base_motion import ramped_ending, ramped_onset, shaped
+from model.transients.shaping import Shaper, Transients
+from model.transients.time_response import plate_in_time
+from plates import make_paper_rig, smooth_rig, smooth_table
+from set_table import only, wants
+from set_table import phased as answer
+
+PUBLISHED = {
+    6.3: 0.727, 8: 0.873, 10: 0.951, 12.5: 0.958, 16: 0.896, 20: 0.782, 25: 0.647, 31.5: 0.519,
+    40: 0.411, 50: 0.324, 63: 0.256, 80: 0.202, 100: 0.160, 125: 0.127, 160: 0.101, 200: 0.0799,
+    250: 0.0634, 315: 0.0503, 400: 0.0398, 500: 0.0314, 630: 0.0245, 800: 0.0186, 1000: 0.0135,
+    1250: 0.00894,
+}  # fmt: skip
+"""Factors of ISO 5349-1:2001, table A.2, at the nominal frequencies of third octaves [Hz]."""
+
+
+def test_weighting_is_that_of_the_standard():
+    """Its table is of the exact frequencies, 10^(n/10)."""
+    nominal = np.array([*PUBLISHED])
+    exact = 10 ** (np.round(10 * np.log10(nominal)) / 10)
+    assert hand_weighting(exact) == pytest.approx([*PUBLISHED.values()], rel=5e-3)
+
+
+def test_exposure_is_the_weighted_root_mean_square_of_all_that_a_finger_feels():
+    """By levels above threshold: of a content alone, of what leaks, and of two together.
+
+    A finger's own content counts at its loudest point, up to 6 dB above the mean of its level.
+    """
+    table = smooth_table()
+    found = answer(table, [wants((0.09, 0.07)), wants((0.25, 0.18))], [Finger((0.16, 0.20))])
+    weighted = []
+    for layer in found.layers:
+        f = np.array([layer.frequency])
+        weighted.append(float(hand_weighting(f)[0] * detection_threshold(f)[0] / np.sqrt(2)))
+    first, second, quiet = exposures(table, found)
+    for exposure, each, own in zip((first, second), found.fingers, weighted, strict=False):
+        mean = own * 10 ** (each.promised_level_db_sl / 20)
+        assert mean < exposure < 2.5 * mean
+    heard = 10 ** (found.fingers[2].foreign_level_db_sl / 20)
+    assert min(weighted) * heard <= quiet <= max(weighted) * heard
+    louder = answer(
+        table,
+        [wants((0.09, 0.07), level_db_sl=26.0), wants((0.25, 0.18), level_db_sl=26.0)],
+        [Finger((0.16, 0.20))],
+    )
+    assert exposures(table, louder) == pytest.approx(
+        [10 ** (6 / 20) * each for each in (first, second, quiet)], rel=1e-3
+    )
+
+
+TARGET = (0.15, 0.12)
+PLATE = smooth_rig().plate
+AREA = PLATE.length * PLATE.width
+POINTS = cell_centres(PLATE)
+NEAR = np.hypot(*(POINTS - TARGET).T) <= 0.05
+CIRCLE = pi * 0.05**2
+
+
+def concentration(*amplitudes, frequencies=(100.0,)):
+    """Concentration of amplitudes (f, p) at the centres of cells, 1 m/s² at the target."""
+    field = np.array(amplitudes, dtype=float)
+    return concentration_of(
+        np.array(frequencies), field, ~is_beyond(POINTS, [TARGET]), felt=1.0, plate=PLATE
+    )
+
+
+def test_concentration_weighs_energy_and_sums_amplitudes_over_frequencies():
+    """Half the frequency is four times the energy; two quarters of the target make a half."""
+    found = concentration(NEAR, ~NEAR, frequencies=(100.0, 200.0))
+    assert found.energy_share_near == pytest.approx(4 / (4 + (AREA / CIRCLE - 1)), rel=0.01)
+    left = POINTS[:, 0] < PLATE.length / 2
+    for amplitude, area in ((0.249, 0.0), (0.251, AREA / 2)):
+        found = concentration(amplitude * left, amplitude * left, frequencies=(100.0, 200.0))
+        assert found.area_above_half == pytest.approx(area, rel=0.01)
+
+
+def test_concentration_on_a_plate_within_five_centimetres():
+    """Where nothing is farther away, all of it is around the target."""
+    small = replace(PLATE, length=0.06, width=0.06)
+    points = cell_centres(small)
+    near = ~is_beyond(points, [(0.03, 0.03)])
+    found = concentration_of(
+        np.array([100.0]), np.full((1, len(points)), 0.5), near, felt=1.0, plate=small
+    )
+    assert found.contrast_95_db == pytest.approx(20 * np.log10(2))
+    assert found.energy_share_near == pytest.approx(1.0)
+
+
+def test_concentration_agrees_with_points_counted_one_by_one():
+    """Two targets, from points 1.7 mm apart; with quiet fingers there is no concentration."""
+    table = smooth_table()
+    places = ((0.09, 0.08), (0.24, 0.14))
+    answer = query(table, Placement(places), drive_mode="phased")
+    layer = answer.layers[0]
+    points = lattice(*(np.arange(0.0008, side, 0.0017) for side in (PLATE.length, PLATE.width)))
+    frequencies, amplitudes = table.amplitudes(layer.excitation, points)
+    energy = ((amplitudes / frequencies[:, None]) ** 2).sum(axis=0)
+    peak = amplitudes.sum(axis=0)
+    discs = [fingertip_points(*place, PLATE) for place in places]
+    felt = min(table.amplitudes(layer.excitation, disc)[1].sum(axis=0).mean() for disc in discs)
+    near = np.min([np.hypot(*(points - place).T) for place in places], axis=0) <= 0.05
+    far = np.sort(peak[~near])
+    found = measures(table, answer).concentration
+    assert found is not None
+    contrast = 20 * np.log10(felt / far[int(0.95 * len(far))])
+    assert found.contrast_95_db == pytest.approx(contrast, abs=0.1)
+    assert found.area_above_half == pytest.approx((peak > felt / 2).mean() * AREA, rel=0.02)
+    assert found.energy_share_near == pytest.approx(energy[near].sum() / energy.sum(), abs=0.01)
+    answer = query(table, Placement(places[:1], places[1:]), drive_mode="phased")
+    assert measures(table, answer).concentration is None
+
+
+PLACED = Placement(((0.09, 0.07),), ((0.25, 0.18), (0.05, 0.19)))
+
+
+@pytest.fixture(scope="module")
+def rig():
+    """A mesh that is quick to solve, and weightless fingers, as on the plate in time."""
+    known = replace(Uncertainty.none(), gain=0.05, phase_deg=5.0)
+    return replace(make_paper_rig(24, 18), fingertip=None, uncertainty=known)
+
+
+@pytest.fixture(scope="module")
+def table(rig):
+    """A few frequencies are enough to choose among."""
+    return build_table(rig, frequencies=np.array([90.0, 130.0, 220.0, 300.0]), drive_mode="phased")
+
+
+@pytest.fixture(scope="module")
+def solved(rig):
+    """The same plate solved in time without the table."""
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras), frequency_max=300.0)
+    return Transients(plate_in_time(reduced, rig.eras))
+
+
+def test_transient_measures_agree_with_another_solution_of_the_plate(rig, table, solved):
+    """Measures of ramps and envelopes agree; envelopes do better with the same excitation."""
+    timing = Timing(table)
+    plain, _ = only(table, PLACED, drive_mode="phased")
+    shaped_layer = timing.with_envelopes(plain, PLACED)
+    assert plain.onset is plain.ending is None
+    ramps = (
+        ramped_onset(plain.excitation, rig.eras, ramp=0.040),
+        ramped_ending(plain.excitation, rig.eras, ramp=0.040),
+    )
+    envelopes = (shaped(shaped_layer.onset, rig.eras), shaped(shaped_layer.ending, rig.eras))
+    found = []
+    for layer, (onset, ending) in ((plain, ramps), (shaped_layer, envelopes)):
+        contrast = solved.contrast_db(onset, targets=PLACED.targets, quiet=PLACED.quiet)
+        left = solved.residual_db(layer.excitation, ending)
+        both = timing.transient_contrast_db(layer, PLACED), timing.residual_db(layer, PLACED)
+        found.append(both)
+        assert found[-1][0] == pytest.approx(contrast, abs=0.1)
+        assert found[-1][1] == pytest.approx(left, abs=0.2)
+    assert found[1][0] > found[0][0] + 3
+    assert found[1][1] < found[0][1] - 10
+    assert shaped_layer.excitation == plain.excitation
+
+
+@pytest.mark.parametrize("quiet", [(), ((0.25, 0.18), (0.005, 0.1))])
+def test_envelopes_are_those_of_fingertips_read_point_by_point(table, quiet):
+    """Knots within a per mille of the largest, at an edge of the plate as well."""
+    placed = replace(PLACED, quiet=quiet)
+    layer, _ = only(table, placed, drive_mode="phased")
+    found = Timing(table).with_envelopes(layer, placed)
+    shaper = Shaper(table.in_time, gain_variance=table.uncertainty.gain_variance)
+    onset = shaper.onset(found.excitation, targets=placed.targets, quiet=quiet)
+    largest = max(each.largest for each in onset.values())
+    for name, each in onset.items():
+        np.testing.assert_allclose(found.onset[name].knots, each.knots, atol=1e-3 * largest)
+
+
+def test_transient_measures_without_quiet_fingers(table):
+    """There is no contrast; what is left after the end is known all the same."""
+    alone, timing = Placement(((0.09, 0.07),)), Timing(table)
+    layer = timing.with_envelopes(only(table, alone, drive_mode="phased")[0], alone)
+    assert timing.transient_contrast_db(layer, alone) is None
+    assert timing.residual_db(layer, alone) < -20
+
+
+def test_query_batch_has_knots_only_with_envelopes(table):
+    """21 and 8 knots for every ERA, from silence to the pattern and back; else null."""
+    line = {"target": [0.09, 0.07], "quiet": [[0.25, 0.18]]}
+    plain, with_knots = query_batch(
+        table, [json.dumps(line), json.dumps(line | {"envelopes": True})]
+    )
+    before, after = plain["transient_contrast_db"], with_knots["transient_contrast_db"]
+    (plain,), (with_knots,) = plain["layers"], with_knots["layers"]
+    assert plain["onset"] is plain["ending"] is None
+    assert {len(each["knots"]) for each in with_knots["onset"].values()} == {21}
+    assert {len(each["knots"]) for each in with_knots["ending"].values()} == {8}
+    assert {each["start"]["level"] for each in with_knots["onset"].values()} == {0.0}
+    for era, tone in with_knots["drive"].items():
+        start = with_knots["ending"][era]["start"]
+        assert start["level"] == pytest.approx(tone["level"])
+        assert start["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        last = with_knots["onset"][era]["knots"][-1]
+        assert last["level"] == pytest.approx(tone["level"])
+        assert last["phase_deg"] == pytest.approx(tone["phase_deg"], abs=1e-6)
+        assert with_knots["onset"][era]["frequency_hz"] == tone["frequency_hz"]
+        assert with_knots["ending"][era]["knots"][-1]["level"] == 0
+    assert after > before
+
+
+RUNNER = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def table_file(tmp_path_factory):
+    """The table on disk."""
+    path = tmp_path_factory.mktemp("tables") / "t.npz"
+    save_table(smooth_table(), path)
+    return path
+
+
+def test_a_line_of_a_batch_is_read_key_by_key():
+    """Targets, quiet fingers, mode, level and loads."""
+    line = (
+        '{"targets": [[0.1, 0.1], [0.2, 0.2]], "quiet": [[0.05, 0.02]], "mode": "switched",'
+        ' "level_db_sl": 15, "loads": [1, 2, 0.5]}'
+    )
+    (found,) = query_batch(smooth_table(), [line])
+    placed = Placement(((0.1, 0.1), (0.2, 0.2)), ((0.05, 0.02),), (1.0, 2.0, 0.5))
+    layer, felt = only(smooth_table(), placed, 15.0, drive_mode="switched")
+    assert found["layers"][0]["drive"] == smooth_table().drive_of(layer.excitation)
+    assert found["layers"][0]["fingers"] == [0, 1]
+    assert found["fingers"][0]["promised_contrast_db"] == felt.promised_contrast_db
+
+
+BAD_LINES = {
+    "nonsense": r'such as \{"target".*Invalid JSON',
+    "[]": r'such as \{"target".*object',
+    '{"target": [0.1]}': "target",
+    '{"target": [0.1, 0.1], "loud": 3}': "loud",
+    '{"target": [0.1, "x"]}': "target.1",
+    '{"target": [0.1, 0.1], "targets": [[0.2, 0.1]]}': "target must be given without targets",
+    "{}": "at least one finger",
+}
+
+
+def test_a_bad_line_of_a_batch_is_refused():
+    """The key that is wrong is named."""
+    found = list(query_batch(smooth_table(), BAD_LINES))
+    for number, (answer, named) in enumerate(zip(found, BAD_LINES.values(), strict=True), start=1):
+        assert answer["line"] == number
+        assert re.search(named, answer["error"])
+
+
+@pytest.mark.parametrize("has_errors", [True, False])
+def test_batch_answers_line_by_line(table_file, tmp_path, has_errors):
+    """An error has its line's number and makes status 1; empty lines are skipped."""
+    batch = tmp_path / "b.jsonl"
+    good = '{"target": [0.1, 0.1], "quiet": [[0.2, 0.15]], "mode": "phased"}\n\n'
+    batch.write_text(good * 2 + 'oops\n{"target": [9, 9]}\n' * has_errors)
+    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", str(batch)])
+    assert result.exit_code == has_errors
+    first, second, *errors = map(json.loads, result.stdout.splitlines())
+    assert first["layers"][0]["mode"] == second["layers"][0]["mode"] == "phased"
+    assert [each["line"] for each in errors] == [5, 6][: len(errors)]
+    assert all("error" in each for each in errors)
+    assert len(errors) == 2 * has_errors
+
+
+def test_batch_reads_standard_input(table_file):
+    """`-` is no file of that name: what another program writes is answered."""
+    line = '{"target": [0.1, 0.1], "mode": "phased"}\n'
+    result = RUNNER.invoke(app, ["table", "query", str(table_file), "--batch", "-"], input=line)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["layers"][0]["mode"] == "phased"
+
+
+def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monkeypatch):
+    """As in `era table query TABLE --batch FILE | head`: the error is of the answers' pipe."""
+    batch = tmp_path / "b.jsonl"
+    batch.write_text('{"target": [0.1, 0.1]}\n')
+    broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    monkeypatch.setattr("builtins.print", broken)
+    with pytest.raises(BrokenPipeError):
+        table_cli_query(table_file, batch=batch)
+
+
+def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):
+    """Level, mode and envelopes of the command hold where a line leaves them out."""
+    batch = tmp_path / "b.jsonl"
+    place = '"target": [0.1, 0.1], "quiet": [[0.2, 0.15]]'
+    own = '"mode": "switched", "level_db_sl": 9, "envelopes": false'
+    batch.write_text("{" + place + "}\n{" + place + ", " + own + "}\n")
+    options = "--level 14 --mode phased --envelopes"
+    command = ["table", "query", str(table_file), "--batch", str(batch), *options.split()]
+    result = RUNNER.invoke(app, command)
+    default, given = map(json.loads, result.stdout.splitlines())
+    for found, level in ((default, 14.0), (given, 9.0)):
+        assert found["fingers"][0]["promised_level_db_sl"] == pytest.approx(level)
+    (shaped,), (plain,) = default["layers"], given["layers"]
+    assert (shaped["mode"], plain["mode"]) == ("phased", "switched")
+    assert shaped["onset"] is not None
+    assert plain["onset"] is None
+
+
+def test_batch_refuses_a_file_that_is_not_utf_8(table_file, tmp_path):
+    """The error names the option."""
+    (tmp_path / "b.jsonl").write_bytes(b"\xff\xfe")
+    command = ["table", "query", str(table_file), "--batch", str(tmp_path / "b.jsonl")]
+    result = RUNNER.invoke(app, command)
+    assert isinstance(result.exception, InputError)
+    assert "--batch" in str(result.exception)

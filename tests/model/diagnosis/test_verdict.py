@@ -1,4 +1,12 @@
-"""Diagnosis from responses that another solver computes for a known truth.
+"""Which resonance, feet and exciters the file of a weekend's board has, and the board has not.
+
+A board on exciters as sold: sound ones pass, and each mistake of a maker is named.
+
+Which side a board's grain runs along: boards of a weekend, drawn as their parts deviate.
+
+Whether measured responses can be of one plate, and of which polarity.
+
+Diagnosis from responses that another solver computes for a known truth.
 
 Truth comes from one sparse solve a frequency (`model.fem`), the comparison from the
 reduced plate. Gains of 5 % and 5 degrees at random and noise of 2 % of each row are in every
@@ -6,29 +14,388 @@ measurement.
 """
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import controller.cli.rig_cli
 import plates
+from benchmarks.identification.mistakes import on_glue
+from benchmarks.weekend.chain import FOLDER, BuiltBoard
+from controller.cli.main import run
 from long_form import shortly
-from model.calibration.calibrate import MAX_OUTLIERS
+from model.arrays import FloatArray
+from model.calibration.calibrate import MAX_OUTLIERS, calibrate
 from model.calibration.fit import sensed_plate, without_outliers
-from model.calibration.responses import Responses, read_measured, responses_of
+from model.calibration.responses import Responses, read_measured, responses_of, write_responses
 from model.diagnosis import causes
 from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
-from model.diagnosis.plate_match import MAX_FIT_ERROR, match_plate
-from model.diagnosis.verdict import Verdict, check_consistency, diagnose
+from model.diagnosis.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate, phases_of_drive
+from model.diagnosis.verdict import (
+    Verdict,
+    check_consistency,
+    check_meaning,
+    diagnose,
+    judged_by_promises,
+)
 from model.errors import InputError
 from model.fem import Mesh
+from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from plates import DISTORTIONS, noise_like, random_gains
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
+from model.structure.exciter import Exciter
+from plates import DISTORTIONS, exciter_rig, make_paper_rig, noise_like, perturbed, random_gains
+from plates import measured as plates_measured
+
+TONES = np.arange(91.0, 300.0, 20.0)
+NAMES = ("NE", "NW", "SW", "SE")
+
+
+def given_as(which: str, resonance: float = 306.0) -> Rig:
+    """The board of the page, whose file has a resonance, by default its sheet's, as one of both."""
+    keys = {"resonance": resonance, "resonance_is": which}
+    return load_rig(FOLDER / "rig.yaml").replaced(eras=dict.fromkeys(NAMES, keys))
+
+
+def measured(rig: Rig, seed: int) -> Responses:
+    """What one moved sensor reads of a board whose parts deviate, at every place or at four."""
+    found = BuiltBoard.drawn(rig, seed).measured(TONES, seed)
+    return found if seed % 2 else found.without(np.arange(12) % 3 > 0)
+
+
+@pytest.mark.parametrize(
+    ("true", "written", "glued"), [("free", "mounted", 60), ("mounted", "free", 306)]
+)
+def test_the_other_resonance_is_named_before_anything_is_fitted(
+    true: str, written: str, glued: int
+) -> None:
+    """Six boards: 306 Hz of a coil of 1.29 g are 306 sqrt(1.29 / 33.5) = 60 Hz of a magnet."""
+    said = rf"^resonance_is of NE, NW, SW, SE must be {true}, got {written}: .* at {glued} Hz"
+    for seed in range(6):
+        with pytest.raises(InputError, match=said):
+            check_consistency(given_as(written), measured(given_as(true), seed))
+
+
+def test_wiring_is_judged_by_the_right_resonance() -> None:
+    """Nothing is called reversed or loose, but two exchanged plugs are found."""
+    found = measured(given_as("free"), 3)
+    swapped = replace(found, values=found.values[:, [0, 2, 1, 3]])
+    verdict = diagnose(given_as("mounted"), swapped)
+    first, second, *others = verdict_rows(verdict)
+    assert first.startswith("RESONANCE: resonance_is of NE, NW, SW, SE must be free, got mounted")
+    assert second.startswith("SWAPPED: channel 1 of amplifier card (ERA NW in the rig)")
+    assert others == []
+    assert not verdict.is_well
+    assert as_json(verdict)["plate"]["resonance_is"] == dict.fromkeys(NAMES, "free")
+
+
+def test_a_resonance_that_differs_little_is_refused_with_what_is_at_a_bound() -> None:
+    """60 Hz of the magnet, given as of its coil, are 12 Hz: from 91 Hz on both move alike."""
+    found, rig = measured(given_as("free"), 1), given_as("free", 60.0)
+    with pytest.raises(InputError, match=r"^stiffness of .* 10 times it.* resonance_is"):
+        calibrate(rig, found, check_consistency(rig, found))
+
+
+def test_feet_of_another_kind_are_refused_at_their_bound(tmp_path: Path) -> None:
+    """Of foam below the board and of rubber in its file, ten times as stiff or more."""
+    text = (FOLDER / "rig.yaml").read_text(encoding="utf-8")
+    (tmp_path / "rig.yaml").write_text(text.replace("foam", "rubber"), encoding="utf-8")
+    found, rubber = measured(given_as("free"), 1), load_rig(tmp_path / "rig.yaml")
+    with pytest.raises(InputError, match=r"^stiffness of feet .* 0\.1 times it"):
+        calibrate(rubber, found, check_consistency(rubber, found))
+
+
+def test_a_dead_exciter_is_no_calibrated_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file would say that it moves the plate: exit status 1, and what to type instead."""
+    found, made = measured(given_as("free"), 1), tmp_path / "made.yaml"
+    values = found.values.copy()
+    values[:, 2] *= 1e-4
+    write_responses(tmp_path / "m.uff", replace(found, values=values), given_as("free"))
+    assert run(["calibrate", str(FOLDER / "rig.yaml"), f"{tmp_path}/m.uff", "-o", str(made)]) == 1
+    said = "".join(capsys.readouterr())
+    assert "SW did not; no rig is written. Find out why by era rig check" in said
+    assert "Next:" not in said
+    assert not made.exists()
+
+
+EXCITERS_CHECKED_TONES = np.arange(41.0, 300.0, 20.0)
+PLACES = np.array([(0.3 * x, 0.23 * y) for x in (0.1, 0.4, 0.88) for y in (0.15, 0.5, 0.85)])
+PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"
+
+
+def as_sold(rig: Rig, seed: int) -> Rig:
+    """A board of another rigidity (10 %) with exciters whose parts differ (20 %, 10 degrees)."""
+    rng = np.random.default_rng(seed)
+
+    def factor(deviation: float) -> float:
+        return float(np.exp(deviation * rng.standard_normal()))
+
+    eras = tuple(
+        replace(
+            era,
+            stiffness=factor(0.2) * era.in_time.stiffness,
+            magnet_mass=factor(0.2) * getattr(era, "magnet_mass"),  # noqa: B009
+            force_factor=factor(0.2) * getattr(era, "force_factor"),  # noqa: B009
+            gains=((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),),
+        )
+        for era in rig.eras
+    )
+    return replace(rig, plate=rig.plate.scaled(modulus=factor(0.1)), eras=eras)
+
+
+def checked(
+    seed: int,
+    *,
+    loose: int | None = None,
+    glue: float = 0.0,
+    wired: FloatArray | None = None,
+) -> Verdict:
+    """A board checked by nine sensors with 0.5 % of noise.
+
+    glue [N/m]: of the loose exciter; wired (e, s): signs of what is read.
+    """
+    rig = exciter_rig("type: DAEX25FHE-4, power: 1 W", frequency="[40, 300]", more=PARTS)
+    true = as_sold(rig, seed)
+    assert isinstance(rig.mesh, SpectralMesh)
+    sources = [
+        on_glue(era, glue) if number == loose and isinstance(era, Exciter) else era
+        for number, era in enumerate(true.eras)
+    ]
+    values = direct_spectral_acceleration(
+        true.plate, rig.mesh, sources, EXCITERS_CHECKED_TONES, PLACES, loads=true.masses
+    )
+    values = values / np.array([era.full_level for era in rig.eras])[:, None]
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    noise = np.random.default_rng([seed, 1]).standard_normal((2, *values.shape))
+    values = values + 0.005 * size * (noise[0] + 1j * noise[1])
+    signs = np.ones(values.shape[1:]) if wired is None else wired
+    names = tuple(f"P{number}" for number in range(1, len(PLACES) + 1))
+    return diagnose(rig, Responses(names, PLACES, EXCITERS_CHECKED_TONES, signs * values))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_sound_board_of_parts_as_sold_is_well(seed: int) -> None:
+    """Gains and force factors that are 20 % off together are no weak exciter, nor another plate."""
+    assert verdict_rows(checked(seed)) == ["ALL WELL: plate and channels match the rig"]
+
+
+@pytest.mark.parametrize("glue", [600.0, 4000.0])
+def test_exciter_whose_glue_is_off_is_loose_and_nothing_else(glue: float) -> None:
+    """By its dynamic stiffness, or by how its gain rises; its size may be that of a weak one."""
+    verdict = checked(5, loose=2, glue=glue)
+    assert [channel.states[0] for channel in verdict.channels] == ["well", "well", "loose", "well"]
+    rows = verdict_rows(verdict)
+    assert rows[0].startswith("LOOSE: channel 2 of amplifier card (ERA NE in the rig)")
+    assert not any(row.startswith("PLATE") for row in rows)
+
+
+def test_exciter_wired_backwards_and_sensor_upside_down_are_told_apart() -> None:
+    """One has the opposite sign at every sensor, the other under every exciter."""
+    signs = np.ones((4, len(PLACES)))
+    signs[1] *= -1
+    signs[:, 4] *= -1
+    verdict = checked(6, wired=signs)
+    assert [channel.states for channel in verdict.channels] == [
+        ("well",), ("inverted",), ("well",), ("well",)
+    ]  # fmt: skip
+    (sensor,) = verdict.bad_sensors
+    assert sensor.name == "P5"
+    assert "upside down" in sensor.why
+
+
+def test_shapes_that_are_alike_beyond_rounding_have_no_error() -> None:
+    """A MAC of one place is 1 but for rounding, as 1 + 2.2e-16."""
+    assert ShapeMatch(np.full((3, 1, 1), 1 + 2.3e-16), (0.0, 0.0)).error == 0.0
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The board of the page, grain along its length."""
+    return load_rig(FOLDER / "rig.yaml")
+
+
+@pytest.fixture(scope="module")
+def across(rig: Rig) -> Rig:
+    """The same cut the other way."""
+    return rig.replaced(plate={"grain": "width"})
+
+
+@pytest.fixture(scope="module")
+def turned(across: Rig) -> Responses:
+    """Measured on a board that is cut the other way."""
+    return measured(across, 1)
+
+
+def test_boards_cut_as_their_file_says_are_not_accused(rig: Rig) -> None:
+    """Twenty whose parts deviate as bought ones do, half of them by four of the twelve places."""
+    for seed in range(20):
+        check_meaning(rig, measured(rig, seed))
+
+
+def test_boards_cut_the_other_way_are_accused_of_that_alone(rig: Rig, across: Rig) -> None:
+    """Ten, before anything is fitted in full."""
+    for seed in range(10):
+        with pytest.raises(InputError, match=r"^plate\.grain must be width, got length: "):
+            check_consistency(rig, measured(across, seed))
+
+
+def test_the_other_side_is_named_and_wiring_is_judged_on_the_board_itself(
+    across: Rig, rig: Rig
+) -> None:
+    """The file says width, the board has length, and two plugs are exchanged: both are said."""
+    found = measured(rig, 3)
+    verdict = diagnose(across, replace(found, values=found.values[:, [0, 2, 1, 3]]))
+    first, second = verdict_rows(verdict)[:2]
+    assert first.startswith("GRAIN: plate.grain must be length, got width: ")
+    assert second.startswith("SWAPPED: channel 1 of amplifier card (ERA NW in the rig)")
+    assert not verdict.is_well
+    assert as_json(verdict)["plate"]["grain"]["found"] == "length"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "calibrate {rig} {file} -o {made}",
+        "rig identify {rig} --measured {file} -o {made}",
+        "rig identify {rig} --yes -o {made}",
+        "rig check {rig} --measured {file}",
+    ],
+)
+def test_commands_say_so_and_write_no_rig(
+    command: str,
+    turned: Responses,
+    rig: Rig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """By a file, and of what amplifiers would have measured."""
+    here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
+    monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
+    file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
+    write_responses(file, turned, rig)
+    typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)
+    assert run(typed.split()) != 0
+    assert "plate.grain must be width, got length" in "".join(capsys.readouterr())
+    assert not made.exists()
+
+
+FREQUENCIES = np.arange(60.0, 421.0, 40.0)
+
+NAMED = {
+    "g": "9.80665",
+    "velocity": "velocity in m/s",
+    "displacement": "displacement in m",
+    "opposite": "SW, SE, NE and NW",
+    "conjugated": "exp",
+    "swapped_channels": "SW and SE",
+    "swapped_sensors": "P1 at that of P6, P6 at that of P1",
+    "two_sensors": "got 2",
+}
+"""By distortion, what the refusal names."""
+
+
+@pytest.fixture(scope="module")
+def consistency_rig() -> Rig:
+    """The paper's plate on a coarse mesh."""
+    return make_paper_rig(16, 12)
+
+
+@pytest.fixture(scope="module")
+def responses(consistency_rig: Rig) -> Responses:
+    """Of a plate within a builder's tolerances, with 1 % noise."""
+    return plates_measured(
+        perturbed(consistency_rig, frequencies=FREQUENCIES), frequencies=FREQUENCIES
+    )
+
+
+@pytest.mark.parametrize(
+    "name", shortly(DISTORTIONS, ["g", "velocity", "displacement", "two_sensors"])
+)  # the errors of the others are provoked in tests/errors
+def test_distorted_responses_are_refused_by_their_cause(
+    consistency_rig: Rig, responses: Responses, name: str
+) -> None:
+    """Each distortion alone, with its own cause named."""
+    with pytest.raises(InputError, match=NAMED[name]):
+        check_consistency(consistency_rig, DISTORTIONS[name](responses))
+
+
+def test_plate_of_another_length_is_refused_by_its_length(
+    consistency_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate that is a fifth longer than the rig's, sensors where they are said to be.
+
+    Of few sizes and causes; whole searches are tested with diagnoses.
+    """
+    monkeypatch.setattr(causes, "_SIZES", (0.82, 1.21))
+    monkeypatch.setattr(causes, "_FITTED_CAUSES", 3)
+    monkeypatch.setattr(causes, "_REFINED_CAUSES", 1)
+    monkeypatch.setattr(causes, "_REFINEMENTS", 3)
+    plate = replace(consistency_rig.plate, length=1.2 * consistency_rig.plate.length)
+    eras = tuple(replace(era, x=1.2 * era.x) for era in consistency_rig.eras)
+    longer = replace(
+        consistency_rig, plate=plate, eras=eras, mesh=Mesh(16, 12, plate.length, plate.width)
+    )
+    found = plates_measured(perturbed(longer, frequencies=FREQUENCIES), frequencies=FREQUENCIES)
+    with pytest.raises(InputError, match=r"plate\.length"):
+        check_consistency(consistency_rig, found)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "sign"), [(0.0, 1), (80.0, 1), (-80.0, 1), (100.0, -1), (-100.0, -1), (180.0, -1)]
+)
+def test_phases_of_drive_inverts_beyond_a_quarter_turn(degrees: float, sign: int) -> None:
+    """Measured is what was predicted, turned by an angle; that is found, and the nearer sign."""
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((5, 1, 4)) + 1j * rng.standard_normal((5, 1, 4))
+    turned = predicted * np.exp(1j * math.radians(degrees))
+    observation = Responses(
+        tuple("ABCD"), np.zeros((4, 2)), np.arange(5.0), turned, has_phases=True
+    )
+    (phase,) = phases_of_drive(observation, predicted)
+    assert phase.degrees == pytest.approx(degrees, abs=1e-6)
+    assert phase.sign == sign
+    assert phase.confidence == pytest.approx(1.0)
+
+
+def verdict_on(consistency_rig: Rig, *, loss: float, stiffness: float) -> Verdict:
+    """Verdict on a plate with these factors, from responses of the sparse solve."""
+    eras = tuple(replace(era, stiffness=stiffness * era.stiffness) for era in consistency_rig.eras)
+    plate = replace(consistency_rig.plate, loss_factor=loss * consistency_rig.plate.loss_factor)
+    truth = replace(consistency_rig, plate=plate, eras=eras)
+    responses = plates_measured(truth, frequencies=FREQUENCIES, noise=0.005)
+    return judged_by_promises(diagnose(consistency_rig, responses), consistency_rig)
+
+
+def test_plate_with_more_loss_and_less_stiffness_has_a_verdict_of_its_own() -> None:
+    """60 % more loss and 20 % less stiffness: wiring well, both named."""
+    verdict = verdict_on(make_paper_rig(16, 12), loss=1.6, stiffness=0.8)
+    assert verdict.wiring_matches
+    told = as_json(verdict)
+    assert told["wiring_matches"]
+    assert told["plate"]["changes"]["loss_factor"] == pytest.approx(0.6, abs=0.15)
+    assert told["plate"]["changes"]["stiffness"] == pytest.approx(-0.2, abs=0.03)
+
+
+def test_plate_as_written_costs_nothing() -> None:
+    """The rig's own plate: no change of more than 5 %, and more than nine of ten promises kept."""
+    verdict = verdict_on(make_paper_rig(16, 12), loss=1.0, stiffness=1.0)
+    assert verdict.is_well
+    assert verdict.changes is not None
+    assert max(map(abs, verdict.changes.values())) < 0.05
+    assert verdict.kept_share is not None
+    assert verdict.kept_share > 0.9
+
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
-FREQUENCIES = np.linspace(57.0, 487.0, 10)
+DIAGNOSIS_FREQUENCIES = np.linspace(57.0, 487.0, 10)
 
 
 def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
@@ -52,13 +419,13 @@ def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
     return replace(rig, plate=plate, eras=eras)
 
 
-def measured(truth: Rig, rng: np.random.Generator) -> Responses:
+def diagnosis_measured(truth: Rig, rng: np.random.Generator) -> Responses:
     """Responses with the gains and the noise of every measurement."""
     eras = tuple(
-        replace(era, gains=random_gains(rng, FREQUENCIES, size=0.05, phase=np.radians(5)))
+        replace(era, gains=random_gains(rng, DIAGNOSIS_FREQUENCIES, size=0.05, phase=np.radians(5)))
         for era in truth.eras
     )
-    return plates.measured(replace(truth, eras=eras), frequencies=FREQUENCIES, noise=0.02)
+    return plates.measured(replace(truth, eras=eras), frequencies=DIAGNOSIS_FREQUENCIES, noise=0.02)
 
 
 def states(verdict: Verdict) -> dict[str, tuple[str, ...]]:
@@ -86,7 +453,7 @@ def solved_once():
 def built(coarse_rig: Rig) -> Responses:
     """Responses of one plate within tolerance."""
     rng = np.random.default_rng(7)
-    return measured(within_tolerance(coarse_rig, rng), rng)
+    return diagnosis_measured(within_tolerance(coarse_rig, rng), rng)
 
 
 @pytest.mark.parametrize("seed", shortly(range(2), [0]))
@@ -96,7 +463,7 @@ def test_diagnose_passes_a_plate_within_tolerance_and_finds_a_swap(coarse_rig, s
     A dead sensor and one that is upside down and half are named and left out of the first verdict.
     """
     rng = np.random.default_rng(1000 + seed)
-    built = measured(within_tolerance(coarse_rig, rng), rng)
+    built = diagnosis_measured(within_tolerance(coarse_rig, rng), rng)
     broken, values = built.values.copy(), built.values.copy()
     broken[:, :, 5] = 1e-9
     broken[:, :, 2] *= -0.5
@@ -309,7 +676,7 @@ def test_diagnose_names_what_explains_another_plate(coarse_rig, what, value, wit
     """The first of the explanations is the truth, its value within what is uncertain otherwise."""
     rng = np.random.default_rng(11)
     truth = changed(within_tolerance(coarse_rig, rng), what)
-    verdict = diagnose(coarse_rig, measured(truth, rng))
+    verdict = diagnose(coarse_rig, diagnosis_measured(truth, rng))
     assert not verdict.plate_matches
     first = verdict.explanations[0]
     assert first.cause.key == what
@@ -321,7 +688,7 @@ def test_diagnose_finds_a_swap_on_another_plate(coarse_rig, monkeypatch):
     """Exchanged channels on a plate with other springs: both are found, of few sizes."""
     monkeypatch.setattr(causes, "_SIZES", (0.82, 1.21))
     rng = np.random.default_rng(13)
-    built = measured(changed(coarse_rig, "eras.stiffness"), rng)
+    built = diagnosis_measured(changed(coarse_rig, "eras.stiffness"), rng)
     exchanged = replace(built, values=built.values[:, [0, 2, 1, 3]])
     verdict = diagnose(coarse_rig, exchanged)
     assert verdict.swapped == (("SE", "NE"),)
@@ -347,7 +714,7 @@ def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
     """Two sensors, three frequencies, or no channel at all."""
     with pytest.raises(InputError, match=r"at least 3 sensors .* got 2"):
         diagnose(coarse_rig, DISTORTIONS["two_sensors"](built))
-    few = replace(built, frequencies=FREQUENCIES[:3], values=built.values[:3])
+    few = replace(built, frequencies=DIAGNOSIS_FREQUENCIES[:3], values=built.values[:3])
     with pytest.raises(InputError, match="got 3"):
         diagnose(coarse_rig, few)
     with pytest.raises(InputError, match="driven"):
@@ -412,7 +779,7 @@ def test_chance_counts_all_values(coarse_rig, built):
 def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
     """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
     rng = np.random.default_rng(1003)
-    built = measured(longer(within_tolerance(coarse_rig, rng), 1.03), rng)
+    built = diagnosis_measured(longer(within_tolerance(coarse_rig, rng), 1.03), rng)
     plate = sensed_plate(coarse_rig, built.points, built.frequencies)
     match = match_plate(plate, built.values, drives=range(4))
     used = without_outliers(built.values, match.predicted)[-1]

@@ -1,6 +1,14 @@
-"""The free plate with anything attached to it, against the direct solve of the same mesh."""
+"""The free plate with anything attached to it, against the direct solve of the same mesh.
 
-from dataclasses import replace
+The plate in a few coordinates: against the full one, its slopes, modes and what was left out.
+
+A plate with a part that stays as its thickness changes: a mass along its edges, as a double.
+
+Modes that differ from a plate's theory, and a loss factor that varies, in every solution.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -8,12 +16,37 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from benchmarks.direct_plate import direct_acceleration
+from model.arrays import FloatArray
+from model.calibration.fit import sensed_plate
+from model.config.document import ConfigError
 from model.errors import InputError
-from model.fem import ELEMENTS, Mesh, assemble
-from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.spectral.modes import SpectralMesh
-from model.structure.attachments import Era, PointLoad
-from model.structure.plate import Laminate, LaminateLayer, Plate
+from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
+from model.finger import Grid
+from model.identification.forward import ForwardModel, Sensor
+from model.identification.parameters import space_of
+from model.reduction import free_plate
+from model.reduction.free_plate import (
+    FreePlate,
+    SpectralModes,
+    solve_free_plate,
+    truncation_weights,
+)
+from model.reduction.reduced_plate import (
+    SupportedModes,
+    modal_matrices,
+    place_slopes,
+    reduce_free_plate,
+    reduce_plate,
+    supported_modes,
+)
+from model.rig.rig import Rig, Uncertainty
+from model.rig.rig_file import example_rig_path, load_rig, parse_rig
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh, local_compliance
+from model.structure.attachments import Era, PointLoad, damping_from_ratio, footprints_of
+from model.structure.plate import LOSS_FREQUENCY, Laminate, LaminateLayer, Plate
+from model.study.verification import verify_table
+from model.table.table_file import TableProblem, build_table, table_following
 from model.vibration import natural_modes
 from plates import ALUMINIUM, LENGTH, WIDTH, make_paper_rig
 
@@ -205,3 +238,366 @@ def test_receptances_of_a_thicker_plate(free):
     found = free.receptances(places, points, frequencies, loads=loads, thickness=h)
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, theirs / h**3, atol=1e-9 * np.abs(ours).max())
+
+
+PLATE = Plate(LENGTH, WIDTH, 0.0015, ALUMINIUM)
+MESH = Mesh(6, 5, LENGTH, WIDTH, ELEMENTS["Q4"], 0.003)
+CORNERS = [(0.0, 0.0), (LENGTH, 0.0), (LENGTH, WIDTH), (0.0, WIDTH)]
+INSIDE = [(0.051, 0.017), (0.29, 0.08), (0.12, WIDTH)]
+
+
+@pytest.mark.parametrize("places", [CORNERS, [*INSIDE, INSIDE[0]]])
+def test_reduced_plate_response_equals_direct_solve(places):
+    """Its equations, solved frequency by frequency, are within 3e-5.
+
+    Relative L2 over the plate, against the direct solve of the same mesh.
+    Two ERAs at one place need the same static vectors: one set of them is dropped.
+    """
+    eras = [
+        Era(f"E{n}", x, y, 17000.0 * (n + 1), 3.0, 0.004 * n, 1e-4)
+        for n, (x, y) in enumerate(places)
+    ]
+    frequencies = np.array([31.7, 68.1, 110.0, 250.0, 444.0, 500.0])
+    reduced = reduce_plate(PLATE, MESH, footprints_of(eras))
+    touch, observe = reduced.at(footprints_of(eras)), reduced.at(MESH.nodes)
+    direct = direct_acceleration(assemble(PLATE, MESH), eras, frequencies, MESH.nodes)
+    for row, omega in enumerate(2 * np.pi * frequencies):
+        spring = np.array([era.stiffness + 1j * omega * era.damping for era in eras])
+        attached = spring - omega**2 * np.array([era.bolt_mass for era in eras])
+        dynamic = np.diag((1 + 0.01j) * reduced.omega**2 - omega**2) + (touch.T * attached) @ touch
+        answer = -(omega**2) * observe @ np.linalg.solve(dynamic, touch.T * spring * 1e-4)
+        error = np.linalg.norm(answer.T - direct[row], axis=1)
+        error /= np.linalg.norm(direct[row], axis=1)
+        assert error.max() < 3e-5
+
+
+def test_projection_carries_motion_to_another_reduction():
+    """To more points nothing is lost; to fewer, or others, it is the mass-weighted projection.
+
+    Which is the same seen from either side, and exact at the points that both answer for.
+    """
+    small = reduce_plate(PLATE, MESH, np.array(CORNERS))
+    large = small.with_attachments_at(np.array(INSIDE))
+    other = small.with_attachments_at(np.array([[0.2, 0.1]]))
+    up, down = large.projection_from(small), small.projection_from(large)
+    np.testing.assert_allclose(up.T @ up, np.eye(len(small.omega)), atol=1e-9)
+    np.testing.assert_allclose(down, up.T, atol=1e-9)
+    np.testing.assert_allclose(
+        large.at(MESH.nodes) @ up,
+        small.at(MESH.nodes),
+        atol=1e-8 * np.abs(small.at(MESH.nodes)).max(),
+    )
+    across = other.projection_from(large)
+    np.testing.assert_allclose(across, large.projection_from(other).T, atol=1e-9)
+    through_small = other.projection_from(small) @ down
+    np.testing.assert_allclose(across @ up, through_small @ up, atol=1e-9)
+    assert np.linalg.norm(across - through_small) > 0.1
+
+
+SIDES = np.array([0.3, 0.2])
+WAVES = np.array([[20.0, 0.0], [35.0, -60.0], [0.0, 90.0]])  # rad/m
+
+
+def test_slopes_are_those_of_waves() -> None:
+    """Inside, beside edges and at corners, to 2e-6 of the wave number, from points on the plate."""
+    places = np.array([[0.1, 0.05], [0.0, 0.12], [0.3, 0.2], [1e-7, 0.2], [0.12, 0.2 - 1e-7]])
+    places = np.column_stack([places, np.full(len(places), 0.01)])
+
+    def field(at: FloatArray) -> FloatArray:
+        assert ((at[:, :2] >= 0) & (at[:, :2] <= SIDES)).all()
+        assert (at[:, 2] == 0.01).all()
+        return np.asarray(np.sin(at[:, :2] @ WAVES.T))
+
+    exact = np.cos(places[:, :2] @ WAVES.T)[:, None] * WAVES.T
+    np.testing.assert_allclose(place_slopes(field, places, SIDES), exact, atol=2e-6 * 90)
+
+
+LARGEST = 1 / 4.0e7  # the lowest truncated mode at about 1 kHz
+
+
+def approximation(zeta, u, terms):
+    """Sum of the weights times (u / u_c)^j."""
+    powers = (u[:, None] / LARGEST) ** np.arange(1, terms + 1)
+    return powers @ truncation_weights(np.array([zeta]), LARGEST, terms)[0]
+
+
+def error_bound(zeta, terms):
+    """1 / |T_k(t)| at t = 2 / (u_c zeta) - 1, by |T_k| = |cosh(k arccosh t)|."""
+    return 1 / abs(np.cosh(terms * np.arccosh(2 / (LARGEST * complex(zeta)) - 1)))
+
+
+@pytest.mark.parametrize("terms", [1, 3, 4, 8])
+@pytest.mark.parametrize("zeta", [1e3, 1e6, 1e7, 1e7 - 1e5j, 3e7])
+def test_truncation_weights_reach_the_error_of_a_chebyshev_polynomial(zeta, terms):
+    """Over the whole interval the relative error reaches its bound and does not exceed it."""
+    u = LARGEST * np.linspace(1e-6, 1, 2001)
+    exact = u / (1 - zeta * u)
+    error = np.abs(approximation(zeta, u, terms) / exact - 1).max()
+    bound = error_bound(zeta, terms)
+    assert error < 1.001 * bound + 1e-11
+    assert error > 0.9 * bound or bound < 1e-9
+
+
+def modes_of(rig: Rig, *, frequency_max: float) -> SupportedModes:
+    """Those of a rig's plate on its mesh."""
+    attached = footprints_of(rig.eras)
+    reduced = reduce_plate(rig.plate, rig.mesh, attached, frequency_max=frequency_max)
+    return supported_modes(reduced, rig.eras, frequency_max=frequency_max)
+
+
+def test_damping_ratio_of_a_rigid_plate_as_by_hand() -> None:
+    """Bouncing has the ratio zeta, tilting nearly sqrt(3) times that.
+
+    Mass m on four corners of k and c = 2 zeta sqrt(k m / 4): bouncing 4 c / (2 sqrt(4 k m)).
+    Tilting along a side b has the inertia m (b² + h²) / 12, and k b², c b².
+    """
+    rig = make_paper_rig(12, 9)
+    plate = replace(rig.plate, thickness=0.03, loss_factor=0.0)  # bends at a thousand hertz
+    damping = damping_from_ratio(0.05, stiffness=17000.0, plate_mass=plate.mass, era_count=4)
+    eras = tuple(replace(era, damping=damping) for era in rig.eras)
+    mesh = Mesh.accurate(plate, frequency_max=100.0)
+    found = modes_of(replace(rig, plate=plate, eras=eras, mesh=mesh), frequency_max=100.0)
+    tilting = [
+        0.05 * np.sqrt(3 / (1 + (plate.thickness / side) ** 2))
+        for side in (plate.width, plate.length)
+    ]
+    np.testing.assert_allclose(found.damping_ratios, [0.05, *tilting], rtol=2e-3)
+    bouncing = np.sqrt(4 * 17000.0 / plate.mass) / (2 * np.pi)
+    np.testing.assert_allclose(found.natural_frequencies[0], bouncing, rtol=1e-3)
+
+
+FRAME = 0.053  # kg
+FREQUENCIES = np.arange(60.0, 301.0, 20.0)
+POINTS = np.array([[0.08, 0.06], [0.2, 0.15]])
+
+
+@dataclass(frozen=True)
+class Framed(Plate):
+    """A plate with a mass [kg] along its edges, on the nodes of a mesh there."""
+
+    frame_mass: float = 0.0
+
+
+def assemble_framed(plate: Plate, mesh: Mesh) -> PlateMatrices:
+    """The plate's matrices, with its frame."""
+    found = assemble(plate, mesh)
+    if not isinstance(plate, Framed):
+        return found
+    at_edge = np.isclose(mesh.nodes, 0) | np.isclose(mesh.nodes, [plate.length, plate.width])
+    nodes = np.flatnonzero(at_edge.any(axis=1))
+    frame = np.zeros(mesh.dof)
+    frame[3 * nodes] = plate.frame_mass / len(nodes)
+    return replace(found, mass=sparse.csc_array(found.mass + sparse.diags_array(frame)))
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """The paper's rig with a frame, in finite elements."""
+    monkeypatch.setattr(free_plate, "assemble", assemble_framed)
+    plain = make_paper_rig(24, 18)
+    own = {each.name: getattr(plain.plate, each.name) for each in fields(plain.plate)}
+    return replace(plain, plate=Framed(**own, frame_mass=FRAME))
+
+
+def receptance(free: FreePlate, rig: Rig, thickness: float = 1.0) -> FloatArray:
+    """Sizes of the response at POINTS to forces at the ERAs, on their springs."""
+    places = np.array([(era.x, era.y) for era in rig.eras])
+    loads = [PointLoad(era.x, era.y, stiffness=era.stiffness) for era in rig.eras]
+    _, found = free.receptances(places, POINTS, FREQUENCIES, loads=loads, thickness=thickness)
+    return np.abs(found)
+
+
+@pytest.mark.parametrize(("frame", "least", "most"), [(FRAME, 0.03, 0.5), (0.0, 0.0, 0.01)])
+def test_scaling_is_wrong_with_a_frame_alone(
+    rig: Rig, frame: float, least: float, most: float
+) -> None:
+    """Against the plate solved anew 2 % thicker: the law that is refused is off by per cents."""
+    plate = replace(rig.plate, frame_mass=frame)
+    solved = solve_free_plate(plate, rig.mesh)
+    rigid_mode = solved.modes.shapes_at(POINTS)[:, 0]
+    assert rigid_mode == pytest.approx((plate.mass + frame) ** -0.5)
+    exact = receptance(solve_free_plate(plate.scaled(thickness=1.02), rig.mesh), rig)
+    scaled = receptance(replace(solved, plate=make_paper_rig(24, 18).plate), rig, 1.02)
+    error = np.linalg.norm(scaled - exact) / np.linalg.norm(exact)
+    assert least <= error <= most
+    if frame:
+        with pytest.raises(InputError, match=r"plate\.frame_mass"):
+            receptance(solved, rig, 1.02)
+    np.testing.assert_allclose(receptance(solved, rig), receptance(solved, rig, 1.0))
+
+
+def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
+    """Tables of an uncertain thickness, those that follow another, identification, calibration."""
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*set uncertainty"):
+        TableProblem(rig, FREQUENCIES, Grid(2, 2))
+    known = replace(rig, uncertainty=Uncertainty.none())
+    table = build_table(known, frequencies=FREQUENCIES[:2])
+    assert table_following(table, known).plate == known.plate
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*set uncertainty"):
+        _ = replace(table, uncertainty=rig.uncertainty).attached
+    for other in (
+        rig.plate.scaled(thickness=1.001),
+        rig.plate.scaled(modulus=1.001),
+        replace(rig.plate, frame_mass=2 * FRAME),
+    ):
+        with pytest.raises(InputError, match=r"plate\.frame_mass.*build"):
+            table_following(table, replace(known, plate=other))
+    free = solve_free_plate(rig.plate, rig.mesh)
+    sensors = [Sensor("SW", era="SW")]
+    space = space_of(rig, ["SW"], rig.uncertainty)
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
+        ForwardModel(rig, sensors, FREQUENCIES, space, free)
+    with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
+        sensed_plate(known, POINTS, FREQUENCIES)
+    assert ForwardModel(
+        known, sensors, FREQUENCIES, space_of(known, ["SW"], known.uncertainty), free
+    )
+
+
+MODE_DEVIATIONS_FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
+DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
+MODE_DEVIATIONS_POINTS = np.array([[0.05, 0.04], [0.2, 0.11]])
+
+
+@pytest.fixture(scope="module")
+def mode_deviations_rig() -> Rig:
+    """The paper's plate with three modes off its theory, and a loss that rises with frequency."""
+    rig = load_rig(example_rig_path())
+    plate = replace(rig.plate, loss_exponent=0.4, mode_deviations=DEVIATIONS)
+    return replace(rig, plate=plate)
+
+
+def test_only_the_modes_named_change_the_receptance(mode_deviations_rig: Rig) -> None:
+    """The receptance changes by that of three oscillators with stiffness and loss of their own."""
+    plain = replace(
+        mode_deviations_rig, plate=replace(mode_deviations_rig.plate, mode_deviations=())
+    )
+    solved = [
+        solve_free_plate(each.plate, each.mesh, frequency_max=500.0)
+        for each in (mode_deviations_rig, plain)
+    ]
+    found, before = (
+        free.receptances(
+            MODE_DEVIATIONS_POINTS, MODE_DEVIATIONS_POINTS, MODE_DEVIATIONS_FREQUENCIES
+        )[0]
+        for free in solved
+    )
+    modes = solved[0].modes
+    elastic = np.sort(modes.eigenvalues)[3:6]
+    omega = 2 * np.pi * MODE_DEVIATIONS_FREQUENCIES
+    eta = (
+        mode_deviations_rig.plate.loss_factor
+        * (MODE_DEVIATIONS_FREQUENCIES / LOSS_FREQUENCY) ** 0.4
+    )
+    expected = before.copy()
+    for eigenvalue, (shift, loss) in zip(elastic, DEVIATIONS, strict=True):
+        phi = modes.shapes_at(MODE_DEVIATIONS_POINTS)[
+            :, np.flatnonzero(modes.eigenvalues == eigenvalue)[0]
+        ]
+        for factor, more, sign in ((np.exp(shift), np.exp(loss), 1), (1.0, 1.0, -1)):
+            oscillator = 1 / ((1 + 1j * eta * more) * eigenvalue * factor - omega**2)
+            expected += sign * oscillator[:, None, None] * np.outer(phi, phi)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_loss_varies_alike_in_modes_and_in_a_direct_solution(mode_deviations_rig: Rig) -> None:
+    """Modal and direct accelerations agree where the loss factor rises with frequency."""
+    plate = replace(mode_deviations_rig.plate, mode_deviations=())
+    assert isinstance(mode_deviations_rig.mesh, SpectralMesh)
+    direct = direct_spectral_acceleration(
+        plate,
+        mode_deviations_rig.mesh,
+        mode_deviations_rig.eras,
+        MODE_DEVIATIONS_FREQUENCIES,
+        MODE_DEVIATIONS_POINTS,
+    )
+    free = solve_free_plate(plate, mode_deviations_rig.mesh, frequency_max=500.0)
+    found = free.acceleration(
+        mode_deviations_rig.eras, MODE_DEVIATIONS_FREQUENCIES, MODE_DEVIATIONS_POINTS
+    )
+    np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
+
+
+def test_a_table_is_verified_with_them(mode_deviations_rig: Rig) -> None:
+    """Its fields and one answer are those of the plate anew, not of the plate in theory."""
+    table = build_table(mode_deviations_rig)
+    assert verify_table(table, mode_deviations_rig, samples=1).failed_count == 0
+    other = replace(
+        mode_deviations_rig, plate=replace(mode_deviations_rig.plate, mode_deviations=())
+    )
+    checks = verify_table(table, other, samples=1).content
+    assert not any(check.is_passed for check in checks)
+
+
+def test_plate_in_time_has_them(mode_deviations_rig: Rig) -> None:
+    """Steady vibration of the viscous plate in time is that of the hysteretic one within 1 %."""
+    reduced = reduce_plate(
+        mode_deviations_rig.plate, mode_deviations_rig.mesh, footprints_of(mode_deviations_rig.eras)
+    )
+    M, C, K = modal_matrices(reduced, mode_deviations_rig.eras)
+    free = solve_free_plate(
+        mode_deviations_rig.plate, mode_deviations_rig.mesh, frequency_max=500.0
+    )
+    expected = free.acceleration(
+        mode_deviations_rig.eras, MODE_DEVIATIONS_FREQUENCIES, MODE_DEVIATIONS_POINTS
+    )[:, 0]
+    era = mode_deviations_rig.eras[0]
+    forces = reduced.at(footprints_of(mode_deviations_rig.eras[:1]))[0]
+    for row, omega in enumerate(2 * np.pi * MODE_DEVIATIONS_FREQUENCIES):
+        base = (era.stiffness + 1j * omega * era.damping) * era.stroke
+        moved = np.linalg.solve(K + 1j * omega * C - omega**2 * M, forces * base)
+        found = -(omega**2) * (reduced.at(MODE_DEVIATIONS_POINTS) @ moved)
+        error = np.linalg.norm(found - expected[row]) / np.linalg.norm(expected[row])
+        assert error < 0.01
+
+
+@pytest.mark.parametrize("wrong", ["loss_exponent: 3", "modes: [[1.5, 1]]", "modes: [[1, 0]]"])
+def test_rig_file_refuses_what_is_no_deviation(wrong: str) -> None:
+    """Exponents and deviations beyond what a plate may have are refused where they are read."""
+    text = example_rig_path().read_text()
+    with pytest.raises(ConfigError):
+        parse_rig("rig.yaml", text.replace("loss_factor:", f"{wrong}\n  loss_factor:"))
+
+
+MODE_DEVIATIONS_PLATE = replace(make_paper_rig(12, 9).plate, loss_factor=0.0)
+PLACES = np.array([(0.13, 0.11, 0), (0.17, 0, 0), (LENGTH, WIDTH, 0), (0.05, 0.06, 0.01)])
+
+# ln 10 / (2 pi kappa G h) with kappa 5/6 and G = 70 GPa / 2.66, at a point inside; on an edge and
+# at a corner its images double it once and twice; a disc ends the logarithm.
+DECADE = math.log(10) / (2 * math.pi * 5 / 6 * 70e9 / 2.66 * 0.0015)
+DECADES = DECADE * np.array([1, 2, 4, 0])
+
+
+def plates():
+    """The paper's plate without damping in polynomials, and the softer one."""
+    free = solve_free_plate(
+        MODE_DEVIATIONS_PLATE, SpectralMesh(12, 9, LENGTH, WIDTH), frequency_max=500.0
+    )
+    assert isinstance(free.modes, SpectralModes)
+    return free, replace(free, modes=free.modes.softer())
+
+
+def test_softer_plate_gives_way_by_a_fifth_and_a_decade_more():
+    """Under slow forces: a fifth of the unresolved compliance, and a decade under points."""
+    free, softer = plates()
+    (stiff, to_points), (soft, to_softer_points) = (
+        plate.receptances(PLACES, PLACES, np.array([5.0])) for plate in (free, softer)
+    )
+    assert pytest.approx(1.1e-8, rel=0.05) == DECADE
+    expected = 0.2 * local_compliance(MODE_DEVIATIONS_PLATE, (12, 9), PLACES, PLACES) + np.diag(
+        DECADES
+    )
+    np.testing.assert_allclose((soft - stiff)[0].real, expected, rtol=1e-3, atol=1e-13)
+    np.testing.assert_allclose(
+        (to_softer_points - to_points)[0].real, expected, rtol=1e-3, atol=1e-13
+    )
+
+
+def test_softer_plate_can_be_reduced():
+    """Its reduction has the same receptance, as that of the plate itself."""
+    _, softer = plates()
+    exact, _ = softer.receptances(PLACES, PLACES, np.array([5.0]))
+    reduced = reduce_free_plate(softer, PLACES)
+    shapes = reduced.at(PLACES)
+    found = shapes / (reduced.omega**2 - (10 * math.pi) ** 2) @ shapes.T
+    np.testing.assert_allclose(found, exact[0].real, rtol=1e-5)

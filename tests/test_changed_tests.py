@@ -43,7 +43,7 @@ def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
 def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     """Over imports within tests/support; a page over its name, whatever folder names it."""
     assert nearest(["tests/support/set_table.py"]).keys() >= importing("set_table")
-    assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_page.py"] == 0
+    assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_summary.py"] == 0
     assert nearest(["tests/test_docs_site.py"]) == {"tests/test_docs_site.py": 0}
     assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
 

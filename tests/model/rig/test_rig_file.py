@@ -1,17 +1,37 @@
+"""What full level is, gains of ERAs, and layouts of a rig.
+
+Rig files written again with other values.
+"""
+
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from model.config.document import ConfigError, read_document
+from benchmarks.direct_plate import direct_acceleration
+from model.answer.stimulus import Placement
+from model.config.document import ConfigError, parse_document, read_document
 from model.errors import InputError
-from model.rig.rig import Channel, Rig, Uncertainty
-from model.rig.rig_file import load_rig, parse_mesh
-from model.rig.rig_summary import RIG
-from model.structure.attachments import Fingertip, PointLoad
+from model.fem import assemble
+from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import reduce_plate
+from model.rig import rig_writing
+from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty, diagonal_pair, edge_pair
+from model.rig.rig_file import load_rig, parse_mesh, parse_rig, rig_of
+from model.rig.rig_summary import RIG as RIG_SUMMARY_RIG
+from model.rig.rig_summary import gain_notes
+from model.rig.rig_writing import rewritten_text
+from model.structure.attachments import Fingertip, PointLoad, footprints_of
 from model.structure.materials import material
 from model.structure.plate import Plate
+from model.table.table_file import build_table
+from model.transients.base_motion import BaseMotions, Term
+from model.transients.time_response import plate_in_time
+from plates import exciter_rig, exciter_rig_text, make_paper_rig
+from set_table import only
 
 # A line per value, so that every problem has a line of its own.
 GOOD = """\
@@ -411,7 +431,7 @@ def test_check_warns_of_what_costs_accuracy(
 ) -> None:
     """Of stiff points, of friction in an air gap, of another unit, of layers that slide."""
     text = text.replace("48x36", "auto").replace("amplifiers:", THIRD)
-    warnings = RIG.check(read_document(write(tmp_path, text))).warnings
+    warnings = RIG_SUMMARY_RIG.check(read_document(write(tmp_path, text))).warnings
     found = [each for each in warnings if each.startswith(key)]
     assert len(found) == (said is not None)
     assert all(str(said) in each for each in found)
@@ -422,7 +442,7 @@ def test_config_check_refuses_an_unsupported_plate(tmp_path: Path) -> None:
     path = write(tmp_path, GOOD)
     assert len(load_rig(path).eras) == 2
     with pytest.raises(ConfigError) as caught:
-        RIG.check(read_document(path))
+        RIG_SUMMARY_RIG.check(read_document(path))
     assert [(each.line, each.key) for each in caught.value.problems] == [(7, "eras")]
 
 
@@ -433,3 +453,343 @@ def test_uncertainty_is_shown_to_three_digits() -> None:
         "gain 1.02 %, thickness 2 %, modulus 2 %, stiffness 10 %, harmonic 1 %, phase 1°, "
         "damping x 1.033, fingertip x 1.6, place 1 mm"
     )
+
+
+DESK = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
+RIG_TEXT = """
+plate: {length: 12 in, width: 9 in, thickness: 1.5 mm, material: aluminium}
+mesh: 16x12
+eras:
+  SW: {at: [0, 0], stiffness: 17000, amplifier: main, channel: 0}
+  SE: {at: [12 in, 0], stiffness: 17000, amplifier: main, channel: 1, gains: {SE}}
+  NE: {at: [12 in, 9 in], stiffness: 17000}
+  NW: {at: [0, 9 in], stiffness: 17000}
+amplifiers:
+  main: {url: "sim://", full_level: {main}}
+limits: {frequency: [60, 260]}
+"""
+
+
+def text(*, full_level: str = "output", gains: str = "[[40, 6, 0], [300, 2, -20]]") -> str:
+    """The rig with this full level and these gains of one ERA."""
+    return RIG_TEXT.replace("{main}", full_level).replace("{SE}", gains)
+
+
+def test_full_level_is_a_motion_or_an_output() -> None:
+    """A motion unless the file says that it is an output, as that of the desk does.
+
+    What drives exciters is one without a word.
+    """
+    assert parse_rig("rig.yaml", text().replace(", full_level: output", "")).outputs == set()
+    assert parse_rig("rig.yaml", text(full_level="motion")).outputs == set()
+    assert parse_rig("rig.yaml", text()).outputs == {"main"}
+    assert load_rig(DESK).outputs == {"main"}
+    board = exciter_rig_text().replace(", full_level: output", "")
+    assert "full_level" not in board
+    assert parse_rig("board.yaml", board).outputs == {"card"}
+    with pytest.raises(ConfigError, match=r"amplifiers\.main\.full_level"):
+        parse_rig("rig.yaml", text(full_level="voltage"))
+
+
+def test_check_says_which_motion_by_an_output_is_a_guess() -> None:
+    """Of the ERAs without gains at once; of motions and exciters nothing is to be measured."""
+    (guess,) = gain_notes(parse_rig("rig.yaml", text()))
+    assert guess.startswith("gains of SW: missing")
+    both = text().replace(", gains: [[40, 6, 0], [300, 2, -20]]", "")
+    assert gain_notes(parse_rig("rig.yaml", both)) == [guess.replace("SW", "SW, SE")]
+    assert gain_notes(exciter_rig()) == []
+    assert gain_notes(parse_rig("rig.yaml", text(full_level="motion"))) == []
+
+
+def test_check_names_rows_that_are_too_far_apart() -> None:
+    """Halfway between rows 90 degrees apart a straight line has 0.7 of the gain; 179 to -176 is 5.
+
+    Rows beyond the limits of frequency are not played.
+    """
+    far = "[[40, 2, 179], [150, 2, -176], [255, 2, 94], [300, 2, 90], [320, 2, 0]]"
+    _, coarse = gain_notes(parse_rig("rig.yaml", text(gains=far)))
+    assert coarse.startswith("eras.SE.gains: phases differ by 90 degrees between 150 and 255 Hz")
+
+
+def test_era_without_amplifier_supports_as_one_at_rest() -> None:
+    """Fields of the others are those of the rig in which it is wired and not driven.
+
+    No pattern drives it.
+    """
+    rig = parse_rig("rig.yaml", text())
+    wired = text().replace("17000}", "17000, amplifier: side, channel: 0}", 1)
+    wired = wired.replace("17000}", "17000, amplifier: side, channel: 1}", 1)
+    whole = parse_rig("rig.yaml", wired.replace("limits", '  side: {url: "sim://x"}\nlimits'))
+    assert (rig.supports, [era.name for era in rig.eras]) == (("NE", "NW"), ["SW", "SE"])
+    frequencies, points = np.array([80.0, 220.0]), np.array([[0.1, 0.06], [0.22, 0.16]])
+
+    def fields(one: Rig) -> np.ndarray:
+        plate = assemble(one.plate, one.mesh)
+        return direct_acceleration(plate, one.eras, frequencies, points, loads=one.masses)
+
+    np.testing.assert_allclose(fields(rig), fields(whole)[:, :2], rtol=1e-9)
+    table = build_table(rig, frequencies=np.arange(60.0, 261.0, 20.0))
+    np.testing.assert_allclose(
+        table.unit_fields(points)[[1, 8]],
+        fields(rig),
+        rtol=0.02,
+        atol=0.02 * np.abs(fields(rig)).max(),
+    )
+    placed = Placement(((0.1, 0.06),), ((0.22, 0.16),))
+    layer, _ = only(table, placed, 10.0, drive_mode="phased")
+    assert set(layer.excitation) <= {"SW", "SE"}
+
+
+GAINS = ((100.0, 0.9, 0.2), (200.0, 1.3, -0.4))
+
+
+@pytest.fixture
+def uneven(coarse_rig: Rig) -> Rig:
+    """The paper's plate, its second ERA with gains."""
+    eras = list(coarse_rig.eras)
+    eras[1] = replace(eras[1], gains=GAINS)
+    return replace(coarse_rig, eras=tuple(eras))
+
+
+def test_era_gain_is_interpolated_and_held_beyond_its_frequencies(uneven: Rig) -> None:
+    """It lies on the line between two complex gains, and is the last one beyond."""
+    low, high = 0.9 * np.exp(0.2j), 1.3 * np.exp(-0.4j)
+    found = uneven.eras[1].gain(np.array([50.0, 100.0, 125.0, 300.0]))
+    np.testing.assert_allclose(found, [low, low, 0.75 * low + 0.25 * high, high])
+
+
+def test_acceleration_is_scaled_by_the_gain_of_its_era(coarse_rig: Rig, uneven: Rig) -> None:
+    """The ERA's own response is multiplied, not its neighbours'."""
+    points = np.array([[0.1, 0.05], [0.2, 0.2]])
+    frequencies = np.array([100.0, 150.0, 200.0])
+    factor = np.ones((3, 4, 1), dtype=complex)
+    factor[:, 1, 0] = uneven.eras[1].gain(frequencies)
+    free = solve_free_plate(coarse_rig.plate, coarse_rig.mesh)
+    np.testing.assert_allclose(
+        free.acceleration(uneven.eras, frequencies, points),
+        factor * free.acceleration(coarse_rig.eras, frequencies, points),
+        rtol=1e-10,
+    )
+
+
+def test_particular_solution_is_the_same_for_negative_frequency(
+    coarse_rig: Rig, uneven: Rig
+) -> None:
+    """Im[c exp(i w t)] is Im[-conj(c) exp(-i w t)]: quick ramps of low tones are made of both."""
+    reduced = reduce_plate(coarse_rig.plate, coarse_rig.mesh, footprints_of(coarse_rig.eras))
+    plate, omega, c = plate_in_time(reduced, uneven.eras), 2 * math.pi * 150.0, 6e-5 + 3e-5j
+    tones = Term(0.0, math.inf, omega, c), Term(0.0, math.inf, -omega, -c.conjugate())
+    expected, back = (
+        plate.driven(BaseMotions([(), (tone,)]), [0], [0.0]).state(0, 0.0123) for tone in tones
+    )
+    np.testing.assert_allclose(back, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_corners_and_pairs_are_those_of_the_paper():
+    """`corners` are its own rig, of which SW and SE share the long edge, and SW and NE not."""
+    rig = make_paper_rig(12, 9)
+    corners = next(layout for layout in FOUR_ERA_LAYOUTS if layout.name == "corners")
+    expected = [(era.x, era.y) for era in rig.eras]
+    np.testing.assert_allclose(corners.positions(rig.plate), expected)
+    pairs = [[rig.eras[era].name for era in of(rig.eras)] for of in (edge_pair, diagonal_pair)]
+    assert pairs == [["SW", "SE"], ["SW", "NE"]]
+
+
+RIG = Path(__file__).parents[3] / "examples" / "desk" / "rig.yaml"
+
+
+FLOW = """\
+# my panel
+plate: {length: 0.3, width: 0.2, thickness: 2 mm, material: steel}  # from stock
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A: {at: [0, 0], stiffness: 9 kN/m, damping_ratio: 0.1, amplifier: m, channel: 0}
+  B: {at: [0.3, 0], stiffness: 9000, amplifier: m, channel: 1, }
+  C: {at: [0, 0.2], stiffness: 9000, damping: 2, bolt_mass: 3 g, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+BLOCK = """\
+plate:
+  length: 0.3
+  width: 0.2
+  layers:   # glass on glass
+    - material: soda-lime-glass
+      thickness: 2 mm
+    - material: {E: 60 GPa, rho: 2500, nu: 0.2}
+      thickness: 1 mm   # the touch side
+  bond: none
+  loss_factor: 2 %   # bonded
+mesh: 12x9
+limits: {frequency: [40, 200]}
+eras:
+  A:   # "ä" in a comment: µ
+    at:
+      - 0
+      - 0
+    stiffness: 9000   # maker's
+    amplifier: m
+    channel: 0
+    gains:
+      - [50, 1, 0]
+      - [60, 1, 0]
+  B:
+    at: [0.3, 0]
+    bolt_mass: 1 g
+    stiffness: 9000
+    amplifier: m
+    channel: 1
+  C: {at: [0, 0.2], stiffness: 9000, amplifier: m, channel: 2}
+amplifiers: {m: {url: "sim://"}}
+"""
+
+REWRITTEN_BOARD = (
+    FLOW.replace("thickness: 2 mm, material: steel", "thickness: 6 mm, material: plywood")
+    .replace("width: 0.2,", "width: 0.2, grain: width,")
+    .replace("mesh: 12x9", "supports: {foot: {at: [0.1, 0.1], kind: foam}}  # of foam")
+)
+
+BY_NUMBERS = REWRITTEN_BOARD.replace(
+    "plywood", "{E1: 12 GPa, E2: 4.8 GPa, G12: 0.7 GPa, G13: 350 MPa, G23: 250 MPa, nu12: 0.05, "
+    "rho: 680}",
+)  # fmt: skip
+
+ACRYLIC = REWRITTEN_BOARD.replace("plywood", "acrylic")
+
+BONDED = BLOCK.replace("bond: none", "bond: full").replace("12x9", "auto")
+
+
+def other_values(rig: Rig) -> Rig:
+    """Other values everywhere, gains for all but the last ERA."""
+    plate = replace(rig.plate.scaled(modulus=1.2345678), loss_factor=0.0234)
+    eras = tuple(
+        replace(
+            era,
+            stiffness=era.stiffness * 1.1 + number,
+            damping=era.damping + 1.5,
+            bolt_mass=era.bolt_mass + 0.0123456,
+            x=0.00123 if number == 0 else era.x,
+            gains=((50.0, 0.91234, -0.2), (60.5, 1.1, 3.0)) if number < 2 else (),
+        )
+        for number, era in enumerate(rig.eras)
+    )
+    return replace(
+        rig,
+        plate=plate,
+        laminate=rig.laminate and rig.laminate.scaled(modulus=1.2345678),
+        eras=eras,
+        uncertainty=Uncertainty(0.004, 0.3, 0.002, 0.01, 1.02, 0.5),
+    )
+
+
+def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
+    """An ERA of several short lines becomes a long one; some lengths break it at its gains."""
+    lines = RIG.read_text("utf-8").splitlines()
+    text = "\n".join(line for line in lines if not line.startswith("#"))
+    text = text.replace("main", 32 * "m")
+    for zeros in range(8, 29, 4):
+        longer = text.replace(
+            "0.05, bolt_mass: 0, stroke: 100 um", f"0.05,\n     stroke: 0.0001{zeros * '0'}"
+        )
+        document = parse_document("rig.yaml", longer)
+        rig = rig_of(document)
+        gains = ((50.0, 1.25, 0.5), (60.0, 1.5, 0.25))
+        eras = tuple(
+            replace(era, x=0.99 * era.x + 0.0005678, stiffness=1.0123 * era.stiffness, gains=gains)
+            for era in rig.eras
+        )
+        after = rewritten_text(document, rig, replace(rig, eras=eras), comment="measured")
+        read = rig_of(parse_document("new.yaml", after))
+        assert [[row[0] for row in era.gains] for era in read.eras] == [[50.0, 60.0]] * 4
+
+
+TEXTS = {
+    **{"flow": FLOW, "block": BLOCK, "bonded": BONDED},
+    **{"board": REWRITTEN_BOARD, "by numbers": BY_NUMBERS, "acrylic": ACRYLIC},
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_rewritten_text_keeps_comments_and_has_every_value(text: str) -> None:
+    """Comments of any style stay, and values are those of the other rig, layers' moduli too."""
+    document = parse_document("rig.yaml", text)
+    rig = rig_of(document)
+    other = other_values(rig)
+    written = rewritten_text(document, rig, other, comment="new\nvalues")
+    assert written.startswith("# new\n# values\n\n")
+    for line in text.splitlines():
+        if "#" in line:
+            assert line[line.index("#") :] in written
+    back = rig_of(parse_document("new.yaml", written))
+    if back.plate.laminate is None or "layers" not in document.data["plate"]:
+        before, after = (
+            each.laminate.layers[0].material if each.laminate else each.plate.material
+            for each in (rig, back)
+        )
+        expected = {key: 1.2345678 * each for key, each in before.moduli.items()}
+        assert after.moduli == pytest.approx(expected, rel=1e-6)
+    else:
+        moduli = [layer.material.E for layer in back.plate.laminate.layers]
+        assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-6)
+    assert back.plate.loss_factor == 0.0234
+    for era, expected in zip(back.eras, other.eras, strict=True):
+        assert era.stiffness == pytest.approx(expected.stiffness, rel=1e-5)
+        assert era.damping == pytest.approx(expected.damping, rel=1e-5)
+        assert era.bolt_mass == pytest.approx(expected.bolt_mass, rel=1e-5)
+        np.testing.assert_allclose(era.gains, expected.gains, rtol=1e-5)
+    assert back.wiring == rig.wiring
+    assert back.plate.mass == pytest.approx(rig.plate.mass, rel=1e-9)
+
+
+@pytest.mark.parametrize(("key", "off"), [("material", 0.2), ("loss_factor", 5e-5)])
+def test_text_that_reads_back_otherwise_is_refused(
+    monkeypatch: pytest.MonkeyPatch, key: str, off: float
+) -> None:
+    """A file whose plate cannot be changed, also by a quarter of a percent, is not the other's."""
+    document = parse_document("rig.yaml", FLOW)
+    rig, put = rig_of(document), rig_writing._put
+    plate = replace(rig.plate, loss_factor=rig.plate.loss_factor + off)
+    other = replace(rig, plate=plate if key == "loss_factor" else plate.scaled(modulus=1 + off))
+    monkeypatch.setattr(
+        rig_writing, "_put", lambda data, path, *more: path[-1] == key or put(data, path, *more)
+    )
+    with pytest.raises(InputError, match="read back"):
+        rewritten_text(document, rig, other, comment="")
+
+
+def test_a_mass_that_is_found_comes_beside_supports() -> None:
+    """Supports stay, and the mass is read back where it was found."""
+    document = parse_document("rig.yaml", REWRITTEN_BOARD)
+    rig = rig_of(document)
+    found = PointLoad(0.05, 0.15, mass=0.004)
+    text = rewritten_text(document, rig, replace(rig, masses=(*rig.masses, found)), comment="")
+    back = rig_of(parse_document("rig.yaml", text)).masses
+    assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
+    assert found in back
+
+
+def test_feet_are_read_back_whichever_is_stiffer_by_a_hair() -> None:
+    """Two that differ by less than is written: the order of their stiffness says nothing."""
+    feet = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}"
+    document = parse_document("rig.yaml", FLOW.replace("mesh: 12x9", f"{feet}\nmesh: 12x9"))
+    rig = rig_of(document)
+    one, other = rig.masses
+    masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
+    known = replace(rig.uncertainty, supports=0.05)
+    found = replace(rig, masses=masses, uncertainty=known)
+    text = rewritten_text(document, rig, found, comment="")
+    back = rig_of(parse_document("rig.yaml", text)).masses
+    assert [each.x for each in back] == [0.1, 0.2]
+    assert [each.stiffness for each in back] == pytest.approx([345.678, 345.678])
+
+
+def test_rewritten_text_keeps_how_uncertain_feet_are_that_it_states() -> None:
+    """A foot of foam, uncertain by its kind, gets a stiffness and stays as uncertain: by 0.3."""
+    document = parse_document("rig.yaml", REWRITTEN_BOARD)
+    rig = rig_of(document)
+    (foot,) = rig.masses
+    softer = replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
+    back = rig_of(parse_document("b.yaml", rewritten_text(document, rig, softer, comment="")))
+    assert back.uncertainty.supports == 0.3
+    assert back.masses[0].stiffness == pytest.approx(0.8 * foot.stiffness)

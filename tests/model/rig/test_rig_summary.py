@@ -1,5 +1,11 @@
-"""Exciters in rig files: by type and by values, what is refused and warned of, written again."""
+"""The reference of the rig file against what rig files may say.
 
+Every plain key of a plate, also a new one: in both solvers, in a rigid plate, in a summary.
+
+Exciters in rig files: by type and by values, what is refused and warned of, written again.
+"""
+
+import inspect
 import json
 import math
 import re
@@ -10,16 +16,125 @@ import numpy as np
 import pytest
 
 import era_haptics
+import model
+import rig_page
+from key_tables import quantities
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, parse_document
+from model.config.fields import Section
 from model.errors import InputError
-from model.rig.rig_file import parse_rig
-from model.rig.rig_summary import RIG, exciter_notes, excursion_notes
+from model.reduction.free_plate import solve_free_plate
+from model.rig import sections
+from model.rig.actuator_keys import KINDS
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
 from model.rig.rig_writing import rewritten_text
+from model.rig.sections import PlateSection
+from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
-from model.structure.materials import EXCITER_TYPES
+from model.structure.materials import EXCITER_TYPES, KNOWN_MATERIALS
 from model.table.table_file import build_table, table_following
+from model.vibration import natural_modes
 from plates import exciter_rig, exciter_rig_text
+
+ROOT = Path(model.__file__).parent.parent
+PAGE = (ROOT / "docs" / "reference" / "rig.md").read_text("utf-8")
+
+
+def test_tables_of_keys_are_those_of_the_sections() -> None:
+    """Of every section; unit, default, limits and meaning of a key."""
+    every = {each for _, each in inspect.getmembers(sections, inspect.isclass)}
+    every |= {*KINDS.values()}
+    assert {each for each in every if issubclass(each, Section)} - {Section} == {
+        *rig_page.SECTIONS.values()
+    }
+    for row in (
+        "| `thickness` | m | required, or `layers` | at least 1e-06, at most 1 | at most the",
+        "| `stroke` | m | 0.1 mm | above 0, at most 0.01 | amplitude of its base at level 1,",
+        "| `channel` | | none | 0 to 255 | its channel;",
+        "| `bond` | | `full` | `full`, `none` | whether",
+        "| `frequency` | Hz | `[40, 500]` | at least 1, at most 2000 | lowest and highest",
+        "| `resonance_is` | | required with `resonance` | `free`, `mounted` | of which",
+        "| `kind` | | none | `foam`, `rubber` | of a foot",
+        "| `E` | Pa | required, or those with a grain | at least 1000, at most 1e+13 | Young's",
+    ):
+        assert f"\n{row}" in PAGE
+
+
+def test_page_has_a_minimal_rig_that_loads(tmp_path):
+    """The rig that the page prints loads, with three ERAs."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1], encoding="utf-8")
+    assert [era.name for era in load_rig(path).eras] == ["SW", "SE", "N"]
+
+
+def test_page_lists_the_known_materials():
+    """By name, all of them and no other."""
+    (names,) = re.findall(r"Materials by name are (.+?);", PAGE, re.DOTALL)
+    assert re.findall(r"`([\w-]+)`", names) == [*KNOWN_MATERIALS]
+
+
+def test_choices_of_a_key_that_may_be_left_out() -> None:
+    """They are in its row, as those of a key with a default are."""
+    assert "| `kind` | | none | `foam`, `rubber` |" in rig_page.PARTS["supports"]()
+    assert "| `magnet` | | `free` | `free`, `held` |" in rig_page.PARTS["exciters"]()
+
+
+PLATE = {"length": 0.3, "width": 0.2, "thickness": 0.002}
+GLASS = {"E": 70e9, "rho": 2500.0, "nu": 0.2}
+CORNERS = {"SW": [0, 0], "SE": [0.3, 0], "NE": [0.3, 0.2], "NW": [0.01, 0.2]}
+FIELDS = PlateSection.model_fields
+PLAIN = {key: each for key, field in FIELDS.items() for each in quantities(field)}
+
+
+def rig_with(key: str, mesh: str, stiffness: float = 17e3, more: float = 0.02) -> Rig:
+    """A plate whose key is so much more of one unit than otherwise, on four springs."""
+    start = PLATE.get(key) or FIELDS[key].default or 0.0
+    data = {
+        "plate": {**PLATE, "material": GLASS, key: start + more * min(1.0, PLAIN[key].at_most)},
+        "mesh": mesh,
+        "eras": {
+            name: {
+                "at": at,
+                "stiffness": stiffness,
+                "bolt_mass": 0.01,
+                "amplifier": "main",
+                "channel": number,
+            }
+            for number, (name, at) in enumerate(CORNERS.items())
+        },
+        "amplifiers": {"main": {"url": "sim://"}},
+        "limits": {"frequency": [40, 300]},
+    }
+    return parse_rig("rig.json", json.dumps(data))
+
+
+@pytest.mark.parametrize("key", [key for key in PLAIN if key != "thickness"])
+def test_a_key_is_in_elements_and_polynomials_and_in_the_summary(key: str) -> None:
+    """Responses, which it changes, within 1 %; three modes of soft springs as of a rigid plate."""
+    polynomials = "14x10 Legendre"
+    rigs = (
+        rig_with(key, polynomials, more=0.0),
+        rig_with(key, "12x8 Q5"),
+        rig_with(key, polynomials),
+    )
+    (before, E, P) = (
+        solve_free_plate(rig.plate, rig.mesh).acceleration(
+            rig.eras, np.array([60.0, 150.0, 290.0]), np.array([[0.1, 0.05], [0.3, 0.2]])
+        )
+        for rig in rigs
+    )
+    assert np.linalg.norm(P - E) < 0.01 * np.linalg.norm(E)
+    assert np.linalg.norm(P - before) > 1e-5 * np.linalg.norm(E)
+    soft = rig_with(key, polynomials, stiffness=10.0)
+    assert natural_modes(soft, 3, support="eras").frequencies == pytest.approx(
+        rigid_body_frequencies(soft.plate, soft.eras), rel=1e-3
+    )
+    summary = plate_summary(soft)
+    shown = {**summary, **summary["further"]}
+    assert shown[PLAIN[key].dimension.key(key)] == getattr(soft.plate, key)
+
 
 OWN = (
     "coil_mass: 1.61 g, weight: 109.29 g, q: 3, force_factor: 3.63 T m, resistance: 4.3 ohm, "

@@ -1,0 +1,541 @@
+"""What clocks that are off cost two contents, as `era config check` tells it.
+
+Export of tables to .mat and .csv files.
+
+Maps of contrast to given quiet fingers, as a command, from Python and as a frame.
+
+Summary of a table, and its map of weak cells.
+"""
+
+import csv
+import json
+import math
+import re
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+from typer.testing import CliRunner
+
+import era_haptics as era
+from drivers.urls import CLOCK_ERRORS
+from model.answer.stimulus import Placement
+from model.cli import app
+from model.errors import InputError
+from model.finger import Grid
+from model.rig.rig import Channel, Uncertainty
+from model.rig.rig_file import example_rig_path
+from model.structure.attachments import PointLoad
+from model.structure.plate import AirGap, Laminate, LaminateLayer
+from model.study import overview
+from model.study.contrast_maps import (
+    WeakCells,
+    ask_once,
+    contrasts_reached,
+    find_weak_cells,
+    map_grid,
+    pair_questions,
+    sampling_error,
+    text_map,
+)
+from model.study.overview import (
+    CONTACT_SETS,
+    ClockCost,
+    Overview,
+    clock_cost,
+    export_csv,
+    export_mat,
+    find_overview,
+    set_questions,
+    summarize,
+)
+from model.table.table_file import build_table, save_table
+from plates import FREQUENCIES, make_paper_rig, small_table, smooth_rig, with_strokes
+from set_table import only
+
+IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
+RIG = """
+plate: {length: 305 mm, width: 229 mm, thickness: 1.5 mm, material: aluminium}
+mesh: 6x5 Q4
+eras:
+  SW: {at: [0, 0], stiffness: 17e3, amplifier: a, channel: 0}
+  SE: {at: [305 mm, 0], stiffness: 17e3, amplifier: a, channel: 1}
+  NW: {at: [0, 229 mm], stiffness: 17e3, amplifier: b, channel: 0}
+  NE: {at: [305 mm, 229 mm], stiffness: 17e3, amplifier: b, channel: 1}
+amplifiers:
+  a: {url: "serial:///dev/ttyUSB0"}
+  b: {url: "serial:///dev/ttyUSB1"%s}
+limits: {frequency: [40 Hz, 250 Hz]}
+uncertainty: {gain: 0.5 %%, phase_deg: 0.5, thickness: 0.1 %%, stiffness: 0.5 %%, damping: 1.02}
+"""
+USB_US = round(1e6 * math.hypot(CLOCK_ERRORS["ftdi-low-latency"], 5e-6 / math.sqrt(3)), 1)
+
+
+def test_contrast_falls_with_the_error_and_stays_with_one_amplifier() -> None:
+    """Two amplifiers of two ERAs each; one with all of them loses nothing whatever its clock."""
+    rig = replace(smooth_rig(), uncertainty=IDENTIFIED)
+    halves = {era.name: Channel("ab"[n % 2], n // 2) for n, era in enumerate(rig.eras)}
+    both = replace(rig, wiring=halves)
+    costs = [clock_cost(both, {"a": each, "b": each}) for each in (0.0, 2e-5, 2e-4, math.inf)]
+    kept = [each.kept_db for each in costs]
+    assert kept[0] == costs[0].exact_db
+    assert kept == sorted(kept, reverse=True)
+    assert kept[0] - kept[1] < 2 < kept[0] - kept[3]
+    one = replace(rig, wiring={era.name: Channel("a", n) for n, era in enumerate(rig.eras)})
+    assert clock_cost(one, {"a": math.inf}) == ClockCost(costs[0].exact_db, costs[0].exact_db)
+
+
+@pytest.mark.parametrize(("length", "width", "said"), [("60 cm", "40 cm", 1), ("12 in", "9 in", 0)])
+def test_config_check_remarks_eras_on_a_small_part_of_the_plate(
+    tmp_path: Path, length: str, width: str, said: int
+) -> None:
+    """12 x 9 in of 60 x 40 cm are 29 %; spread to the corners ERAs promise more. Still good."""
+    text = example_rig_path().read_text("utf-8")
+    text = text.replace("length: 12 in", f"length: {length}").replace(
+        "width: 9 in", f"width: {width}"
+    )
+    file = tmp_path / "rig.yaml"
+    file.write_text(text)
+    result = CliRunner().invoke(app, ["config", "check", str(file), "--json"])
+    assert result.exit_code == 0
+    remarks = [each for each in json.loads(result.output)["warnings"] if "span" in each]
+    assert len(remarks) == said
+    for each in remarks:
+        assert "29 %" in each
+        here, there = (float(number) for number in re.findall(r"([0-9.]+) dB", each))
+        assert here + 1 < there
+
+
+@pytest.mark.parametrize(
+    ("more", "error_us", "warnings"), [("", USB_US, 1), (", clock_error: unknown", None, 2)]
+)
+def test_config_check_tells_what_clocks_cost(
+    tmp_path: Path, more: str, error_us: float | None, warnings: int
+) -> None:
+    """Over USB: that of the line, and 5 us / sqrt(3) of the amplifier; and which plays alone."""
+    file = tmp_path / "rig.yaml"
+    file.write_text(RIG % more)
+    run = partial(CliRunner().invoke, app)
+    found = json.loads(run(["config", "check", str(file), "--json"]).output)
+    assert found["ok"]
+    clocks = found["clocks"]
+    assert clocks["error_us"] == {"a": USB_US, "b": error_us}
+    assert clocks["kept_contrast_db"] < clocks["exact_contrast_db"]
+    assert len([each for each in found["warnings"] if "contents" in each]) == warnings
+
+
+@pytest.fixture(scope="module")
+def table():
+    """A small one."""
+    return small_table()
+
+
+@pytest.fixture
+def struct(table, tmp_path):
+    """Its .mat file as MATLAB would see it."""
+    export_mat(table, tmp_path / "t.mat")
+    return loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+
+
+def read_csv(path):
+    """Rows as dictionaries of text."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_export_mat_holds_the_table_to_the_bit(table, struct):
+    """Fields, modes and provenance, to the bit and in their shapes."""
+    fields = table.unit_fields(table.raster.points)
+    np.testing.assert_array_equal(struct.acceleration_m_s2.transpose(1, 2, 0), fields)
+    np.testing.assert_array_equal(struct.frequency_hz, FREQUENCIES)
+    np.testing.assert_array_equal(struct.mode_shape, table.shapes)
+    np.testing.assert_array_equal(struct.cell_centre_m, table.cell_centres)
+    assert len(struct.raster_x_m) * len(struct.raster_y_m) == len(struct.acceleration_m_s2)
+    assert struct.fingerprint == table.fingerprint
+    assert struct.mode == "switched"
+    assert struct.plate.length_m == 0.3048
+    assert struct.plate.material.E_pa == 70e9
+    assert struct.plate.air_gap.size == 0
+    assert (struct.fingertip.phalanx_mass_kg, struct.uncertainty.thickness) == (0.005, 0.02)
+    assert [era.name for era in struct.eras] == ["SW", "SE", "NE", "NW"]
+    assert [era.stiffness_n_m for era in struct.eras] == [17000.0] * 4
+    assert struct.eras[2].x_m == 0.3048
+
+
+def test_export_mat_holds_names_of_sets_as_a_cell_array(table, tmp_path):
+    """A column of strings, of one set too, beside the set of levels."""
+    for names in (("pressing-fingertip", "vibrotactile-probe"), ("pressing-fingertip",)):
+        export_mat(replace(table, promised_thresholds=names), tmp_path / "t.mat")
+        struct = loadmat(tmp_path / "t.mat", struct_as_record=False)["table"][0, 0]
+        assert struct.threshold.tolist() == ["vibrotactile-probe"]
+        assert struct.promised_thresholds.shape == (len(names), 1)
+        assert [each.item() for each in struct.promised_thresholds.flat] == list(names)
+
+
+def test_export_mat_holds_layers_and_air(table, tmp_path):
+    """A laminate is a struct with its layers, each with its material and rows by frequency."""
+    metal, rows = table.plate.material, ((1.0, 1.0, 0.1), (900.0, 2.0, 0.1))
+    layers = (LaminateLayer(metal, 0.001), LaminateLayer(metal, 0.0005, by_frequency=rows))
+    plate = replace(table.plate, laminate=Laminate(layers), air_gap=AirGap(0.002, closed=True))
+    export_mat(replace(table, plate=plate), tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"].plate
+    assert (struct.air_gap.depth_m, struct.air_gap.closed) == (0.002, 1)
+    first, second = struct.laminate.layers
+    assert (first.thickness_m, first.material.rho_kg_m3) == (0.001, metal.rho)
+    np.testing.assert_array_equal(second.by_frequency, rows)
+
+
+def test_export_mat_holds_masses(table, tmp_path):
+    """One mass is a struct of one, none is empty."""
+    attachment_shapes = np.vstack([table.attachment_shapes, table.attachment_shapes[:1]])
+    laden = replace(
+        table, masses=(PointLoad(0.1, 0.15, mass=0.06),), attachment_shapes=attachment_shapes
+    )
+    export_mat(laden, tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+    assert struct.masses.mass_kg == 0.06
+    assert struct.masses.y_m == 0.15
+    export_mat(table, tmp_path / "t.mat")
+    struct = loadmat(tmp_path / "t.mat", squeeze_me=True, struct_as_record=False)["table"]
+    assert struct.masses.size == 0
+
+
+def test_export_mat_refuses_a_table_too_large(table, tmp_path, monkeypatch):
+    """Before anything is written; the error names a remedy."""
+    monkeypatch.setattr(overview, "MAX_MAT_BYTES", 1000)
+    with pytest.raises(InputError, match="numpy"):
+        export_mat(table, tmp_path / "t.mat")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("drive_mode", ["switched", "phased"])
+def test_export_csv_of_patterns_holds_answers_in_the_drive_mode_of_the_table(drive_mode, tmp_path):
+    """In each row the levels of the ERAs, asked anew, give the promised level and contrast.
+
+    In mode `switched` ERAs play at one level, and at one frequency or two; in `phased` at one
+    frequency with levels and phases of their own.
+    """
+    table = replace(small_table(drive_mode=drive_mode), grid=Grid(2, 2))
+    export_csv(table, tmp_path / "t.csv", content="patterns")
+    rows = read_csv(tmp_path / "t.csv")
+    assert len({(row["target_x_m"], row["target_y_m"]) for row in rows}) == 4
+    assert len(rows) > 4 * 4
+    names = [era.name for era in table.eras]
+    for row in rows[::9]:
+        levels = {float(row[f"{name}_level"]) for name in names if row[f"{name}_level"]}
+        driven = [name for name in names if row[f"{name}_hz"]]
+        frequencies = {row[f"{name}_hz"] for name in driven}
+        if drive_mode == "switched":
+            assert max(levels) == pytest.approx(min(levels))
+            assert len(frequencies) <= 2
+        else:
+            assert (len(driven), len(frequencies)) == (4, 1)
+        target, quiet = (
+            (float(row[f"{finger}_x_m"]), float(row[f"{finger}_y_m"]))
+            for finger in ("target", "quiet")
+        )
+        _, felt = only(table, Placement((target,), (quiet,)))
+        assert float(row["promised_contrast_db"]) == felt.promised_contrast_db
+        assert float(row["promised_level_db_sl"]) >= 20 - 1e-3
+    weak = replace(with_strokes(table, 1e-6), grid=Grid(1, 2))
+    export_csv(weak, tmp_path / "weak.csv", content="patterns")
+    assert all(not row["SW_level"] for row in read_csv(tmp_path / "weak.csv"))
+
+
+def test_export_csv_of_fields(table, tmp_path):
+    """A row for each raster point and frequency, both parts of each ERA's field, to the bit."""
+    export_csv(table, tmp_path / "t.csv", content="fields")
+    rows = read_csv(tmp_path / "t.csv")
+    assert len(rows) == table.raster.point_count * 3
+    row = rows[3 * 7 + 2]
+    assert float(row["x_m"]) == table.raster.points[7, 0]
+    assert float(row["y_m"]) == table.raster.points[7, 1]
+    assert row["frequency_hz"] == "250.0"
+    found = np.complex64(complex(float(row["NE_real_m_s2"]), float(row["NE_imag_m_s2"])))
+    assert found == table.unit_fields(table.raster.points)[2, 2, 7]
+
+
+def test_format_page_names_everything_exported(struct, tmp_path, table):
+    """Every field of the struct, every array and every key of the header."""
+    page = (Path(__file__).parents[3] / "docs/reference/table-file.md").read_text("utf-8")
+    names = [*struct._fieldnames]
+    save_table(table, tmp_path / "t.npz")
+    with np.load(tmp_path / "t.npz") as content:
+        names += [*content, *json.loads(content["header"].tobytes())]
+    assert [name for name in names if f"`{name}`" not in page] == []
+
+
+QUIET = (0.2286, 0.0381)  # m; centre of the fourth cell of the lowest row
+MODES = ("switched", "phased")
+
+
+@pytest.fixture(scope="module")
+def contrast_map_table() -> era.LocalizationTable:
+    """A small table of the paper's plate, cells of 61 x 76 mm."""
+    return build_table(
+        make_paper_rig(12, 9),
+        frequencies=np.array([60.0, 110.0, 250.0]),
+        grid=era.Grid(5, 3),
+        drive_mode="phased",
+    )
+
+
+@pytest.fixture(scope="module")
+def found(contrast_map_table: era.LocalizationTable) -> era.ContrastMap:
+    """Both drive modes, side by side."""
+    return era.contrast_map(contrast_map_table, QUIET, drive_modes=MODES)
+
+
+def test_map_has_the_answer_of_every_place(
+    contrast_map_table: era.LocalizationTable, found: era.ContrastMap
+) -> None:
+    """Promised and nominal contrast of a query there; none where the quiet finger itself is."""
+    for row, y in enumerate(found.y):
+        for column, x in enumerate(found.x):
+            far = math.dist((x, y), QUIET) >= 0.013
+            for mode in MODES:
+                promised = found.promised_db[mode][row, column]
+                assert np.isfinite(promised) == far
+                if far:
+                    felt = era.query(
+                        contrast_map_table, (x, y), quiet=[QUIET], drive_mode=mode
+                    ).fingers[0]
+                    assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
+                    nominal = found.nominal_db[mode][row, column]
+                    assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
+
+
+def test_frame_has_a_row_a_place(found: era.ContrastMap) -> None:
+    """As pandas has it: places along x first, a column for each mode and number."""
+    frame = found.to_frame()
+    assert frame.shape == (15, 6)
+    best = frame.loc[frame["phased_promised_db"].idxmax()]
+    row, column = np.unravel_index(np.nanargmax(found.promised_db["phased"]), (3, 5))
+    assert (best["x_m"], best["y_m"]) == (found.x[column], found.y[row])
+
+
+def test_command_prints_and_writes_the_map(
+    contrast_map_table: era.LocalizationTable, found: era.ContrastMap, tmp_path: Path
+) -> None:
+    """JSON with null for no answer, a CSV file of a row a place, a PDF of the size in cm."""
+    file = tmp_path / "t.npz"
+    era.save_table(contrast_map_table, file)
+    quiet = ["table", "map", str(file), "--quiet", f"{QUIET[0]},{QUIET[1]}"]
+    both = [*quiet, "--modes", ",".join(MODES)]
+
+    printed = json.loads(CliRunner().invoke(app, [*both, "--json"]).stdout)
+    for mode in MODES:
+        rows = np.array(printed["promised_contrast_db"][mode], dtype=float)
+        assert rows == pytest.approx(found.promised_db[mode], abs=0.1, nan_ok=True)
+
+    for name in ("map.csv", "map.pdf"):
+        options = ["--size", "16x10"] if name.endswith("pdf") else []
+        assert CliRunner().invoke(app, [*both, "-o", str(tmp_path / name), *options]).exit_code == 0
+    assert (tmp_path / "map.csv").read_text().count("\n") == 16
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (tmp_path / "map.pdf").read_bytes())
+    assert box is not None
+    points = [float(side) for side in box.groups()]
+    assert points == pytest.approx([16 / 2.54 * 72, 10 / 2.54 * 72], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        (["--quiet", "22,16"], "must be on the plate"),
+        (["--quiet", "0.1,0.1", "--modes", "loud"], "drive mode"),
+        (["--quiet", "0.1,0.1", "--size", "3"], "--size"),
+        (["--quiet", "0.1,0.1", "-o", "m.xyz"], "must end in"),
+    ],
+)
+def test_bad_input_is_refused(
+    contrast_map_table: era.LocalizationTable, tmp_path: Path, options: list[str], cause: str
+) -> None:
+    """A finger off the plate, an unknown mode, a size without height, an unknown ending."""
+    era.save_table(contrast_map_table, tmp_path / "t.npz")
+    result = CliRunner().invoke(app, ["table", "map", str(tmp_path / "t.npz"), *options])
+    assert isinstance(result.exception, era.InputError)
+    assert cause in str(result.exception)
+
+
+def test_weak_cells_take_percentiles_over_fingers_all_over_the_plate(table):
+    """Half of a cell's contrasts are below its median, a tenth below the other.
+
+    Its other fingers are in different ones of 4 by 4 fields, at least 5 cm from the cell.
+    """
+    rng = np.random.default_rng(0)
+    drawn: dict[tuple[float, float], list[float]] = {}
+    tried: dict[tuple[float, float], list[tuple[float, float]]] = {}
+
+    def at_random(question):
+        (target,), (other,) = question.targets, question.quiet
+        assert math.dist(target, other) >= 0.05
+        tried.setdefault(target, []).append(other)
+        drawn.setdefault(target, []).append(float(rng.uniform(0, 30)))
+        return drawn[target][-1], 0.0
+
+    weak = find_weak_cells(table, [[*map(at_random, each)] for each in pair_questions(table)])
+    assert len(drawn) == len(weak.centres) == 12
+    for values, share in ((weak.median_db, 0.5), (weak.tenth_db, 0.1)):
+        for value, contrasts in zip(values, drawn.values(), strict=True):
+            below = (np.array(contrasts) < value).mean()
+            assert below == pytest.approx(share, abs=1.5 / len(contrasts))
+    size = (table.plate.length, table.plate.width)
+    for target, others in tried.items():
+        counts, *_ = np.histogram2d(
+            *np.array(others).T, bins=(4, 4), range=[(0, side) for side in size]
+        )
+        assert counts.max() == 1
+        assert counts.sum() >= 16 - 4  # a place within 5 cm is in the target's field or beside it
+        (x, y) = target
+        mirrored = np.array(tried[min(tried, key=lambda at: math.dist(at, (size[0] - x, y)))])
+        np.testing.assert_allclose(
+            sorted(size[0] - mirrored[:, 0]), sorted(x for x, _ in others), atol=1e-12
+        )
+
+
+def test_other_fingers_mirror_each_other_only_where_the_plate_does(table):
+    """A mass on the middle line leaves symmetry along x, a weaker corner none."""
+    length, width = table.plate.length, table.plate.width
+
+    def rounded(places):
+        return sorted((round(x, 9), round(y, 9)) for x, y in places)
+
+    def symmetries(some):
+        asked = {
+            rounded(each[0].targets)[0]: [one.quiet[0] for one in each]
+            for each in pair_questions(some)
+        }
+        for at in (lambda x, y: (length - x, y), lambda x, y: (x, width - y)):
+            yield all(
+                rounded(at(*place) for place in places) == rounded(asked[rounded([at(*target)])[0]])
+                for target, places in asked.items()
+            )
+
+    mass = PointLoad(length / 2, width / 4, mass=0.05)
+    weaker = replace(table.eras[0], stroke=0.9 * table.eras[0].stroke)
+    assert list(symmetries(table)) == [True, True]
+    assert list(symmetries(replace(table, masses=(mass,)))) == [True, False]
+    assert list(symmetries(replace(table, eras=(weaker, *table.eras[1:])))) == [False, False]
+
+
+def test_questions_that_mirror_each_other_are_one_sample(table):
+    """On a symmetric plate both have the answer of one of them, to the bit; not on another one."""
+    (target,), (other,) = (pair := pair_questions(table)[0][0]).targets, pair.quiet
+    image = Placement(
+        ((table.plate.length - target[0], target[1]),),
+        ((table.plate.length - other[0], other[1]),),
+    )
+    ask = ask_once(table)
+    assert ask(pair) == ask(image)
+    weaker = replace(table.eras[0], stroke=0.5 * table.eras[0].stroke)
+    ask = ask_once(replace(table, eras=(weaker, *table.eras[1:])))
+    assert ask(pair) != ask(image)
+
+
+def test_sampling_error_is_how_much_a_percentile_of_random_samples_varies():
+    """Of 5000 samples of 64 normal values the median is within 0.157, the tenth within 0.214.
+
+    The standard deviation of a percentile is sqrt(p (1 - p) / n) over the density there. Copies of
+    the values tell nothing more.
+    """
+    samples = np.random.default_rng(0).normal(size=(5000, 64))
+    for percent, expected in ((50, 0.1567), (10, 0.2137)):
+        stated = np.array([sampling_error(each, percent) for each in samples])
+        assert stated.mean() == pytest.approx(expected, rel=0.15)
+        assert sampling_error(np.tile(samples[0], 4), percent) == stated[0]
+    assert math.isnan(sampling_error([-np.inf, -np.inf, 1.0, 2.0], 50))
+
+
+def test_map_grid_is_coarser_than_a_fine_grid(table):
+    """A cell of the map is no smaller than an eighth by a sixth of the plate."""
+    assert map_grid(replace(table, grid=Grid(24, 5))) == Grid(8, 5)
+    assert map_grid(replace(table, grid=Grid(4, 20))) == Grid(4, 6)
+
+
+def test_weak_and_feasible_follow_from_twelve_decibels():
+    """Feasible by the median other finger, weak by one in ten; a text map shows both."""
+    weak = WeakCells(
+        Grid(2, 2),
+        np.zeros((4, 2)),
+        median_db=np.array([20.4, 12.0, -np.inf, 9.0]),
+        tenth_db=np.array([12.0, 11.9, -np.inf, 5.0]),
+        errors_db=np.zeros((2, 4)),
+        pairs_db=np.empty((2, 0)),
+    )
+    assert weak.feasible.tolist() == [True, True, False, False]
+    assert weak.weak.tolist() == [False, True, True, True]
+    assert list(text_map(weak)) == ["   -*   9*", "  20   12*"]  # the largest y first
+
+
+def test_summary_of_a_plate_too_small_for_two_fingers():
+    """Where no two fingers fit 5 cm apart the distribution is empty, not an endless loop."""
+    rig = make_paper_rig(6, 6)
+    small = replace(
+        rig,
+        plate=replace(rig.plate, length=0.03, width=0.03),
+        mesh=replace(rig.mesh, length=0.03, width=0.03),
+        eras=tuple(replace(era, x=0.03 * (era.x > 0), y=0.03 * (era.y > 0)) for era in rig.eras),
+    )
+    built = build_table(small, frequencies=np.array([110.0]), grid=Grid(2, 2))
+    summary = summarize(built, find_overview(built))
+    assert summary["promised_contrast_1_quiet_median_db"] is None
+    assert summary["feasible_share"] is None
+
+
+def test_weak_cells_are_not_feasible_when_only_19_db_sl_are_reached(table):
+    """The map is at 20 dB SL, which no pattern reaches with these strokes."""
+    weaker = with_strokes(table, 10 ** ((19.0 - table.available_level_db_sl.max()) / 20))
+    assert weaker.available_level_db_sl.max() == pytest.approx(19.0, abs=0.01)
+    weak = find_overview(weaker).cells
+    assert np.isneginf(weak.median_db).all()
+    assert not weak.feasible.any()
+
+
+def test_summary_counts_levels_and_shares(table):
+    """Levels from 12 dB SL count as felt; shares are of the cells for which there is a value."""
+    one_to_hundred = np.array([np.arange(101.0), np.arange(101.0) + 5])
+    levels = np.sort(table.available_level_db_sl)
+    lower = 10 ** ((12.0 - levels[5:7].mean()) / 20)  # six of twelve cells are below 12 dB SL then
+    quieter = with_strokes(table, lower)
+    values = np.array([20.0, 12.0, 9.0, -np.inf, *[np.nan] * 8])
+    errors = np.zeros((2, 12))
+    weak = WeakCells(table.grid, np.zeros((12, 2)), values, values - 0.1, errors, one_to_hundred)
+    layers = tuple(LaminateLayer(table.plate.material, thickness) for thickness in (1e-3, 2e-3))
+    quieter = replace(quieter, plate=replace(table.plate, laminate=Laminate(layers)))
+    summary = summarize(quieter, Overview(weak, [one_to_hundred] * 3))
+    assert summary["plate_m"][2] == pytest.approx(3e-3)  # not of one material that bends alike
+    assert summary["frequency_range_hz"] == [60.0, 250.0]
+    expected = {
+        "dead_zone_share": 0.5,
+        "least_level_at_full_stroke_db_sl": levels[0] + 20 * np.log10(lower),
+        "feasible_share": 0.5,
+        "weak_share": 0.75,
+        "frequency_count": 3,
+        "patterns": 4 * 3 + 6 * 3**2,
+        "promised_contrast_2_quiet_median_db": 50.0,
+        "promised_contrast_2_quiet_tenth_percentile_db": 10.0,
+        "contrast_2_quiet_median_db": 55.0,
+        "discretisation_error_percent": 100 * max(quieter.discretisation_error),
+    }
+    assert {name: summary[name] for name in expected} == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("others", [1, 3])
+def test_contact_sets_are_of_fingers_apart(table, others):
+    """As many sets as are wanted, all at least 5 cm apart, no two alike."""
+    questions = set_questions(table, others=others, rng=np.random.default_rng(1))
+    assert len({question.contacts for question in questions}) == CONTACT_SETS
+    for question in questions:
+        assert len(question.quiet) == others
+        for one, other in combinations(question.contacts, 2):
+            assert math.dist(one, other) >= 0.05
+
+
+def test_sets_that_miss_the_level_are_left_out():
+    """Of three answers the one without contrast."""
+    assert contrasts_reached([(1.0, 2.0), None, (3.0, 4.0)]).tolist() == [[1, 3], [2, 4]]
+    assert contrasts_reached([None]).shape == (2, 0)

@@ -1,15 +1,72 @@
-"""How far magnets move on a plate, worked out for rigid ones."""
+"""How far magnets move on a plate, worked out for rigid ones.
+
+Bases that move along samples, against SciPy's integration of the equations of motion.
+
+Exciters on a board in time, settled: what the frequency domain says at each frequency.
+
+Knots by the kernel in C, beside the same in numpy.
+
+Magnets that are pumped by levels that swing, worked out for coils that are held.
+"""
 
 import math
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import StateSpace, lsim
 
+from model.answer.answer import swings_of_pulse
+from model.answer.stimulus import Course
 from model.reduction.free_plate import solve_free_plate
+from model.reduction.reduced_plate import (
+    modal_matrices,
+    reduce_free_plate,
+    reduce_plate,
+    supported_modes,
+)
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.structure.attachments import (
+    Fingertip,
+    FingertipLoad,
+    fingertip_loads,
+    footprints_of,
+    rigid_body_frequencies,
+)
 from model.structure.exciter import Exciter
-from model.transients.excursions import excursions_of, relative_motions
-from plates import exciter_rig
+from model.table.table_file import build_table
+from model.transients.base_motion import shaped
+from model.transients.excursions import (
+    CLICKS_APART,
+    MagnetMotions,
+    Swing,
+    excursions_of,
+    magnets_of,
+    motions_along,
+    relative_motions,
+)
+from model.transients.knots import (
+    Carrier,
+    FingerResponses,
+    ending_by_numpy,
+    ending_knots,
+    onset_by_numpy,
+    onset_knots,
+    quiet_weight,
+    steady_states,
+)
+from model.transients.shaping import Shaper, Transients, of_eras, responses_at
+from model.transients.time_response import (
+    PlateInTime,
+    enveloped_accelerations,
+    from_rest,
+    plate_in_time,
+)
+from model.vibration import Tone
+from plates import exciter_rig, make_paper_rig
 
 
 def test_magnets_on_a_board_as_light_as_they_are() -> None:
@@ -48,3 +105,288 @@ def test_excursion_within_the_frequencies_of_a_rig() -> None:
     assert 60 < half.allowed < full.allowed < 300
     narrow = replace(rig, limits=replace(rig.limits, frequency_min=full.allowed))
     assert not excursions_of(narrow).passed.any()
+
+
+RATE, COUNT, FINER = 5000.0, 400, 64
+
+
+def chirp(times: np.ndarray) -> np.ndarray:
+    """A burst from 60 to 400 Hz that comes and goes smoothly within 70 ms."""
+    window = np.exp(-(((times - 0.04) / 0.009) ** 2))
+    return np.asarray(window * np.sin(2 * np.pi * (60 * times + 2100 * times**2)))
+
+
+def test_bursts_are_followed_as_scipy_integrates() -> None:
+    """Two ERAs at once, one late and turned, a finger on the plate: to 1e-4 of the peak.
+
+    SciPy is given the bases' motion and velocity 64 times as finely, joined by straight lines. With
+    twice as many samples the plate moves the same, to 1e-7, as band-limited signals say no more.
+    """
+    rig = make_paper_rig(12, 9)
+    tips = fingertip_loads(Fingertip(), [(0.1, 0.08)])
+    reduced = reduce_plate(rig.plate, rig.mesh, footprints_of(rig.eras, (), tips))
+    plate = plate_in_time(reduced, rig.eras, contacts=tips)
+    points = np.array([[0.1, 0.08], [0.25, 0.2]])
+
+    def played(rate: float, count: int) -> np.ndarray:
+        times, signals = np.arange(count) / rate, np.zeros((4, count))
+        signals[0], signals[3] = 0.8 * chirp(times), -0.5 * chirp(times - 0.003)
+        factors = np.ones(4, dtype=complex)
+        return from_rest(plate, signals, reduced.at(points), sample_rate=rate, factors=factors)
+
+    found = played(RATE, COUNT)
+    finer = played(2 * RATE, 2 * COUNT)[::2]
+    np.testing.assert_allclose(found, finer, atol=1e-7 * np.abs(finer).max())
+
+    M, C, K = modal_matrices(reduced, rig.eras, contacts=tips)
+    r, inverse = len(M), np.linalg.inv(M)
+    phi = np.pad(reduced.at(footprints_of(rig.eras)), ((0, 0), (0, 1)))[[0, 3]].T
+    A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
+    eras = [rig.eras[0], rig.eras[3]]
+    k, c = (np.array([getattr(era, key) for era in eras]) for key in ("stiffness", "damping"))
+    B = np.vstack([np.zeros((r, 4)), inverse @ np.hstack([phi * k, phi * c])])
+    shapes = np.pad(reduced.at(points), ((0, 0), (0, 1)))
+    system = StateSpace(A, B, shapes @ A[r:], shapes @ B[r:])  # gives the acceleration
+    fine = np.arange(COUNT * FINER) / (RATE * FINER)
+    bases = np.array([0.8 * chirp(fine), -0.5 * chirp(fine - 0.003)]).T * rig.eras[0].stroke
+    _, expected, _ = lsim(system, np.hstack([bases, np.gradient(bases, fine, axis=0)]), fine)
+    np.testing.assert_allclose(found, expected[::FINER], atol=1e-4 * np.abs(expected).max())
+
+
+POINTS = np.array([[0.05, 0.05], [0.15, 0.12], [0.28, 0.2]])
+FINGER = FingertipLoad(0.11, 0.09, Fingertip())
+
+
+def in_time(rig: Rig, *contacts: FingertipLoad) -> PlateInTime:
+    """Its plate, reduced for all that acts on it."""
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses, [FINGER]))
+    return plate_in_time(reduced, rig.eras, loads=rig.masses, contacts=contacts)
+
+
+def lossless(keys: str) -> Rig:
+    """A board that itself hardly loses, as losses of a plate differ in time off resonance."""
+    rig = exciter_rig(keys, frequency="[40, 500]")
+    gains = ((40.0, 1.0, 0.0), (500.0, 0.7, -0.5))
+    eras = tuple(replace(era, gains=gains) for era in rig.eras)
+    return replace(rig, plate=replace(rig.plate, loss_factor=1e-4), eras=eras)
+
+
+@pytest.mark.parametrize(
+    "keys", ["type: DAEX25FHE-4", "type: DAEX13-4SM", "type: DAEX25FHE-4, magnet: held"]
+)
+def test_settled_vibration_is_that_of_the_frequency_domain(keys: str) -> None:
+    """Of each exciter alone, under a finger: within (omega L / R)² of the current, 0.6 %."""
+    rig = lossless(keys)
+    plate = in_time(rig, FINGER)
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    frequencies = np.array([40.0, 62.0, 90.0, 170.0, 330.0, 500.0])
+    expected = free.acceleration(rig.eras, frequencies, POINTS, loads=(*rig.masses, FINGER))
+    for frequency, fields in zip(frequencies, expected, strict=True):
+        omega = 2 * math.pi * frequency
+        states = steady_states(plate, omega)
+        found = -(omega**2) * states @ (plate.shapes_at(POINTS) @ plate.displacement).T
+        apart = np.linalg.norm(found - fields, axis=1) / np.linalg.norm(fields, axis=1)
+        assert apart.max() < 6e-3
+
+
+def test_envelopes_lead_to_the_settled_vibration() -> None:
+    """A finger held by its forces on the plate without it: the last row, all exciters at once."""
+    rig = lossless("type: DAEX25CT-4")
+    plate, weights = in_time(rig), np.array([1.0, 0.3j, -0.5, 0.8])
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=500.0)
+    fields = free.acceleration(rig.eras, np.array([90.0]), POINTS, loads=(*rig.masses, FINGER))
+    found = enveloped_accelerations(
+        plate,
+        weights * [era.full_level for era in rig.eras],
+        90.0,
+        points=plate.reduced.at(POINTS),
+        fingers=[(plate.reduced.at(np.array([[0.11, 0.09]]))[0], FINGER.fingertip)],
+        envelope=np.hanning(60),
+        step=0.002,
+    )
+    assert found[-1] == pytest.approx(weights @ fields[0], rel=5e-3)
+
+
+def test_lowest_modes_are_those_of_a_board_and_magnets_worked_out() -> None:
+    """A stiff board and four magnets that heave: two masses on two springs, by their determinant.
+
+    Statically a free magnet is a weight, and holds nothing.
+    """
+    rig = exciter_rig("type: DAEX25FHE-4, coil_mass: 0, resonance: 27.2, resonance_is: mounted")
+    stiff = replace(rig.plate, material=replace(rig.plate.material, E=1e13))
+    board, magnets, foam = stiff.mass, 4 * 0.10929, 4 * 2000.0
+    k = magnets * (2 * math.pi * 27.2) ** 2
+    a, b, c = board * magnets, -(k * (board + magnets) + foam * magnets), k * foam
+    heaves = np.sqrt(np.roots([a, b, c])) / (2 * math.pi)
+    modes = supported_modes(
+        in_time(replace(rig, plate=stiff)).reduced, rig.eras, loads=rig.masses, frequency_max=100.0
+    )
+    centre = np.abs(modes.at(np.array([[0.15, 0.115]]))[0])
+    found = modes.natural_frequencies[centre > 0.3 * centre.max()]
+    assert found[[0, -1]] == pytest.approx(sorted(heaves.real), rel=0.02)
+    rigid = rigid_body_frequencies(stiff, rig.eras, loads=rig.masses)
+    assert rigid[0] == pytest.approx(math.sqrt(foam / (board + magnets)) / (2 * math.pi), rel=0.02)
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+VARIANCE = 0.05**2 + np.radians(5) ** 2
+
+
+def random_plate(rng, eras: int, quiet: int) -> tuple[Carrier, FingerResponses]:
+    """Responses that ring and decay, of one target and so many quiet fingers."""
+    r, samples, steps = 6 + quiet, 5, 30
+
+    def drawn(*shape):
+        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+    ago = np.arange(steps)[::-1, None] + np.arange(samples) / samples
+    rates = rng.uniform(-0.4, -0.1, r) + 1j * rng.uniform(-2, 2, r)
+    shapes = drawn(r, eras)
+    hats = np.exp(rates * ago[..., None]).transpose(1, 2, 0)[..., None] * shapes[:, None]
+    rows = drawn(8 * eras, 8 * eras) * np.repeat(0.5 ** np.arange(8), eras)[::-1]
+    form = rows.conj().T @ rows
+    single = np.complex64
+    carrier = Carrier(
+        hats.astype(single), drawn(eras, r), form.astype(single), gain_variance=VARIANCE
+    )
+    at = rng.standard_normal((1 + 5 * quiet, r))
+    return carrier, responses_at(carrier, at[:1], at[1:])
+
+
+@pytest.mark.usefixtures("kernels_or_numpy")
+@pytest.mark.parametrize(("eras", "quiet"), list(product([4, 5, 8, 11, 16], [1, 9])))
+@pytest.mark.parametrize("level", [0.05, 1.0])
+def test_knots_are_those_of_numpy(eras, quiet, level):
+    """Random tones, low ones and at full stroke; some ERAs silent in the endings.
+
+    In single precision; the bounded ones of the others after thirty steps.
+    """
+    rng = np.random.default_rng(100 * eras + quiet)
+    carrier, found = random_plate(rng, eras, quiet)
+    weights = rng.standard_normal(eras) + 1j * rng.standard_normal(eras)
+    weights *= level / np.abs(weights).max()
+    knots = onset_knots(weights, found, VARIANCE)
+    expected = onset_by_numpy(weights, found, VARIANCE)
+    np.testing.assert_allclose(knots[1:-1], expected, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_array_equal(knots[0], 0)
+    np.testing.assert_array_equal(knots[-1], weights)
+    assert np.abs(knots[1:-1]).max() <= 1
+    active = np.arange(eras)[rng.permutation(eras) > 0]
+    for felt in (None, of_eras(found, active)):
+        weight = 0.0 if felt is None else quiet_weight(carrier, weights, active, felt)
+        knots = ending_knots(carrier, weights, active, felt)
+        expected = ending_by_numpy(carrier, weights, active, felt, weight)
+        np.testing.assert_allclose(knots[1:-1], expected, atol=2e-3 * np.abs(expected).max())
+        np.testing.assert_array_equal(knots[0], weights[active])
+        np.testing.assert_array_equal(knots[-1], 0)
+        assert np.abs(knots[1:-1]).max() <= 1
+
+
+@pytest.mark.parametrize("rig", ["paper_plate", "eight_eras", "table"])
+def test_onsets_and_endings_do_what_those_of_numpy_do(rig, without_kernels):
+    """Contrast of onsets within 0.02 dB, what is left after endings within 0.2, on rigs.
+
+    At a fifth of the stroke and at all of it; against no, one and three quiet fingers.
+    """
+    table = build_table(load_rig(EXAMPLES / f"{rig}.yaml"), frequencies=np.array([130.0]))
+    shaper = Shaper(table.in_time, gain_variance=VARIANCE)
+    transients = Transients(table.in_time)
+    rng = np.random.default_rng(7)
+    size = np.array([table.plate.length, table.plate.width])
+    cases = []
+    for quiet, level in product([0, 1, 3], [0.2, 1.0]):
+        places = [tuple(each) for each in (size * rng.uniform(0.1, 0.9, (1 + quiet, 2))).tolist()]
+        weights = rng.standard_normal((len(table.eras), 2)) @ [1, 1j]
+        weights *= level / np.abs(weights).max()
+        cases.append((places, excitation(table, weights)))
+
+    def measured():
+        found = []
+        for (target, *quiet), tones in cases:
+            onset = shaped(shaper.onset(tones, targets=[target], quiet=quiet), table.eras)
+            ending = shaped(shaper.ending(tones, targets=[target], quiet=quiet), table.eras)
+            others = quiet or [tuple((size - target).tolist())]
+            contrast = transients.contrast_db(onset, targets=[target], quiet=others)
+            found.append((contrast, transients.residual_db(tones, ending)))
+        return np.array(found)
+
+    by_kernel = measured()
+    without_kernels()
+    by_numpy = measured()
+    np.testing.assert_allclose(by_kernel[:, 0], by_numpy[:, 0], atol=0.02)
+    np.testing.assert_allclose(by_kernel[:, 1], by_numpy[:, 1], atol=0.2)
+    assert np.abs(by_kernel - by_numpy).max() > 0  # two ways indeed
+
+
+def excitation(table, weights):
+    """Tones of 130 Hz from weights in strokes."""
+    return {
+        era.name: Tone(130.0, float(era.stroke * abs(w)), float(np.angle(w)))
+        for era, w in zip(table.eras, weights, strict=True)
+    }
+
+
+K, C, M, BL, R, VOLTS = 3189.2, 0.7553, 0.10929, 3.63, 4.4, 3.0008
+"""Of the exciter of 25 mm at 1 W, from its sheet: 27 Hz and a quality of 5 on a held coil."""
+
+
+def held() -> MagnetMotions:
+    """Four on a board that weighs 240 times as much as their magnets."""
+    keys = "type: DAEX25FHE-4, power: 1 W, stiffness: 3189.2, damping: 0.7553, inductance: 0"
+    rig = exciter_rig(keys)
+    heavy = replace(rig.plate.material, E=1e13, rho=3e5)
+    rig = replace(rig, plate=replace(rig.plate, material=heavy))
+    return magnets_of(rig, solve_free_plate(rig.plate, rig.mesh, frequency_max=300.0))
+
+
+def by_hand(frequency: float, swing: Swing) -> float:
+    """Largest |x| of M x'' + (c + Bl^2 / R) x' + k x = Bl V e(t) exp(i w t) / R."""
+    ends = swing.step * np.arange(len(swing.shares))
+    times = np.arange(0, ends[-1], 2e-4)
+    level = BL * VOLTS / R * np.interp(times, ends, swing.shares)
+    push, mass = level * np.exp(2j * math.pi * frequency * times), ([1.0], [M, C + BL**2 / R, K])
+    parts = [lsim(mass, each, times)[1] for each in (push.real, push.imag)]
+    return float(np.hypot(*parts).max())
+
+
+@pytest.mark.parametrize("frequency", [40.0, 47.0])
+def test_motion_along_a_level_that_swings_is_that_of_one_mass(frequency: float) -> None:
+    """At the beat of drive and magnet the level moves it further than one that lasts."""
+    magnets, times = held(), 0.01 * np.arange(61)
+    wave = (1 - np.cos(2 * math.pi * (frequency - 27.2) * times)) / 2
+    for shares in (wave, np.minimum(times / 0.01, 1)):
+        swing = Swing(tuple(shares.tolist()), 0.01)
+        found = motions_along(magnets.plate, magnets.rows, frequency, swing)
+        assert found == pytest.approx([by_hand(frequency, swing)] * 4, rel=0.02)
+
+
+def test_pulses_over_and_over_add_up_where_they_come_at_the_worst_pace() -> None:
+    """The worst of trains whose pauses are tried one by one; a single one moves it less."""
+    magnets, frequency = held(), 40.0
+    single, _ = swings_of_pulse(0.04, 0.01)
+    once, largest = replace(single, again=math.inf), 0.0
+    for pause in range(60, 120, 4):
+        train = np.zeros(900)
+        for start in range(0, 500, pause):
+            part = single.shares[: len(train) - start]
+            train[start : start + len(part)] += part
+        largest = max(largest, by_hand(frequency, Swing(tuple(train.tolist()), 0.001)))
+    assert single.again == CLICKS_APART == 0.06
+    found = motions_along(magnets.plate, magnets.rows, frequency, single)
+    assert found == pytest.approx([largest] * 4, rel=0.05)
+    alone = motions_along(magnets.plate, magnets.rows, frequency, once)
+    assert found[0] > 1.1 * alone[0]
+
+
+def test_courses_swing_as_they_are_played_from_knot_to_knot() -> None:
+    """Of 95 swings a second knots every 10 ms leave 5, once and then over and over."""
+    times = np.arange(0.0, 0.6, 0.001)
+    shares = (1 + np.cos(2 * math.pi * 95 * times)) / 2
+    swing = Course(tuple(times.tolist()), tuple(shares.tolist())).swings[0]
+    found = np.array(swing.shares)
+    expected = (1 + np.cos(2 * math.pi * 5 * swing.step * np.arange(1, 60))) / 2
+    assert swing.step == 0.01
+    assert found[1:60] == pytest.approx(expected, abs=1e-6)
+    assert (found[60:85] == 0).all()
+    assert found[85:].max() > 0.99

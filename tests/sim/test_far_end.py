@@ -1,6 +1,19 @@
-"""Accelerometers on a bench, recordings of them and of fingers, and their files."""
+"""Accelerometers on a bench, recordings of them and of fingers, and their files.
+
+Delays of lines against the numbers of their standards and data sheets.
+
+Stable names of pseudo-terminals.
+
+Programs of the firmware as amplifiers, and the frequencies of their samples.
+"""
 
 import math
+import os
+import signal
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +25,13 @@ from long_form import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from recordings import read_recording
+from sim import firmware
 from sim.bench.bench import Bench
+from sim.firmware import ending_with_parent, frequencies_in
 from sim.plant.fingers import Accelerometer, readings
 from sim.sensors import Recorder, Recording, write_recording
+from sim.transport.far_end import linked_urls, links_by_amplifier
+from sim.transport.simulated_line import LINE_KINDS, Latency, LineKind
 
 RATE = 5000.0
 
@@ -197,3 +214,179 @@ def test_write_recording_refuses_what_a_format_cannot_hold(
     with pytest.raises(InputError, match="a long name"):
         write_recording(tmp_path / "run.uff", named)
     assert not list(tmp_path.iterdir())
+
+
+PROMPT = Latency()
+FRAME_ERROR = 50e-6  # of a frame's length, relative
+
+
+def test_usb_moves_bytes_in_the_next_frame() -> None:
+    """Either way 0 to 1 ms later, 0.5 ms on average, at whole frames from each other."""
+    delays = LineKind(PROMPT, PROMPT, frame=1e-3).delays(1)
+    times = [number * 1.3717e-3 for number in range(2000)]
+    for shift in (delays.leave, delays.arrive):
+        moved = [shift(time, 10) for time in times]
+        late = [after - before for after, before in zip(moved, times, strict=True)]
+        assert min(late) >= 0
+        assert max(late) <= 1e-3 * (1 + FRAME_ERROR)
+        assert statistics.mean(late) == pytest.approx(0.5e-3, rel=0.05)
+        frames = [(time - moved[0]) / 1e-3 for time in moved]
+        assert all(abs(frame - round(frame)) <= FRAME_ERROR * frame + 1e-6 for frame in frames)
+
+
+def test_bytes_take_their_time_on_usb() -> None:
+    """1 500 bytes at 12 Mbit/s: 1 ms."""
+    delays = LineKind(PROMPT, PROMPT, usb_byte=8 / 12e6).delays(1)
+    assert delays.leave(2.0, 1500) == pytest.approx(2.001)
+    assert delays.arrive(3.0, 1500) == pytest.approx(3.001)
+
+
+def test_ftdi_holds_small_replies_until_its_timer_has_run() -> None:
+    """10 bytes wait for 8 ms on average, at most 16; 62 go at once, and the timer begins anew."""
+    delays = LineKind(PROMPT, PROMPT, latency_timer=16e-3).delays(1)
+    times = [0.1 + number * 0.0371 for number in range(2000)]
+    late = [delays.arrive(time, 10) - time for time in times]
+    assert 0 < min(late) <= max(late) <= 16e-3
+    assert statistics.mean(late) == pytest.approx(8e-3, rel=0.05)
+    assert delays.arrive(100.0, 62) == 100.0
+    assert delays.arrive(100.001, 10) == pytest.approx(100.016)
+    assert delays.arrive(100.002, 10) == pytest.approx(100.016)  # in the same packet
+    assert delays.arrive(200.0, 100) == pytest.approx(200.016)  # all but the first 62
+
+
+def test_latency_has_its_least_and_median_and_stalls() -> None:
+    """Half of 20 000 draws lie below 10 + 20 us; 2 % have 1 ms more on average."""
+    rng = LINE_KINDS["native"].delays(1)._rng
+    drawn = [Latency(10e-6, 20e-6, 0.5).draw(rng) for _ in range(20_000)]
+    assert min(drawn) > 10e-6
+    assert statistics.median(drawn) == pytest.approx(30e-6, rel=0.03)
+    stalled = [Latency(stalls=0.02, stall=1e-3).draw(rng) for _ in range(50_000)]
+    assert sum(each > 0 for each in stalled) / 50_000 == pytest.approx(0.02, rel=0.1)
+    assert statistics.mean(each for each in stalled if each) == pytest.approx(1e-3, rel=0.1)
+    assert max(stalled) <= 5e-3
+
+
+@pytest.mark.parametrize("name", LINE_KINDS)
+def test_delays_keep_the_order_and_are_those_of_their_seed(name: str) -> None:
+    """What is written first leaves first, each way, none too late; another seed, other delays."""
+
+    def drawn(seed: object) -> list[float]:
+        delays = LINE_KINDS[name].delays(seed)
+        return [delays.leave(n * 1e-4, 30) for n in range(300)] + [
+            delays.arrive(n * 1e-4, 30) for n in range(300)
+        ]
+
+    times = drawn(("line", 1))
+    spent = [time - n % 300 * 1e-4 for n, time in enumerate(times)]
+    assert max(spent[:300]) + max(spent[300:]) <= LINE_KINDS[name].max_delay + 1e-3
+    assert times[:300] == sorted(times[:300])
+    assert times[300:] == sorted(times[300:])
+    assert times == drawn(("line", 1)) != drawn(("line", 2))
+
+
+@pytest.fixture
+def terminal() -> Iterator[str]:
+    """The path of a pseudo-terminal."""
+    near, far = os.openpty()
+    yield os.ttyname(far)
+    os.close(near)
+    os.close(far)
+
+
+def test_amplifiers_of_one_line_share_its_link(tmp_path: Path, terminal: str) -> None:
+    """The rest of each URL stays; the link leads to the terminal, and goes at the end."""
+    link = tmp_path / "line"
+    urls = {
+        "a": f"serial://{terminal}?address=1",
+        "b": f"serial://{terminal}?address=2",
+        "c": "modbus+tcp://127.0.0.1:502/1",
+    }
+    with linked_urls(urls, links_by_amplifier([str(link)], amplifiers=list(urls))) as moved:
+        assert moved == {
+            "a": f"serial://{link}?address=1",
+            "b": f"serial://{link}?address=2",
+            "c": "modbus+tcp://127.0.0.1:502/1",
+        }
+        assert str(link.readlink()) == terminal
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("options", [["d=/tmp/x"], ["a="], ["a=/tmp/x", "/tmp/y"]])
+def test_options_that_name_no_line_are_refused(options: list[str]) -> None:
+    """An unknown amplifier, no path, and two paths for one amplifier."""
+    with pytest.raises(InputError, match="--link"):
+        links_by_amplifier(options, amplifiers=["a", "b"])
+
+
+def test_a_line_has_one_link_and_a_network_none(tmp_path: Path, terminal: str) -> None:
+    """Nothing is linked then."""
+    urls = {"a": f"serial://{terminal}?address=1", "b": f"serial://{terminal}?address=2"}
+    with (
+        pytest.raises(InputError, match="one per line"),
+        linked_urls(urls, {"a": tmp_path / "a", "b": tmp_path / "b"}),
+    ):
+        pass
+    with (
+        pytest.raises(InputError, match="pseudo-terminal"),
+        linked_urls({"a": "modbus+tcp://127.0.0.1:502/1"}, {"a": tmp_path / "a"}),
+    ):
+        pass
+    assert not any(path.is_symlink() for path in tmp_path.iterdir())
+
+
+PROGRAMS_RATE = 16_000.0
+
+
+@pytest.mark.parametrize("frequency", [40.0, 128.45, 270.0, 499.95])
+def test_frequency_of_a_steady_tone_is_found_to_the_step_of_the_wire(frequency: float) -> None:
+    """In a quarter of a second, on channels of other levels and phases; silent ones have none."""
+    t = np.arange(4000) / PROGRAMS_RATE
+    tones = [0.9 * np.sin(2 * np.pi * frequency * t), 0.01 * np.cos(2 * np.pi * frequency * t)]
+    samples = np.column_stack([*tones, np.zeros((len(t), 2))])
+    assert frequencies_in(samples, rate=PROGRAMS_RATE) == pytest.approx([frequency], abs=0.051)
+
+
+def test_frequencies_of_channels_and_of_a_cross_fade_are_told_apart() -> None:
+    """Two channels with a tone each, one of which changes to another."""
+    t = np.arange(4000) / PROGRAMS_RATE
+    changing = np.where(t < 0.12, np.sin(2 * np.pi * 100 * t), 0.5 * np.sin(2 * np.pi * 180 * t))
+    samples = np.column_stack([changing, np.sin(2 * np.pi * 130 * t)])
+    assert frequencies_in(samples, rate=PROGRAMS_RATE) == pytest.approx([100, 130, 180], abs=0.5)
+
+
+def test_missing_firmware_is_told_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a checkout the command that builds it, elsewhere that a checkout is needed."""
+    monkeypatch.setattr(firmware, "FOLDER", tmp_path / "out" / "firmware")
+    with pytest.raises(InputError, match="checkout"):
+        firmware.find_firmware()
+    (tmp_path / "firmware").mkdir()
+    with pytest.raises(InputError, match="make firmware"):
+        firmware.find_firmware()
+
+
+PARENT = """
+import subprocess, sys, time
+from sim.firmware import ending_with_parent
+child = [sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"]
+subprocess.Popen(ending_with_parent(child))
+time.sleep(60)
+"""
+
+
+def test_child_ends_when_its_parent_is_killed() -> None:
+    """Its output is at its end then, although nobody has told it."""
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == b"here\n"
+        parent.send_signal(signal.SIGKILL)
+        assert parent.stdout.read() == b""
+
+
+def test_child_whose_parent_is_gone_does_not_start() -> None:
+    """As if the parent had been killed before the child could ask to be told."""
+    command = ending_with_parent([sys.executable, "-c", "print('here')"])
+    command[3] = str(os.getpid() + 1)
+    done = subprocess.run(command, capture_output=True, check=False)
+    assert done.stdout == b""

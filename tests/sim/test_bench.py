@@ -1,0 +1,492 @@
+"""What voices do to the plate follows the clock of their amplifier: its law, crystal and rate.
+
+Sensors of amplifiers of protocol 4: what they measure, what disturbs, what is refused.
+
+A whole rig in numbers: from a request to what a finger feels, on a virtual clock.
+"""
+
+import asyncio
+import cmath
+import json
+import math
+import random
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.direct_plate import direct_acceleration
+from drivers.host.amplifier import measure_tones, read_sensors
+from drivers.playing import Tone, Transition, Voice
+from drivers.protocol.definition import READING_STATES
+from drivers.protocol.records import Refusal, Values
+from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
+from firmware_machine import SESSION as FIRMWARE_MACHINE_SESSION
+from firmware_machine import bench_driving_arm, keep_alive
+from firmware_machine import play as firmware_machine_play
+from model.arrays import FloatArray
+from model.fem import assemble
+from model.finger import fingertip_points
+from model.rig.rig import Channel, Rig
+from model.structure.attachments import Fingertip, FingertipLoad
+from plates import apart, lock_in
+from real_wires import WIRES, layer, on_two_amplifiers, rig_on_wire
+from registry import threads
+from sim.amplifier.readings import AmplifierClock, Crystal
+from sim.bench.bench import WRONG, Bench, StraightClocks
+from sim.control import SimulationContext, carry_out
+from sim.plant.fingers import Accelerometer
+from sim.plant.imperfections import Imperfections, motion_of
+from sim.plant.plant import LoadedPlate, Placement
+from sim.sensors import Accelerometers
+from virtual_lines import in_virtual_time
+
+AT = (0.08, 0.06)
+
+
+@pytest.fixture(scope="module")
+def two_amplifiers(coarse_rig: Rig) -> Rig:
+    """The paper's plate; two ERAs on one amplifier, two on another."""
+    wiring = {
+        era.name: Channel("left" if number < 2 else "right", number % 2)
+        for number, era in enumerate(coarse_rig.eras)
+    }
+    return replace(coarse_rig, wiring=wiring, amplifiers={"left": "sim://", "right": "sim://"})
+
+
+def phases(bench: Bench, times: tuple[float, ...], *frequencies: float) -> np.ndarray:
+    """Phases [rad] (t, f) of tones at the finger, mean of the half second before each time [s]."""
+    found = []
+    for time in times:
+        keep_alive(bench, time)
+        (record,) = bench.fingers.felt(time - 0.5, time).values()
+        samples = record.accelerations[:, 0]
+        found.append([np.angle(lock_in(record.times, samples, each)) for each in frequencies])
+    return np.array(found)
+
+
+def test_angle_is_the_frequency_word_times_the_clock(two_amplifiers: Rig) -> None:
+    """In whole numbers, over the end of a turn and hours later, whenever the voice has begun."""
+    clock = AmplifierClock(Crystal(error=30e-6, ahead=11.0))
+    clock.steer(-123, 40.0)
+    for time in (41.3, 48.9999, 49.0001, 20_000.7):
+        for word, began in ((1999, 41.0), (2000, time - 0.01), (9037, time)):
+            way = Transition(began, 0.0, 0j, 1 + 0j, began)
+            (term,) = motion_of([Voice(0, word / 20, began, way)], clock.straight(time), stroke=1.0)
+            angle = term.omega * (time - term.start)
+            moved = (term.c0 * complex(math.cos(angle), math.sin(angle))).imag
+            turns = (word * clock.reading(time)) % 2**32 / 2**32
+            # The clock is read to half a step: 9037 / 2 of 2^32 parts of a turn, 7e-6 rad.
+            assert moved == pytest.approx(math.sin(2 * math.pi * turns), abs=1e-5)
+
+
+def test_tone_goes_on_where_the_clock_goes_round(coarse_rig: Rig) -> None:
+    """A steady tone of 110.05 Hz has no step and no new phase at 20 s and at 40 s."""
+    bench = Bench(coarse_rig, now=18.0)
+    bench.place_fingers({"a": AT}, now=18.0)
+    firmware_machine_play(bench, Tone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
+    before, over, after = phases(bench, (19.9, 20.4, 40.3), 110.05)
+    assert before == pytest.approx(over, abs=1e-5)
+    assert before == pytest.approx(after, abs=1e-5)
+
+
+def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
+    """At +40 and -30 ppm, two amplifiers move apart by 70 us each second, until one is steered."""
+    crystals = {"left": Crystal(error=40e-6), "right": Crystal(error=-30e-6)}
+    bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(crystals=crystals))
+    bench.place_fingers({"a": AT}, now=0.0)
+    for name, frequency in (("left", 110.0), ("right", 170.0)):
+        firmware_machine_play(
+            bench, Tone(0, frequency, 0.5), now=0.0, name=name, watchdog=2.0, ramp=0.02
+        )
+    found = phases(bench, (3.0, 5.0), 110.0, 170.0)
+    left, right = (found[1] - found[0]) / (2 * math.pi * np.array([110.0, 170.0]))
+    assert (left, right) == pytest.approx((80e-6, -60e-6), abs=0.5e-6)
+    for step in range(200):  # 70 ppm slower, it is as slow as the other
+        bench.exchange(
+            "left",
+            "Ping",
+            {"session": FIRMWARE_MACHINE_SESSION, "rate": -700},
+            now=5.05 + step / 20,
+        )
+    steered = phases(bench, (15.5,), 110.0)[0, 0] - found[1, 0]
+    # From 4.75 s to 5.05 s as before, and to 15.25 s so.
+    expected = 0.3 * 40e-6 - 10.2 * 30e-6
+    assert steered / (2 * math.pi * 110) == pytest.approx(expected, abs=1e-6)
+
+
+def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
+    """Arm with 5 steps of 20 s / 65536 lets a tone of 110 Hz lead by 60.4 degrees."""
+    found = []
+    for shift in (0, 5):
+        bench = Bench(coarse_rig, now=0.0)
+        bench.place_fingers({"a": AT}, now=0.0)
+        values = {"session": FIRMWARE_MACHINE_SESSION, "watchdog": 2000, "shift": shift}
+        bench.exchange("main", "Arm", values, now=0.0)
+        firmware_machine_play(bench, Tone(0, 110.0, 0.5), now=0.1)
+        found.append(phases(bench, (3.0,), 110.0)[0, 0])
+    assert math.degrees(found[1] - found[0]) == pytest.approx(360 * 110 * 5 * 20 / 65536, abs=1e-3)
+
+
+def test_plate_follows_a_steered_clock_by_few_changes() -> None:
+    """Rates that differ by 1 ppm, every 50 ms: 0.6 us wrong at most by a change in two seconds."""
+    chance = random.Random(1)
+    clock = AmplifierClock(Crystal(error=50e-6, warm_up=1e-6), since=0.0)
+    plate, changes, time = StraightClocks({"a": clock}, time=0.0), 0, 0.0
+    for number in range(1, 2400):
+        while (due := plate.next_due) < number / 20:
+            changes += len(plate.renew(due))
+            time = due
+        time = number / 20
+        assert abs(plate.straight["a"].at(time) - clock.straight(time).shown) < WRONG + 0.1e-6
+        steady = -round(1e7 * (clock.crystal.pace(time) - 1))
+        clock.steer(steady + chance.randrange(-10, 11), time)
+        changes += len(plate.renew(time))
+    assert changes < 60
+
+
+SESSION = 9
+
+
+def bench_of(rig: Rig) -> Bench:
+    """A bench whose amplifiers are armed at 5 s, for 2 s at a time."""
+    bench = Bench(rig, now=5.0)
+    for name in bench.amplifiers:
+        bench.exchange(name, "Arm", {"session": SESSION, "watchdog": 2000, "shift": 0}, now=5.0)
+    return bench
+
+
+def play(bench: Bench, token: int, *layers: LayerSet, now: float) -> None:
+    """Play layers on the amplifier main."""
+    for part in parts(pack_layers(layers), session=SESSION, token=token, now=True):
+        bench.exchange("main", "Set", part, now=now)
+
+
+def measure(bench: Bench, number: int, *frequencies: float, now: float, window: int) -> Values:
+    """Begin a reading over a window [ms]."""
+    tones = [round(20 * each) for each in frequencies]
+    values = {"reading": number, "window": window, "tones": len(tones), "frequencies": tones}
+    found: Values = bench.exchange("main", "Measure", values, now=now)
+    return found
+
+
+def reading(bench: Bench, now: float, name: str = "main") -> Values:
+    """The reading at a time [s]."""
+    found: Values = bench.exchange(name, "GetReading", {"first": 0}, now=now)
+    return found
+
+
+@in_virtual_time
+async def test_host_measures_at_the_feet_what_the_model_says(coarse_rig: Rig) -> None:
+    """Amplitude and phase of two tones at four feet and at 28 places more, two a reply: 2 %.
+
+    Against the sparse direct solve; phases count on the clock, whenever the set was committed.
+    """
+    frequencies = [110.0 + 20 * number for number in range(16)]
+    x = np.linspace(0.02, 0.28, 28)
+    async with rig_on_wire(coarse_rig, WIRES["serial"]) as rig:
+        rig.bench.place_sensors([Accelerometer("", each, 0.11) for each in x])
+        await rig.group.arm()
+        tones = [layer((0, 110.0, 1.0)), layer((3, 210.0, 0.5), number=1)]
+        await rig.group.apply({"main": tones})
+        await rig.beat_until(threads.now() + 4.0)
+        main = rig.group.amplifiers["main"]
+        sensors = await read_sensors(main)
+        found = await measure_tones(main, frequencies, 0.2)
+    assert [each.channel for each in sensors[:5]] == [0, 1, 2, 3, None]
+    assert (len(sensors), len(found.sensors), found.state) == (32, 32, "COMPLETE")
+    points = np.array([[each.x, each.y] for each in sensors], dtype=float)
+    unit = direct_acceleration(
+        assemble(coarse_rig.plate, coarse_rig.mesh),
+        coarse_rig.eras,
+        np.array([110.0, 210.0]),
+        points,
+    )
+    for index, expected in ((0, unit[0, 0]), (5, 0.5 * unit[1, 3])):
+        measured = [
+            cmath.rect(one.tones[index][0], math.radians(one.tones[index][1]))
+            for one in found.sensors
+        ]
+        assert apart(np.array(measured), expected) < 0.02
+
+
+def test_what_changes_disturbs_a_reading_and_a_renewal_does_not(coarse_rig: Rig) -> None:
+    """A renewal amid the window, a set, the end of `valid_for`; after the window nothing does."""
+    tone = LayerSet(0, 0, 300, (Command(0, 2200, 1000, 0),))
+    renewal = LayerSet(0, 0, 300, renew=True)
+    for number, (what, state) in enumerate(
+        [((renewal,), "COMPLETE"), ((tone,), "DISTURBED"), ((), "DISTURBED")], 1
+    ):
+        bench = bench_of(coarse_rig)
+        play(bench, 1, tone, now=5.1)
+        measure(bench, number, 110.0, now=5.2, window=300 if not what else 100)
+        if what:
+            play(bench, 2, *what, now=5.25)
+        found = reading(bench, 5.6)
+        assert READING_STATES[state] == found["state"]
+        # 5.2 s of the 20 s in which 2^32 steps go round.
+        assert (found["reading"], found["token"]) == (number, 1)
+        assert found["window_start"] == round(5.2 / 20 * 2**32)
+        bench.exchange("main", "Stop", {"ramp": 0}, now=5.7)
+        assert reading(bench, 5.8)["state"] == found["state"]
+
+
+def test_reading_without_a_set_has_no_token(coarse_rig: Rig) -> None:
+    """After arming no token is there, whatever was played before."""
+    bench = bench_of(coarse_rig)
+    play(bench, 7, LayerSet(0, 0, 0, (Command(0, 2200, 1000, 0),)), now=5.1)
+    bench.exchange("main", "Disarm", {"ramp": 0}, now=5.2)
+    bench.exchange("main", "Arm", {"session": SESSION + 1, "watchdog": 2000, "shift": 0}, now=5.3)
+    found = measure(bench, 1, 110.0, now=5.4, window=100)
+    assert found["token"] == 0
+    bench.amplifiers["main"].restart(5.45)
+    assert reading(bench, 5.6) == {
+        **dict.fromkeys(("reading", "state", "window_left", "window_start", "token"), 0),
+        **{"tones": 0, "count": 0, "sensors": []},
+    }
+
+
+def test_repeated_measure_goes_on_with_its_window(coarse_rig: Rig) -> None:
+    """Its reply was lost; another number begins anew, and a refused one changes nothing."""
+    bench = bench_of(coarse_rig)
+    for now, number, left in ((5.0, 3, 100), (5.04, 3, 60), (5.06, 4, 100)):
+        found = measure(bench, number, 110.0, now=now, window=100)
+        assert (found["reading"], found["window_left"]) == (number, left)
+    for frequencies in ((3000.05,), (9.0,), (110.0, 119.0), ()):
+        with pytest.raises(Refusal) as caught:
+            measure(bench, 5, *frequencies, now=5.08, window=100)
+        assert caught.value.code == "BAD_VALUE"
+    assert (reading(bench, 5.1)["reading"], reading(bench, 5.1)["window_left"]) == (4, 60)
+
+
+def test_each_amplifier_has_the_sensors_of_its_own_eras(coarse_rig: Rig) -> None:
+    """By the wiring; a reading of one is none of the other's."""
+    bench = bench_of(on_two_amplifiers(coarse_rig))
+    places = []
+    for name in ("east", "west"):
+        found = bench.exchange(name, "GetSensors", {"first": 0}, now=5.0)
+        assert [one["channel"] for one in found["sensors"]] == [0, 1]
+        assert (found["all"], found["count"]) == (2, 2)
+        places += [(one["x"], one["y"]) for one in found["sensors"]]
+    eras = sorted((round(1e4 * era.x), round(1e4 * era.y)) for era in coarse_rig.eras)
+    assert sorted(places) == eras
+    values = {"reading": 1, "window": 100, "tones": 1, "frequencies": [2200]}
+    bench.exchange("east", "Measure", values, now=5.0)
+    assert reading(bench, 5.0, "west")["reading"] == 0
+
+
+START = 98765.4321  # as large as a clock may be
+
+
+def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
+    """Noticed two seconds late, the plate has been ringing down since the watchdog ran out."""
+    prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
+    for bench in (prompt, late):
+        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
+        bench_driving_arm(bench, 0.25, now=START)
+        firmware_machine_play(bench, Tone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
+    for step in range(1, 401):
+        prompt.advance(START + 0.1 + step * 0.005)
+    for bench in (prompt, late):
+        bench.advance(START + 2.1)
+        assert bench.amplifiers["main"].fault == "WATCHDOG"
+    window = START + 0.3, START + 0.5
+    np.testing.assert_allclose(
+        late.felt(*window)["a"].peak, prompt.felt(*window)["a"].peak, rtol=1e-4
+    )
+    driven = late.felt(START + 0.25, START + 0.35)["a"].peak.max()
+    assert late.felt(START + 1.9, START + 2.1)["a"].peak.max() < 0.02 * driven
+
+
+class Listener:
+    """A probe at one point that keeps what it is given."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.shapes = bench.shapes_at(np.array([[0.1, 0.1]]))
+        self.times: list[float] = []
+        self.accelerations: list[float] = []
+
+    def record(self, times: FloatArray, accelerations: FloatArray) -> None:
+        """Keep samples."""
+        self.times += times.tolist()
+        self.accelerations += accelerations[:, 0].tolist()
+
+
+def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None:
+    """Read every 3 ms, or once at the end: the same samples of a finger; a probe gets its own."""
+    records, listeners = [], []
+    for is_read in (True, False):
+        bench = Bench(coarse_rig, now=START)
+        bench.place_fingers({"a": (0.1, 0.1)}, now=START)
+        bench_driving_arm(bench, 2.0, now=START)
+        for step in range(1, 101):
+            now = START + 0.003 * step
+            if step in (20, 45, 70):  # at 20 abruptly
+                tone = Tone(step % 4, 100.0 + step, 1.0)
+                firmware_machine_play(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
+            bench.advance(now)
+            if step == 60:
+                listener = Listener(bench)
+                bench.probes.append(listener)
+            if is_read:
+                bench.records(START, now)
+        records.append(bench.records(START, bench.time)[0]["a"])
+        listeners.append(listener)
+    read, unread = records
+    np.testing.assert_array_equal(unread.times, read.times)
+    np.testing.assert_allclose(np.diff(read.times), 1e-4, rtol=1e-4)
+    peak = np.abs(read.accelerations).max()
+    np.testing.assert_allclose(unread.accelerations, read.accelerations, atol=1e-6 * peak)
+    for listener in listeners:
+        count = len(listener.times)
+        np.testing.assert_array_equal(listener.times, read.times[-count:])
+        assert START + 0.18 < listener.times[0] < START + 0.1803
+        centre = read.accelerations[-count:, 0]
+        np.testing.assert_allclose(listener.accelerations, centre, atol=1e-6 * peak)
+
+
+def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
+    """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
+    bench = Bench(coarse_rig, now=0.0)
+    bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
+    bench_driving_arm(bench, 0.25, now=0.0)
+    firmware_machine_play(bench, Tone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
+    bench.advance(86_400.0)
+    felt = bench.felt(86_400.0 - 9.9, 86_400.0)
+    assert felt["a"].peak.max() < 1e-9
+    assert bench.fingers.felt(0.0, 86_400.0)["a"].times[0] >= 86_390.0
+
+
+A, B = (0.1, 0.07), (0.29, 0.2)
+FREQUENCY = 210.0
+FULL_STROKE = Tone(1, FREQUENCY, 1.0)
+
+
+def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
+    """Amplitudes [m/s²] under finger A by the direct solve, one ERA at full stroke."""
+    points = fingertip_points(*A, rig.plate)
+    matrices = assemble(rig.plate, rig.mesh)
+    answer = direct_acceleration(matrices, rig.eras, np.array([FREQUENCY]), points, loads=loads)
+    return np.asarray(np.abs(answer[0, 1]))
+
+
+def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
+    """Fingers of a rig with none load nothing; where fingers do, an observer does not."""
+    bare = Bench(replace(coarse_rig, fingertip=None), now=0.0)
+    observed = Bench(replace(coarse_rig, fingertip=Fingertip(contact_mass=0.02)), now=0.0)
+    bare.place_fingers({"a": A, "b": B}, now=0.0)
+    observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
+    for bench in (bare, observed):
+        firmware_machine_play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+        keep_alive(bench, 4.0)
+        (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
+        assert apart(amplitude, expected(coarse_rig, ())) < 0.01
+
+
+def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
+    """An accelerometer hears the whole time while a finger comes, at every sample, truly."""
+    tip = Fingertip(contact_mass=0.005)
+    bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
+    sensors = Accelerometers(bench)
+    sensors.place([Accelerometer("P1", 0.2, 0.03)])
+    firmware_machine_play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+    keep_alive(bench, 1.0)
+    bench.place_fingers({"b": B}, now=1.0)
+    keep_alive(bench, 4.0)
+    recording = sensors.read(0.0, 4.0)
+    np.testing.assert_allclose(np.diff(recording.times), 1e-4, rtol=1e-6)
+    late = recording.times > 3.5
+    amplitude = abs(lock_in(recording.times[late], recording.samples[late, 0], FREQUENCY))
+    answer = direct_acceleration(
+        assemble(coarse_rig.plate, coarse_rig.mesh),
+        coarse_rig.eras,
+        np.array([FREQUENCY]),
+        np.array([[0.2, 0.03]]),
+        loads=[FingertipLoad(*B, tip)],
+    )
+    assert amplitude == pytest.approx(abs(answer[0, 1, 0]), rel=0.01)
+
+
+PLACE_A, PLACE_B, C = (0.1, 0.07), (0.29, 0.2), (0.2, 0.1)
+
+
+@pytest.fixture
+def rig(coarse_rig: Rig) -> Rig:
+    """A rig whose fingers load the plate."""
+    return replace(coarse_rig, fingertip=Fingertip(2000.0, 3.0, 0.005))
+
+
+@pytest.fixture
+def let_solve(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Solutions wait for this event."""
+    event, solved = threading.Event(), Placement.solved
+
+    def wait(placement: Placement) -> LoadedPlate | None:
+        assert event.wait(60)
+        return solved(placement)
+
+    monkeypatch.setattr(Placement, "solved", wait)
+    return event
+
+
+def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
+    """A bench that plays on through a touch at 0.5 s, up to 1.2 s."""
+    bench = Bench(rig, now=0.0)
+    bench.place_fingers({"a": PLACE_A}, now=0.0)
+    firmware_machine_play(bench, Tone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0)
+    keep_alive(bench, 0.5)
+    place(bench)
+    keep_alive(bench, 1.2)
+    return bench
+
+
+def test_finger_that_is_solved_late_is_felt_as_one_that_is_solved_at_once(rig: Rig) -> None:
+    """The plate waits for it, so that samples before and after it are the same."""
+    late = driven(rig, lambda one: one.begin_placing({"a": PLACE_A, "b": PLACE_B}, now=one.time))
+    at_once = driven(rig, lambda one: one.place_fingers({"a": PLACE_A, "b": PLACE_B}, now=one.time))
+    for since, until in ((0.1, 0.5), (0.51, 1.2)):
+        ours, theirs = (bench.records(since, until)[0] for bench in (late, at_once))
+        assert ours.keys() == theirs.keys()
+        for name, record in ours.items():
+            np.testing.assert_array_equal(record.times, theirs[name].times)
+            peak = np.abs(theirs[name].accelerations).max()
+            np.testing.assert_allclose(
+                record.accelerations, theirs[name].accelerations, rtol=0, atol=1e-5 * peak
+            )
+    assert late.unsolved is None
+
+
+def test_slide_faster_than_it_is_solved_leaves_out_places_between(rig: Rig) -> None:
+    """Of a finger's landing, three moves and its lift, two moves are never solved."""
+    bench = Bench(rig, now=0.0)
+    for number, at in enumerate((PLACE_A, PLACE_B, C, PLACE_A)):
+        bench.begin_placing({"a": at}, now=0.02 * number)
+    bench.begin_placing({}, now=0.1)
+    solved = []
+    while (placement := bench.unsolved) is not None:
+        placement.solved()
+        solved.append((placement.time, placement.positions))
+    assert solved == [(0.0, {"a": PLACE_A}), (pytest.approx(0.06), {"a": PLACE_A}), (0.1, {})]
+
+
+async def test_control_replies_while_the_plate_is_solved(
+    rig: Rig, let_solve: threading.Event
+) -> None:
+    """A finger comes and the state is read before its plate is solved; what it feels waits."""
+    context = SimulationContext(Bench(rig, now=0.0))
+
+    async def ask(now: float, **request: object) -> dict[str, object]:
+        return await carry_out(context, json.dumps(request).encode(), now=now)
+
+    assert (await ask(0.1, op="fingers", fingers={"a": PLACE_A}))["ok"]
+    assert (await ask(0.4, op="state"))["fingers"] == {"a": list(PLACE_A)}
+    felt = asyncio.create_task(ask(0.4, op="felt", since_s=0.1, until_s=0.4))
+    await asyncio.sleep(0)
+    assert context.bench.unsolved is not None
+    let_solve.set()
+    fingers = (await felt)["fingers"]
+    assert isinstance(fingers, dict)
+    assert fingers.keys() == {"a"}
+    await context.stop_solving()

@@ -6,7 +6,7 @@ From a modal test in time on the simulated plate, through a file, to a new rig: 
 
 A sound server that is killed while the daemon plays through a software amplifier.
 
-Its short form has no daemon: tests/sim/desk/soft_amp/test_soft_amp_sound.py.
+Its short form has no daemon: tests/sim/soft_amp/test_soft_amp.py.
 
 Idle, unreading and insistent clients, in processes of their own, while fingers play.
 

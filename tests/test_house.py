@@ -1,23 +1,85 @@
-"""Which tests `make test-changed` takes, and what it does without time."""
+"""No circle of files outside the packages, whose own circles an import contract excludes.
 
+Classes of the model and the controller are nouns of the field, each defined once.
+
+Which tests `make test-changed` takes, and what it does without time.
+
+Retired words do not return as identifiers.
+"""
+
+import ast
 import os
 import re
 import subprocess
 import sys
+from collections import Counter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import changed_tests
-from changed_tests import ALSO, ROOT, also, nearest
+import vocabulary
+from changed_tests import ALSO, also, nearest
+from changed_tests import ROOT as CHANGED_TESTS_ROOT
+from vocabulary import retired_identifiers
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("tests", "docs", "examples", "firmware")
+
+
+def imported(file: Path) -> set[str]:
+    """Names of modules without a package that a file imports, anywhere in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {each.name for each in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
+
+
+def test_no_circle_of_programs() -> None:
+    """Modules of one name in several folders count as one: none of them is in a circle either."""
+    graph: dict[str, set[str]] = {}
+    for folder in FOLDERS:
+        for file in (ROOT / folder).rglob("*.py"):
+            graph.setdefault(file.stem, set()).update(imported(file) - {file.stem})
+    assert len([*TopologicalSorter(graph).static_order()]) >= len(graph)
+
+
+PACKAGES = ("controller", "model")
+
+_REGULAR = re.compile(r"[A-Z][a-z]+ed")
+_IRREGULAR = re.compile(
+    "Built|Chosen|Drawn|Felt|Found|Given|Heard|Held|Kept|Known|Left|Made|Meant|Met|Playing|Sent"
+    "|Shown|Sought|Taken|Told|Unknown|Unsent"
+)
+
+
+def test_classes_are_nouns_that_are_defined_once() -> None:
+    """No bare participle, and no name twice."""
+    names = Counter(
+        node.name
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in names.items() if count > 1 or _is_participle(name)] == []
+
+
+def _is_participle(name: str) -> bool:
+    plain = name.strip("_")
+    return bool(_REGULAR.fullmatch(plain) or _IRREGULAR.fullmatch(plain))
 
 
 def importing(module: str) -> set[str]:
     """The files of tests with a line that imports something out of a module."""
     line = re.compile(rf"^from {re.escape(module)} import", re.MULTILINE)
-    files = ROOT.glob("tests/**/test_*.py")
+    files = CHANGED_TESTS_ROOT.glob("tests/**/test_*.py")
     found = {path for path in files if line.search(path.read_text("utf-8"))}
-    return {path.relative_to(ROOT).as_posix() for path in found}
+    return {path.relative_to(CHANGED_TESTS_ROOT).as_posix() for path in found}
 
 
 @pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
@@ -45,7 +107,9 @@ def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     assert nearest(["tests/support/set_table.py"]).keys() >= importing("set_table")
     assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_summary.py"] == 0
     assert nearest(["tests/test_docs_site.py"]) == {"tests/test_docs_site.py": 0}
-    assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
+    assert len(nearest(["tests/conftest.py"])) == len(
+        [*CHANGED_TESTS_ROOT.glob("tests/**/test_*.py")]
+    )
 
 
 def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() -> None:
@@ -59,9 +123,11 @@ def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() ->
 
 def test_rows_name_what_there_is() -> None:
     """Files or folders, and targets of the Makefile."""
-    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+    targets = re.findall(
+        r"^([\w-]+):", (CHANGED_TESTS_ROOT / "Makefile").read_text("utf-8"), re.MULTILINE
+    )
     for paths, commands in ALSO:
-        assert [path for path in paths if not (ROOT / path).exists()] == []
+        assert [path for path in paths if not (CHANGED_TESTS_ROOT / path).exists()] == []
         named = [command.split()[1] for command in commands if command.startswith("make ")]
         assert set(named) <= set(targets)
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
@@ -82,7 +148,10 @@ def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> 
         "test_a.py",
     ]
     for until, outcome in (("inf", "2 passed"), ("0", "2 without time")):
-        more = {"PYTHONPATH": str(ROOT / "tests" / "support"), "ERA_TESTS_UNTIL": until}
+        more = {
+            "PYTHONPATH": str(CHANGED_TESTS_ROOT / "tests" / "support"),
+            "ERA_TESTS_UNTIL": until,
+        }
         more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to load
         done = subprocess.run(
             command,
@@ -102,7 +171,27 @@ def test_command_fails_where_no_test_had_time(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """And its last line says so, which nothing passed would not."""
-    monkeypatch.setattr(changed_tests, "changed_since", lambda commit: ["tests/test_vocabulary.py"])
+    monkeypatch.setattr(changed_tests, "changed_since", lambda commit: ["tests/test_house.py"])
     monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", "0"])
     assert changed_tests.main() == 3
     assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")
+
+
+def test_identifiers_avoid_retired_words() -> None:
+    """Each word of the list has a replacement; the glossary of CONTRIBUTING defines it."""
+    assert list(retired_identifiers()) == []
+
+
+def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An example, and a program on a page at its line there; text beside programs is free."""
+    files = {
+        "examples/one.py": "begin = 1\n",
+        "README.md": "begin = 0\n\n```python\nstart = 1\nbegin = start\n```\n",
+        "docs/how-to/two.md": "```python\nstart = 1\n```\n```\nbegin = 1\n```\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, "utf-8")
+    monkeypatch.setattr(vocabulary, "ROOT", tmp_path)
+    found = [each.partition(", use")[0] for each in retired_identifiers()]
+    assert found == ["examples/one.py:1: begin", "README.md:5: begin"]

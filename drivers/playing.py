@@ -4,9 +4,9 @@ Voices of one channel: the tones that it plays at once, in any layers, until the
 
     Voice: Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its last transition, in full levels
 
-Its angle is that of the amplifier's clock (`drivers.protocol.definition`), n its frequency word: it does
-not depend on when it began. Amplitudes are complex, in full levels; times [s] are of any one clock.
-Plain loops and few calls: every set is played by host and far end.
+Its angle is that of the amplifier's clock (`drivers.protocol.definition`), n its frequency word:
+it does not depend on when it began. Amplitudes are complex, in full levels; times [s] are of any
+one clock. Plain loops and few calls: every set is played by host and far end.
 
 What the layers of an amplifier are to play: tones in physical units, and layers of them.
 

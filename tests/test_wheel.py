@@ -176,7 +176,8 @@ def test_it_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
     assert (
         Path(
             era.script(
-                "from controller.demo.demonstration import example_touches_path as p; print(p('touches'))"
+                "from controller.demo.demonstration import example_touches_path as path\n"
+                "print(path('touches'))"
             )
         )
         .stat()

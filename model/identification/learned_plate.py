@@ -3,8 +3,8 @@
 The parameters of an identification drift; an update moves them together with the fingers of its
 pattern, which are dropped afterwards. Where innovations are unlikely the state goes back to where
 they began, since an update smears a jump over all parameters, and is held until the patterns since
-then are explained together by one change (`model.identification.settled_patterns`). Such a change is
-followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
+then are explained together by one change (`model.identification.settled_patterns`). Such a change
+is followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
 counts as changed, until patterns are those of the plate as it was.
 
 The file of a learned plate: parameters and covariance, beside the table that they correct.

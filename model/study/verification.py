@@ -8,7 +8,8 @@ less than 1e-3 over 2 %.
 Verification of a table: a sample of it recomputed by other methods.
 
 - Content: fields on the raster and at the cells, against the plate solved at each frequency
-  without modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with measured modes,
+  without modes (`model.spectral.direct_solution`), relative L2. On finite elements, and with
+  measured modes,
   against the free plate solved anew with the ERAs attached (`model.reduction.free_plate`).
 - Answers: level and contrast at random contacts, against the same with the fingers attached, too.
 - Promises: the felt contrast of nine of ten plates, on plates solved exactly.

@@ -1,8 +1,8 @@
 """One simulated amplifier: requests in, replies out; time is passed in.
 
-Requests and replies are the values of their records (`drivers.protocol.definition`), integers of the
-wire. Events happen at their own time: a watchdog that expired between two calls expired when it was
-due, and what plays is a description in time (`drivers.playing`), not samples.
+Requests and replies are the values of their records (`drivers.protocol.definition`), integers of
+the wire. Events happen at their own time: a watchdog that expired between two calls expired when it
+was due, and what plays is a description in time (`drivers.playing`), not samples.
 
 Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
 where the sum of layers is limited.

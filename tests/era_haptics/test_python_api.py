@@ -507,7 +507,7 @@ def test_command_draws_into_files_whatever_backend_is_named(backend: str) -> Non
 
 
 ARGUMENTS_RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
-ARGUMENTS_PLATE, DRIVE, TARGET = era.SolvedPlate(ARGUMENTS_RIG), {"SW": 110}, (0.08, 0.06)
+SOLVED, DRIVE, TARGET = era.SolvedPlate(ARGUMENTS_RIG), {"SW": 110}, (0.08, 0.06)
 ANSWER = era.query(small_table(), TARGET)
 
 SHEET = era.Plate(length=0.3, width=0.2, thickness="2 mm", material="aluminium")
@@ -551,13 +551,13 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "cluster": "tcp://127.0.0.1:1", "progress": print,
     },
     era.SolvedPlate: {"rig": ARGUMENTS_RIG, "seed": 1},
-    ARGUMENTS_PLATE.map: {"drive": DRIVE, "raster": (3, 3)},
-    ARGUMENTS_PLATE.play: {
+    SOLVED.map: {"drive": DRIVE, "raster": (3, 3)},
+    SOLVED.play: {
         "drive": np.zeros((4, 300)), "target": TARGET, "quiet": (), "loads": (1.5,),
         "duration": 0.3, "sample_rate": 3000,
     },
-    ARGUMENTS_PLATE.responses: {"points": [TARGET], "frequencies": [60.0], "fingers": (), "seed": 1},
-    era.draw_map: {"plate": ARGUMENTS_PLATE, "drive": DRIVE},
+    SOLVED.responses: {"points": [TARGET], "frequencies": [60.0], "fingers": (), "seed": 1},
+    era.draw_map: {"plate": SOLVED, "drive": DRIVE},
     era.draw_contrast_map: {
         "table": None,
         "found": era.ContrastMap(*np.zeros((2, 1)), (TARGET,), {"phased": np.zeros((1, 1))}, {}),
@@ -640,7 +640,7 @@ FILES = sorted(
     if "plate" in yaml.safe_load(path.read_text("utf-8"))
 )
 CORNERS = {"SW": (0, 0), "SE": ("12 in", 0), "NE": ("12 in", "9 in"), "NW": (0, "9 in")}
-RIGS_SHEET = era.Plate(length="12 in", width="9 in", thickness="1.5 mm", material="aluminium")
+SHEET_OF_KEYS = era.Plate(length="12 in", width="9 in", thickness="1.5 mm", material="aluminium")
 SPRINGS = {
     name: era.Era(at=at, stiffness="17 kN/m", amplifier="main", channel=number)
     for number, (name, at) in enumerate(CORNERS.items())
@@ -667,10 +667,10 @@ def test_rig_with_defaults_is_the_papers_and_has_its_table(
 ) -> None:
     """Without damping, loss factor and stroke, which the example states as they are by default."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    rig = era.rig(RIGS_SHEET, SPRINGS, amplifiers=MAIN)
+    rig = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
     assert rig == era.load_rig(RIGS_EXAMPLES / "paper_plate.yaml")
     bare = {name: era.Era(at=each["at"], stiffness=17e3) for name, each in SPRINGS.items()}
-    assert era.rig(RIGS_SHEET, bare) == rig  # a simulated amplifier, channels in order
+    assert era.rig(SHEET_OF_KEYS, bare) == rig  # a simulated amplifier, channels in order
     steps: list[tuple[int, int]] = []
     table = era.table(rig, frequencies=[60], progress=lambda *done: steps.append(done))
     assert (table.fingerprint, steps) == (rig.fingerprint, [(1, 2), (2, 2)])
@@ -681,7 +681,7 @@ def test_thickness_takes_the_damping_the_mesh_and_the_frequencies_with_it() -> N
 
     Shear and rotary inertia lower those of 1 mm by 0.1 % more than those of 0.5 mm.
     """
-    rig = era.rig(RIGS_SHEET, SPRINGS, amplifiers=MAIN)
+    rig = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
     thin, thick = (rig.replaced(thickness=each) for each in ("0.5 mm", 0.001))
     assert thin.mesh != thick.mesh
     mass = 2700 * 0.001 * 0.3048 * 0.2286
@@ -696,7 +696,10 @@ def test_thickness_takes_the_damping_the_mesh_and_the_frequencies_with_it() -> N
 def test_places_keep_their_share_of_the_plates_sides() -> None:
     """Corners stay corners, of ERAs and masses; those given beside sides are taken as given."""
     rig = era.rig(
-        RIGS_SHEET, SPRINGS, amplifiers=MAIN, masses={"camera": {"at": (0.1, 0.05), "mass": 0.01}}
+        SHEET_OF_KEYS,
+        SPRINGS,
+        amplifiers=MAIN,
+        masses={"camera": {"at": (0.1, 0.05), "mass": 0.01}},
     )
     wider = rig.replaced(length=0.4, width=np.float32(0.3))
     assert np.allclose(
@@ -710,7 +713,7 @@ def test_places_keep_their_share_of_the_plates_sides() -> None:
 
 def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     """The damping goes with the stiffness; an ERA is added, another left out; others stay."""
-    changed = RIGS_RIG.replaced(
+    changed = KEYED_RIG.replaced(
         plate={"thickness": "2 mm"}, length=0.4, eras={"SW": {"stiffness": 2e4}, "NW": None}
     )
     assert changed.plate.thickness == 0.002
@@ -720,13 +723,13 @@ def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     mass = 2700 * 0.002 * 0.4 * 0.2286
     assert changed.eras[0].damping == pytest.approx(2 * 0.05 * math.sqrt(2e4 * mass / 3))
     assert changed.replaced(eras={"NW": SPRINGS["NW"]}).eras[3].stiffness == 17e3
-    assert RIGS_RIG.replaced(fingertip=None) == RIGS_RIG
-    assert RIGS_RIG.replaced(fingertip="none").fingertip is None
+    assert KEYED_RIG.replaced(fingertip=None) == KEYED_RIG
+    assert KEYED_RIG.replaced(fingertip="none").fingertip is None
 
 
 def test_keys_that_cannot_follow_are_refused() -> None:
     """Deviations of modes were identified on the plate before; None leaves a key out."""
-    rig = era.rig({**RIGS_SHEET, "modes": [(1.02, 1.1)]}, SPRINGS, amplifiers=MAIN)
+    rig = era.rig({**SHEET_OF_KEYS, "modes": [(1.02, 1.1)]}, SPRINGS, amplifiers=MAIN)
     with pytest.raises(era.InputError, match=r"plate\.modes must be given"):
         rig.replaced(thickness="2 mm")
     assert rig.replaced(thickness="2 mm", modes=None).plate.mode_deviations == ()
@@ -738,17 +741,17 @@ def test_keys_that_cannot_follow_are_refused() -> None:
     [
         (lambda: era.Plate(length=-1, widht=2), ["length: must be above 0", "widht: unknown key"]),
         (lambda: era.Era(at=(0, 0)), ["era.Era: stiffness: missing"]),
-        (lambda: era.rig(RIGS_SHEET, SPRINGS, amplifiers={}), ["eras.SW.amplifier: unknown"]),
+        (lambda: era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers={}), ["eras.SW.amplifier: unknown"]),
         (lambda: era.rig(3, 4, amplifiers=5), ["plate: must be a map", "eras: must be a map"]),
-        (lambda: RIGS_RIG.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean thickness"]),
-        (lambda: RIGS_RIG.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
-        (lambda: RIGS_RIG.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
-        (lambda: RIGS_RIG.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
-        (lambda: era.rig(RIGS_SHEET, 4), ["eras must be a Mapping, got 4"]),
-        (lambda: era.rig(RIGS_SHEET, {"SW": 4}), ["eras.SW: must be a map"]),
-        (lambda: RIGS_RIG.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
-        (lambda: RIGS_RIG.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
-        (lambda: era.save_rig(RIGS_RIG, "rig.txt"), ["must end in .yaml"]),
+        (lambda: KEYED_RIG.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean thickness"]),
+        (lambda: KEYED_RIG.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
+        (lambda: KEYED_RIG.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
+        (lambda: KEYED_RIG.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
+        (lambda: era.rig(SHEET_OF_KEYS, 4), ["eras must be a Mapping, got 4"]),
+        (lambda: era.rig(SHEET_OF_KEYS, {"SW": 4}), ["eras.SW: must be a map"]),
+        (lambda: KEYED_RIG.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
+        (lambda: KEYED_RIG.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
+        (lambda: era.save_rig(KEYED_RIG, "rig.txt"), ["must end in .yaml"]),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument_as_a_file_its_key(make, named: list[str]) -> None:
@@ -758,18 +761,18 @@ def test_errors_name_the_argument_as_a_file_its_key(make, named: list[str]) -> N
     assert all(each in str(refused.value) for each in named)
 
 
-RIGS_RIG = era.rig(RIGS_SHEET, SPRINGS, amplifiers=MAIN)
+KEYED_RIG = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
 
 
 def test_fitted_rig_is_saved_and_changed_but_not_another(tmp_path: Path) -> None:
     """Of values that a calibration changes; without the finger of its keys a rig is another one."""
-    plate = replace(RIGS_RIG.plate, material=replace(RIGS_RIG.plate.material, E=72.5e9))
-    fitted = replace(RIGS_RIG, plate=plate, uncertainty=era.Uncertainty(thickness=0.002))
+    plate = replace(KEYED_RIG.plate, material=replace(KEYED_RIG.plate.material, E=72.5e9))
+    fitted = replace(KEYED_RIG, plate=plate, uncertainty=era.Uncertainty(thickness=0.002))
     era.save_rig(fitted, tmp_path / "rig.yaml")
     back = era.load_rig(tmp_path / "rig.yaml")
     assert (back.plate, back.uncertainty) == (plate, fitted.uncertainty)
-    assert back.eras[0].damping == pytest.approx(RIGS_RIG.eras[0].damping, rel=1e-5)
+    assert back.eras[0].damping == pytest.approx(KEYED_RIG.eras[0].damping, rel=1e-5)
     assert fitted.replaced(thickness=0.002).plate == replace(plate, thickness=0.002)
-    for other in (replace(RIGS_RIG, fingertip=None), replace(RIGS_RIG, document=None)):
+    for other in (replace(KEYED_RIG, fingertip=None), replace(KEYED_RIG, document=None)):
         with pytest.raises(era.InputError, match="rig must"):
             era.save_rig(other, tmp_path / "rig.yaml")

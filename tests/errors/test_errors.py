@@ -102,7 +102,9 @@ WRITING = {
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
     "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "era_haptics.lab.paper_figures.paper_figures",
-    "design rig.yaml -o design --layouts random:2": "era_haptics.lab.design.design_run.rank_layouts",
+    "design rig.yaml -o design --layouts random:2": (
+        "era_haptics.lab.design.design_run.rank_layouts"
+    ),
     "report rig.yaml -o out.zip": "era_haptics.lab.report.collect",
 }
 """Commands that write a file, or several into a folder, each with its slow function."""

@@ -22,7 +22,8 @@ The Qt application of the examples, without a screen.
 
 The desk without hardware: real JACK server, plate and commands.
 
-Its short forms have no server, or no plate: tests/era_haptics/lab/measuring/test_measuring.py, test_jack_card.py.
+Its short forms have no server, or no plate: tests/era_haptics/lab/measuring/test_measuring.py,
+test_sound_card.py.
 """
 
 import asyncio

@@ -516,7 +516,7 @@ class LoopWitness(PlateWitness):
     def __init__(
         self,
         urls: Mapping[str, str],
-        limits: PlateTimes = PlateTimes(),  # noqa: B008  frozen
+        limits: PlateTimes = PlateTimes(),
         **judged: Any,
     ) -> None:
         super().__init__(witness_config(urls, **judged), limits)

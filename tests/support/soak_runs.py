@@ -106,7 +106,7 @@ GESTURES = ("tap", "hold", "drag", "chord", "vanish", "flood", "wrong")
 
 @dataclass(frozen=True)
 class Line:
-    """A wire: kind and kind of line as `sim.far_ends.wire_assignment` has them, and speed [bit/s]."""
+    """A wire: kind, kind of line as `sim.far_ends.wire_assignment` has them, speed [bit/s]."""
 
     kind: str
     speed: int | None

@@ -593,10 +593,10 @@ def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
     """Yield each number with its name, between the least and the most that it may be."""
     rows = [(_REPLY, can), *((_LIMITS, one) for one in can["limits"])]
     for record, row in rows:
-        for field in record.fields:
-            if isinstance(field, Number) and row[field.name] is not None:
-                name = field.name if record is _REPLY else "limits"
-                yield name, field.quantity.minimum, row[field.name], field.quantity.maximum
+        for word in record.fields:
+            if isinstance(word, Number) and row[word.name] is not None:
+                name = word.name if record is _REPLY else "limits"
+                yield name, word.quantity.minimum, row[word.name], word.quantity.maximum
     yield from capability_ranges(can)
     yield "features", 0, can["features"], (1 << len(FEATURES)) - 1
     for one in can["limits"]:

@@ -281,9 +281,9 @@ BAD_LINES = {
 def test_a_bad_line_of_a_batch_is_refused():
     """The key that is wrong is named."""
     found = list(query_batch(smooth_table(), BAD_LINES))
-    for number, (answer, named) in enumerate(zip(found, BAD_LINES.values(), strict=True), start=1):
-        assert answer["line"] == number
-        assert re.search(named, answer["error"])
+    for number, (row, named) in enumerate(zip(found, BAD_LINES.values(), strict=True), start=1):
+        assert row["line"] == number
+        assert re.search(named, row["error"])
 
 
 @pytest.mark.parametrize("has_errors", [True, False])

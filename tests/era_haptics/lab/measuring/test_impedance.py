@@ -234,8 +234,8 @@ def test_parts_come_from_two_runs_and_a_scale(
     assert width == pytest.approx(0.245, abs=0.001)
     circuit = ExciterCircuit(is_glued=True, rate=RATE)
     status, told = measured(
-        monkeypatch, MemoryCard(circuit, [0], [1]), "-o", glued, "--free", free, "--weight", IMPEDANCE_RUN_WEIGHT,
-        "--inputs", "1", "--series-error", "0.1", typed="\n\n",
+        monkeypatch, MemoryCard(circuit, [0], [1]), "-o", glued, "--free", free, "--weight",
+        IMPEDANCE_RUN_WEIGHT, "--inputs", "1", "--series-error", "0.1", typed="\n\n",
     )  # fmt: skip
     assert status == 0
     _check(json.loads(told))

@@ -283,7 +283,7 @@ def table(rig: Rig, form: str, separator: str) -> str:
         "db": ("magnitude_db", "phase_deg"),
     }[form]
     lines = [separator.join(["Frequency_Hz".lower(), "output", "sensor", *columns])]
-    for t, tone in enumerate(TONES):
+    for t, frequency in enumerate(TONES):
         for e, era in enumerate(rig.eras):
             for s in range(2):
                 r = ratio(t, e, s)
@@ -293,7 +293,7 @@ def table(rig: Rig, form: str, separator: str) -> str:
                     "magnitude": (size, phase),
                     "db": (20 * np.log10(size), phase),
                 }[form]
-                numbers = [f"{each:.9g}" for each in (tone, *pair)]
+                numbers = [f"{each:.9g}" for each in (frequency, *pair)]
                 if separator == ";":
                     numbers = [each.replace(".", ",") for each in numbers]
                 output = str(e + 1) if form == "db" else era.name

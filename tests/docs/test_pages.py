@@ -530,7 +530,7 @@ def test_page_has_every_scheme_and_the_time_of_a_board() -> None:
     with pytest.raises(CommandError) as unknown:
         address_of("carrier+pigeon://roof")
     assert (
-        set(re.findall(r"([\w+-]+)://[,\s]", f"{unknown.value} ")) - {"carrier+pigeon"} == SCHEMES
+        set(re.findall(r"([\w+-]+)://[,;\s]", f"{unknown.value} ")) - {"carrier+pigeon"} == SCHEMES
     )
     assert set(re.findall(r"^\| `([\w+-]+)://", STATED_FACTS_PAGE, re.MULTILINE)) == SCHEMES
     assert set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE)) == SCHEMES

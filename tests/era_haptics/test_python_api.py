@@ -713,7 +713,7 @@ def test_places_keep_their_share_of_the_plates_sides() -> None:
 
 def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     """The damping goes with the stiffness; an ERA is added, another left out; others stay."""
-    changed = KEYED_RIG.replaced(
+    changed = KEYED.replaced(
         plate={"thickness": "2 mm"}, length=0.4, eras={"SW": {"stiffness": 2e4}, "NW": None}
     )
     assert changed.plate.thickness == 0.002
@@ -723,8 +723,8 @@ def test_keys_of_the_plate_and_of_single_eras_are_changed_alone() -> None:
     mass = 2700 * 0.002 * 0.4 * 0.2286
     assert changed.eras[0].damping == pytest.approx(2 * 0.05 * math.sqrt(2e4 * mass / 3))
     assert changed.replaced(eras={"NW": SPRINGS["NW"]}).eras[3].stiffness == 17e3
-    assert KEYED_RIG.replaced(fingertip=None) == KEYED_RIG
-    assert KEYED_RIG.replaced(fingertip="none").fingertip is None
+    assert KEYED.replaced(fingertip=None) == KEYED
+    assert KEYED.replaced(fingertip="none").fingertip is None
 
 
 def test_keys_that_cannot_follow_are_refused() -> None:
@@ -743,15 +743,15 @@ def test_keys_that_cannot_follow_are_refused() -> None:
         (lambda: era.Era(at=(0, 0)), ["era.Era: stiffness: missing"]),
         (lambda: era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers={}), ["eras.SW.amplifier: unknown"]),
         (lambda: era.rig(3, 4, amplifiers=5), ["plate: must be a map", "eras: must be a map"]),
-        (lambda: KEYED_RIG.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean thickness"]),
-        (lambda: KEYED_RIG.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
-        (lambda: KEYED_RIG.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
-        (lambda: KEYED_RIG.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
+        (lambda: KEYED.replaced(thicknes=1), ["plate.thicknes: unknown key; did you mean thickness"]),
+        (lambda: KEYED.replaced(plate={"thicknes": 1}), ["plate.thicknes: unknown key"]),
+        (lambda: KEYED.replaced(plate=3, length=2), ["plate must be a Mapping, got 3"]),
+        (lambda: KEYED.replaced(eras={"SW": 3}, length=2), ["eras.SW: must be a map"]),
         (lambda: era.rig(SHEET_OF_KEYS, 4), ["eras must be a Mapping, got 4"]),
         (lambda: era.rig(SHEET_OF_KEYS, {"SW": 4}), ["eras.SW: must be a map"]),
-        (lambda: KEYED_RIG.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
-        (lambda: KEYED_RIG.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
-        (lambda: era.save_rig(KEYED_RIG, "rig.txt"), ["must end in .yaml"]),
+        (lambda: KEYED.replaced(length="2 kg"), ["plate.length: '2 kg' is not a length"]),
+        (lambda: KEYED.replaced(mesh="2x2"), ["rig.replaced: mesh: 2x2 is too coarse"]),
+        (lambda: era.save_rig(KEYED, "rig.txt"), ["must end in .yaml"]),
     ],
 )  # fmt: skip
 def test_errors_name_the_argument_as_a_file_its_key(make, named: list[str]) -> None:
@@ -761,18 +761,18 @@ def test_errors_name_the_argument_as_a_file_its_key(make, named: list[str]) -> N
     assert all(each in str(refused.value) for each in named)
 
 
-KEYED_RIG = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
+KEYED = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
 
 
 def test_fitted_rig_is_saved_and_changed_but_not_another(tmp_path: Path) -> None:
     """Of values that a calibration changes; without the finger of its keys a rig is another one."""
-    plate = replace(KEYED_RIG.plate, material=replace(KEYED_RIG.plate.material, E=72.5e9))
-    fitted = replace(KEYED_RIG, plate=plate, uncertainty=era.Uncertainty(thickness=0.002))
+    plate = replace(KEYED.plate, material=replace(KEYED.plate.material, E=72.5e9))
+    fitted = replace(KEYED, plate=plate, uncertainty=era.Uncertainty(thickness=0.002))
     era.save_rig(fitted, tmp_path / "rig.yaml")
     back = era.load_rig(tmp_path / "rig.yaml")
     assert (back.plate, back.uncertainty) == (plate, fitted.uncertainty)
-    assert back.eras[0].damping == pytest.approx(KEYED_RIG.eras[0].damping, rel=1e-5)
+    assert back.eras[0].damping == pytest.approx(KEYED.eras[0].damping, rel=1e-5)
     assert fitted.replaced(thickness=0.002).plate == replace(plate, thickness=0.002)
-    for other in (replace(KEYED_RIG, fingertip=None), replace(KEYED_RIG, document=None)):
+    for other in (replace(KEYED, fingertip=None), replace(KEYED, document=None)):
         with pytest.raises(era.InputError, match="rig must"):
             era.save_rig(other, tmp_path / "rig.yaml")

@@ -90,6 +90,7 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python tests/support/vocabulary.py
+	$(BIN)/python tests/support/ceilings.py
 	$(PAGES) --check
 
 # Every page, part of a page, client stub and C header that is written from the code.

@@ -27,7 +27,7 @@ class Capture(SoundCard):
         frames = round(longest * self.rate)
         self._times = np.zeros(frames // self.block + 1, dtype=np.int64)  # us
         self._transfer.arrivals = self._times.ctypes.data
-        self._samples = self.begin(np.zeros((frames, 0)))
+        self._samples = self.start(np.zeros((frames, 0)))
 
     def samples(self, count: int) -> Float32Array:
         """The last samples (count, channels)."""

@@ -46,7 +46,7 @@ def touches(desk: Desk, sets: list[list[str]]) -> list[Touch]:
             target, *quiet = (places[name] for name in names)
             desk.touch_plate([target, *quiet])
             status = hold(era, [*quiet, target], _SETTLING)
-            recorded = card.begin(np.zeros((round(_WINDOW * card.rate), 0)))
+            recorded = card.start(np.zeros((round(_WINDOW * card.rate), 0)))
             while card.position < len(recorded):
                 era.touch([*quiet, target])
                 time.sleep(0.02)

@@ -638,8 +638,8 @@ def design(
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     check_progress(progress)
-    asked: Any = len(rig.eras) if eras is None else eras
-    counts = [asked] if is_whole(asked) or isinstance(asked, str) else asked
+    requested: Any = len(rig.eras) if eras is None else eras
+    counts = [requested] if is_whole(requested) or isinstance(requested, str) else requested
     for what, row, made_by in (
         ("eras", counts, "range(3, 7)"),
         ("keep", keep, '["SW"]'),

@@ -58,7 +58,7 @@ _LEAST = np.float32(1e-30)
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class Positions:
     """Receptances [m/N] from c places of plates of v thicknesses, the modelled one first.
 
     at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips;
@@ -99,7 +99,7 @@ class Scorer:
         self._contents = contents
         least = LEVEL_RESERVE * contents * 10 ** (STRONG_DB_SL / 20)
         threshold = detection_threshold(frequencies, rig.threshold)
-        self._wanted = (least * threshold).astype(np.float32)
+        self._required = (least * threshold).astype(np.float32)
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(frequencies.max()))
         centres, numbers = np.unique(np.vstack(sets), axis=0, return_inverse=True)
         points, weights = fingertips_on(
@@ -116,11 +116,11 @@ class Scorer:
         tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
         self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
 
-    def places(self, at: FloatArray) -> Places:
+    def places(self, at: FloatArray) -> Positions:
         """Solve for ERAs at places [m] (c, 2)."""
         return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
 
-    def _solved(self, footprints: FloatArray) -> Places:
+    def _solved(self, footprints: FloatArray) -> Positions:
         between, to_points = self._free.receptances(
             footprints,
             self._points,
@@ -133,9 +133,9 @@ class Scorer:
             footprints, self._cells, self._frequencies, loads=self._rig.masses
         )
         over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
-        return Places(footprints[:, :2], between.astype(np.complex64), to_tips, over_plate)
+        return Positions(footprints[:, :2], between.astype(np.complex64), to_tips, over_plate)
 
-    def mean(self, places: Places, chosen: IntArray) -> float:
+    def mean(self, places: Positions, chosen: IntArray) -> float:
         """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
         target, power = self._forms(places, chosen)
         scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
@@ -151,7 +151,7 @@ class Scorer:
         ]
         return np.asarray(np.min(each, axis=0))
 
-    def _forms(self, places: Places, chosen: IntArray) -> tuple[Complex64Array, Complex64Array]:
+    def _forms(self, places: Positions, chosen: IntArray) -> tuple[Complex64Array, Complex64Array]:
         """Mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n, n)."""
         uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
         m, p = weights.shape
@@ -246,7 +246,7 @@ class Scorer:
     ) -> Float32Array:
         """Scores (f, s) of weights (f, s, n) less what their level misses."""
         level = np.abs(np.vecdot(c, w)) / np.maximum(np.abs(w).max(axis=-1), _LEAST)
-        missing = 20 * np.log10(np.maximum(level, _LEAST) / self._wanted[rows])
+        missing = 20 * np.log10(np.maximum(level, _LEAST) / self._required[rows])
         return np.asarray(
             10 * np.log10(np.maximum(score, _LEAST)) + LEVEL_PENALTY * np.minimum(missing, 0)
         )
@@ -392,7 +392,7 @@ class LayoutSearch:
                 return found
         return area_of(ANYWHERE, plate).moved(place, step)
 
-    def _score_at(self, places: Places, positions: FloatArray) -> float:
+    def _score_at(self, places: Positions, positions: FloatArray) -> float:
         """Score [dB] of positions among places, far below 0 if they do not support the plate."""
         if len(positions) + self.problem.supports >= MIN_SUPPORTING:
             shortfall = self.problem.shortfall(positions)

@@ -255,7 +255,7 @@ def _check_pair(free: Circuit, glued: Circuit) -> None:
         )
 
 
-_PLACES = ("before the exciter", "over the resistor")
+_POSITIONS = ("before the exciter", "over the resistor")
 _COLUMNS = ("frequency_hz", "real_ohm", "imag_ohm")
 _READ = ("frequency_hz", "real", "imag", "magnitude", "phase_deg")
 _UNNAMED = ("frequency_hz", "magnitude", "phase_deg")
@@ -281,7 +281,7 @@ def measured_impedance(
     """
     sines = Multisine(LINES, 1, card.rate, level)
     voltages = list[ComplexArray]()
-    for at, place in zip((inputs[0], inputs[-1]), _PLACES, strict=True):
+    for at, place in zip((inputs[0], inputs[-1]), _POSITIONS, strict=True):
         if len(inputs) == 1:
             move(place)
         if len(inputs) == 1 or not voltages:

@@ -294,9 +294,9 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
         raise InputError(f"{path}: {error}") from error
     columns = [sensor.input - 1 for sensor in sensors]
     found, number, before = list[Tone](), 0, 0.0
-    for begin, end in _held(path, references.sum(axis=1), rate):
-        place = f"{path} at {begin / rate:.1f} s"
-        kept = slice((begin + end) // 2, end)
+    for start, end in _held(path, references.sum(axis=1), rate):
+        place = f"{path} at {start / rate:.1f} s"
+        kept = slice((start + end) // 2, end)
         sizes = np.linalg.norm(references[kept], axis=0)
         loudest = int(sizes.argmax())
         if np.delete(sizes, loudest).max(initial=0) > _CROSSTALK * sizes[loudest]:

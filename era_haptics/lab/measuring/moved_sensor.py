@@ -37,7 +37,7 @@ _NOISY = 0.03  # of the response
 
 
 @dataclass(eq=False)
-class PlacesFile:
+class PositionsFile:
     """What is measured at places of a desk with a multisine, and the file that keeps it.
 
     values (f, eras) [1/s²] by the name of a place.
@@ -97,10 +97,10 @@ class PlacesFile:
         text = f"{count} of {total} places are measured" + (f", in {self.path}" if count else "")
         return f"{text}; go on with --resume" if 0 < count < total else text
 
-    def _other(self, what: str, wanted: str, got: str) -> InputError:
+    def _other(self, what: str, expected: str, got: str) -> InputError:
         return InputError(
-            f"--resume {self.path}: {what} must be {wanted}, got {got} in the file; measure as it "
-            "was begun, or leave out --resume and write another file"
+            f"--resume {self.path}: {what} must be {expected}, got {got} in the file; measure as "
+            "it was begun, or leave out --resume and write another file"
         )
 
 
@@ -124,12 +124,12 @@ def measure_by_moving(
             else f"{output}: exists; go on with --resume, or choose another name"
         )
     with Stopwatch() as timed, opened as (card, multisine):
-        file = PlacesFile(output, desk, multisine)
+        file = PositionsFile(output, desk, multisine)
         if is_resumed:
             file.read()
             _tell(str(file))
         try:
-            found = measure_places(file, card, periods=periods)
+            found = measure_positions(file, card, periods=periods)
         except KeyboardInterrupt:
             card.close()  # silent before anything is said
             _tell(f"\nstopped; {file}")
@@ -147,7 +147,7 @@ def measure_by_moving(
     return [str(file)], answer, not missing
 
 
-def _ask(text: str) -> str:
+def _prompt(text: str) -> str:
     sys.stderr.write(text)
     sys.stderr.flush()
     return sys.stdin.readline() or "q"
@@ -157,17 +157,17 @@ def _tell(text: str) -> None:
     sys.stderr.write(f"{text}\n")
 
 
-def measure_places(
-    file: PlacesFile,
+def measure_positions(
+    file: PositionsFile,
     card: SoundCard,
     *,
     periods: int,
-    ask: Callable[[str], str] = _ask,
+    prompt: Callable[[str], str] = _prompt,
     tell: Callable[[str], None] = _tell,
 ) -> dict[str, Measured]:
     """Guide a person through the missing places; returns what was measured now, by place.
 
-    ask: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
+    prompt: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
     that fails a check is reported with its remedy, and asked for again. Raises DeviceLost, OSError;
     what was measured before is in the file then.
     """
@@ -180,7 +180,7 @@ def measure_places(
     )
     while todo:
         place, places = todo[0], file.desk.sensors
-        reply = ask(
+        reply = prompt(
             f"Put the sensor at {place.name}, x {1e3 * place.x:g} mm, y {1e3 * place.y:g} mm "
             f"(place {places.index(place) + 1} of {len(places)}), then Enter: "
         )
@@ -216,7 +216,7 @@ def measure_places(
     return found
 
 
-def _check_moved(file: PlacesFile, place: WiredSensor, found: Measured) -> None:
+def _check_moved(file: PositionsFile, place: WiredSensor, found: Measured) -> None:
     """Raise InputError for a response that is that of another place."""
     own = found.responses.values[:, :, 0]
     limit = max(_SAME, _OF_NOISE * float(np.median(found.std)))

@@ -233,7 +233,7 @@ def find_outputs(
     count = count or desk.output - 1
     with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
         if beside is None:
-            heard = _asked(desk, card, count, level=level, frequency=frequency)
+            heard = _requested(desk, card, count, level=level, frequency=frequency)
         else:
             heard = listen(desk, card, beside, outputs=count, level=level, move=_moved)
     own = {name: at - 1 for name, at in desk.eras}
@@ -267,7 +267,7 @@ def _moved(name: str) -> None:
     )
 
 
-def _asked(
+def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
 ) -> list[Heard]:
     """What each output drives, as is said on the terminal."""

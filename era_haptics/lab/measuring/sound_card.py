@@ -281,7 +281,7 @@ class SoundCard(ABC):
         """
         transfer = self._transfer
         before = transfer.gaps
-        found = self.begin(played)
+        found = self.start(played)
         done, since = 0, time.monotonic()
         try:
             while done < len(found):
@@ -296,7 +296,7 @@ class SoundCard(ABC):
         self.gaps = transfer.gaps - before
         return found
 
-    def begin(self, played: FloatArray) -> Float32Array:
+    def start(self, played: FloatArray) -> Float32Array:
         """Play samples (n, outputs); return at once what is recorded meanwhile (n, inputs).
 
         Raises ValueError for samples beyond the limit.
@@ -314,7 +314,7 @@ class SoundCard(ABC):
 
     @property
     def position(self) -> int:
-        """Frames that were played and recorded since `begin`."""
+        """Frames that were played and recorded since `start`."""
         return int(self._transfer.position)
 
     @abstractmethod

@@ -373,7 +373,7 @@ class CallbackCard(SoundCard):
 
     def call(self) -> tuple[int, bool]:
         """Three blocks; returns the gaps that were counted, and whether all was recorded."""
-        heard = self.begin(np.zeros((3 * FRAMES, 1)))
+        heard = self.start(np.zeros((3 * FRAMES, 1)))
         kind = ctypes.CFUNCTYPE(
             ctypes.c_int,
             ctypes.c_void_p,

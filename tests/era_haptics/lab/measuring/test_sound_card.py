@@ -32,7 +32,7 @@ from benchmarks.direct_plate import direct_responder
 from controller.cli.main import run
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.measure import measure_through
-from era_haptics.lab.measuring.moved_sensor import PlacesFile, measure_places
+from era_haptics.lab.measuring.moved_sensor import PositionsFile, measure_positions
 from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard, open_card
 from gateway_bench import wait_for
 from model.arrays import ComplexArray, Float32Array, FloatArray
@@ -130,14 +130,14 @@ def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: P
     plate = DeskPlate(truth, sensors, rate=RATE, converters=Converters(), seed=1)
     desk = Desk(lossy, sensors)
     sines = Multisine(np.arange(41.0, 300.0, 20.0), len(desk.eras) + 1, RATE, 0.3)
-    file = PlacesFile(tmp_path / "measured.csv", desk, sines)
+    file = PositionsFile(tmp_path / "measured.csv", desk, sines)
 
     def moved(text: str) -> str:
         plate.move_sensor(text.split("sensor at ")[1].split(",")[0])
         return ""
 
     card = DeskCard(plate, rate=RATE)
-    measure_places(file, card, periods=2, ask=moved, tell=lambda text: None)
+    measure_positions(file, card, periods=2, prompt=moved, tell=lambda text: None)
     responses = responses_of(read_measured(file.path), lossy)
     full = np.array([era.full_level for era in lossy.eras])
     exact = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2) / full[:, None]

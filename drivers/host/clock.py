@@ -316,7 +316,8 @@ class HeldClock:
             is_reported = was_armed and self._is_armed and name != "Arm" and not marks
             self._check_pace(status["clock"], sent, received, is_reported=is_reported)
             return
-        if self._has_bits and received - sent < (arrives - sent + self._bits) / 2:
+        # Those of a reply may be fewer than stated, as CAN stuffs less; those of a request are not.
+        if self._has_bits and received < arrives:
             self._has_bits, self._bits, self._promptest, arrives = False, 0.0, math.inf, sent
             self._forget(sent)
         time = min(arrives, received)

@@ -453,9 +453,6 @@ ON_THE_WAY = sorted(
     file for package in ("drivers", "controller") for file in (ROOT / package).rglob("*.py")
 )
 
-# Sends sets of its own, and frames damaged on purpose, to amplifiers that it judges.
-CONFORMANCE = ROOT / "drivers" / "judge" / "asking"
-
 # Kinds of wire make the bytes of requests; ports of CAN adapters take and give packed frames.
 WIRES = ROOT / "drivers" / "wires"
 
@@ -487,13 +484,9 @@ def test_only_wires_use_encoders() -> None:
         if name.startswith(part)
     }
     wires = {file for file in users if WIRES in file.parents}
-    assert {file.parent.name for file in wires if file.name == "host.py"} == {
-        "can_bus",
-        "serial_line",
-    }
+    assert {file.name for file in wires} == {"can_bus.py", "serial_line.py"}
     above = [file for file in users - wires if "protocol" not in file.parts]
-    assert {file.parent for file in above} == {CONFORMANCE, HOST}
-    assert [file.name for file in above if file.parent == HOST] == ["dialogue.py"]
+    assert above == [HOST / "dialogue.py"]
 
 
 def test_only_what_a_ledger_admits_is_packed() -> None:
@@ -502,7 +495,7 @@ def test_only_what_a_ledger_admits_is_packed() -> None:
         ast.unparse(call.args[0])
         for file in ON_THE_WAY
         for name, call in calls(file, "pack_layers")
-        if name == "pack_layers" and file.parent != CONFORMANCE
+        if name == "pack_layers"
     )
     admitted = [
         ast.unparse(node.targets[0])

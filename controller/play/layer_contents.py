@@ -16,7 +16,7 @@ from controller.sources.touch import Contact, ContactKey
 from model.answer import answer
 from model.answer.answer import HELD_BACK, MIXED, OWN, Layer, is_felt, verdict_of
 from model.answer.stimulus import Course, Placement
-from model.finger import detection_threshold, fingertip_points
+from model.finger import detection_threshold, fingertips_on
 from model.table.table import LocalizationTable
 
 Targets = tuple[tuple[Contact, Target], ...]
@@ -312,19 +312,19 @@ def leaks_db_sl(
         return {}
     places = [(each.x, each.y) for each in contacts]
     loads = [each.load for each in contacts]
-    points = [fingertip_points(*at, table.plate) for at in places]
-    ends = np.cumsum([len(each) for each in points])[:-1]
-    power = {each.key: np.zeros(len(own)) for each, own in zip(contacts, points, strict=True)}
-    fields = table.unit_fields(np.concatenate(points), contacts=places, loads=loads)
+    length, width = table.plate.length, table.plate.width
+    points, _ = fingertips_on(np.array(places), length=length, width=width)
+    power = np.zeros(points.shape[:2])  # by contact and point
+    fields = table.unit_fields(points.reshape(-1, 2), contacts=places, loads=loads)
     for content in contents:
         frequencies, felt = table.driven(content.layer.excitation, fields)
         sensed = np.abs(felt) / detection_threshold(frequencies, table.threshold)[:, None]
         own = {contact.key for contact, _ in content.targets}
-        for each, part in zip(contacts, np.split((sensed**2).sum(axis=0), ends), strict=True):
-            if each.key not in own:
-                power[each.key] += part
+        is_foreign = np.array([each.key not in own for each in contacts])
+        power += (sensed**2).sum(axis=0).reshape(power.shape) * is_foreign[:, None]
     return {
-        key: 10 * math.log10(each.max()) if each.any() else -math.inf for key, each in power.items()
+        each.key: 10 * math.log10(loudest) if loudest else -math.inf
+        for each, loudest in zip(contacts, power.max(axis=1).tolist(), strict=True)
     }
 
 

@@ -114,7 +114,12 @@ class Course:
 
     def at(self, times: FloatArray) -> FloatArray:
         """Shares at times [s] (n,), 0 outside."""
-        return np.asarray(np.interp(times, self.times, self.shares, left=0.0, right=0.0))
+        return np.asarray(np.interp(times, *self._line, left=0.0, right=0.0))
+
+    @cached_property
+    def _line(self) -> tuple[FloatArray, FloatArray]:
+        """Times and shares as arrays, made once: it is read for every piece that is played."""
+        return np.array(self.times), np.array(self.shares)
 
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0

@@ -33,7 +33,7 @@ from sim.transport.far_end import FarEnd
 from virtual_lines import MemoryMachine, VirtualLoop, in_virtual_time
 
 LONGEST, STOPPED_WITHIN = 0.005, 0.020  # s of processor time
-ROUNDS = 2  # of which the quickest counts: the first of anything may be slower
+ROUNDS = 3  # of which the quickest counts: the first of anything may be slower
 FILES = 35  # of 60 s, in each of two layouts
 PLACE = (0.1, 0.02)  # in a region
 TOUCHES = [(0.02 * (each % 10) + 0.01, 0.02 * (each // 10) + 0.05) for each in range(20)]
@@ -287,7 +287,7 @@ async def test_content_rendered_amid_a_stop_is_not_played(
 
     steady = [(0.0, 1.0, 0.5), (1.0, 1.0, 0.5)]
     async with ready_daemon(tmp_path) as (bench, era), await bench.client("another") as other:
-        monkeypatch.setattr("virtual_loop._AWAITED", ())  # time goes on beside the thread
+        monkeypatch.setattr("virtual_lines._AWAITED", ())  # time goes on beside the thread
         await other.arm("me", lease_s=60)
         async with holding(other, PLACE, far=bench.far):
             monkeypatch.setattr(File, "prepare", slow)
@@ -299,5 +299,5 @@ async def test_content_rendered_amid_a_stop_is_not_played(
             released.set()
             with pytest.raises(RpcError, match="stopped or disarmed meanwhile"):
                 await playing
-            monkeypatch.setattr("virtual_loop._AWAITED", ("content",))
+            monkeypatch.setattr("virtual_lines._AWAITED", ("content",))
             await era.play(steady, PLACE)

@@ -283,7 +283,7 @@ async def test_machine_that_was_late_once_has_a_verdict_on_voices(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By 1 s, beside replies of 9 ms and ramps of 0.7 s: what it leads by fits into these."""
-    monkeypatch.setattr("judged_line.DELAY", 0.0045)
+    monkeypatch.setattr("virtual_lines.DELAY", 0.0045)
     far = varied()
     far.capabilities.update(ramp_max=700)
     line = JudgedLine("tcp", far)
@@ -307,7 +307,7 @@ SLOW = {
 @pytest.mark.parametrize("kind", SLOW)
 def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """At 40 ms each way and back: times are long against it, and what comes late is heard."""
-    monkeypatch.setattr("judged_line.DELAY", 0.02)
+    monkeypatch.setattr("virtual_lines.DELAY", 0.02)
     for found in judged(kind, SLOW[kind]):
         assert (found.result, found.attempts) == (Result.PASSED, 1), found
 
@@ -368,7 +368,7 @@ def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After 9 ms, where 10 are allowed: every check has its verdict, or says what is not seen."""
-    monkeypatch.setattr("judged_line.DELAY", 0.0045)
+    monkeypatch.setattr("virtual_lines.DELAY", 0.0045)
     skipped = set() if names else SKIPPED[kind]
     twice = kind == "tcp"  # each request that changes something is a write and a read
     expect_passed(judged(kind, names), skipped, within=(1.7 if twice else 1.4) * MINUTE)
@@ -451,7 +451,7 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a status takes 8 ms, as at 115 200 baud: 3.3 ms a second show within 6 s."""
-    monkeypatch.setattr("judged_line.DELAY", 0.004)
+    monkeypatch.setattr("virtual_lines.DELAY", 0.004)
     found = [
         judged(kind, ["clock_rate"], far=each("steered", channels=4))
         for each in (Amplifier, _Unsteered)

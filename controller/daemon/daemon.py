@@ -26,9 +26,9 @@ from controller.daemon.messages import EventPublisher, amplifier_statuses
 from controller.daemon.methods import ApiService
 from controller.gateway.settings import require_gateway
 from controller.learning.learning import Learning
-from controller.operation.links import Supervisor
+from controller.operation.fault_dumps import FaultDumps
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation
-from controller.operation.operator import FaultDumps
+from controller.operation.supervisor import Supervisor
 from controller.play.loop import Controller
 from controller.play.planner import Observers
 from controller.process.daemon_process import ServiceManager, SocketLock

@@ -54,7 +54,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.effects.player import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
-from controller.operation.operator import LinkChange
+from controller.operation.supervisor import LinkChange
 from controller.play.intent import NO_CONTACTS
 from controller.play.layer_contents import BEING_CHOSEN, leaks_db_sl
 from controller.play.planner import Observers, PlayReport, SilenceReport

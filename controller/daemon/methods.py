@@ -46,7 +46,6 @@ from controller.daemon.messages import EventPublisher, effects_result, hello_res
 from controller.effects.effect import MIN_DB_SL, Effect
 from controller.effects.kinds import File
 from controller.learning.learning import Learning
-from controller.operation.links import Supervisor
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -55,7 +54,7 @@ from controller.operation.operation_states import (
     Operation,
     Trigger,
 )
-from controller.operation.operator import LEASE_OVER
+from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
 from controller.sources.touch import Contact, Touch, TouchFrame

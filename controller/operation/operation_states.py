@@ -1,18 +1,16 @@
-"""The operation of the plate: a transition table and `step`, a pure function that applies it.
+"""The operation of the plate: states, events, and `step`, which applies the transition table.
 
-State names follow CiA 402.
+States have the names of CiA 402.
 
 - Only ARM in READY_TO_SWITCH_ON leads to SWITCHED_ON, and only ARMED from there to
   OPERATION_ENABLED.
-- QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, by VERIFIED: whoever says that has
-  read back all amplifiers, without a fault and at level zero, after a CLEAR of the same epoch.
-- COMM_LOST ends with RECONNECTED, not before any lost amplifier's watchdog has certainly expired;
+- QUICK_STOP_ACTIVE and FAULT lead only to SWITCH_ON_DISABLED, by VERIFIED: all amplifiers have been
+  read back, without a fault and at level zero, after a CLEAR of the same epoch (`find_problem`).
+- COMM_LOST ends with RECONNECTED, once the watchdog of every lost amplifier has certainly expired;
   it leads to FAULT if anything was latched or energised before.
 - An event without an entry in the table changes nothing.
 
-Calls of observers, apart from what they observe.
-
-Read-back of disarmed amplifiers: silent and without a fault.
+Observers are called after the actions of a transition have begun (`DeferredCalls`).
 """
 
 import asyncio
@@ -41,17 +39,17 @@ _REMEDIES = {
     "INTERLOCK": "close its interlock",
     "OVER_CURRENT": "check ERAs and cables for a short circuit",
 }
-"""What to do about the faults that an amplifier reports."""
+"""Remedies of the faults that an amplifier reports."""
 
 
-def acknowledge(cause: str) -> str:
-    """The remedy of a fault, by the names in its cause."""
+def fault_remedy(cause: str) -> str:
+    """Return the remedy of a fault, by the names of faults in its cause."""
     named = (_REMEDIES[name] for name in re.findall("[A-Z_]+", cause) if name in _REMEDIES)
     return f"{next(named, 'find the cause')}, then clear (era clear) and arm again"
 
 
 class DaemonState(StrEnum):
-    """States by their CiA 402 names, and COMM_LOST."""
+    """State of the daemon: those of CiA 402, and COMM_LOST."""
 
     NOT_READY = "NOT_READY"
     SWITCH_ON_DISABLED = "SWITCH_ON_DISABLED"
@@ -104,12 +102,15 @@ class Action(Enum):
 
 @dataclass(frozen=True)
 class Lease:
-    """A lease; duration [s]: from each renewal; token: proves ownership; expires_at [s]."""
+    """The lease of the client that armed: without renewal the amplifiers are disarmed."""
 
     owner: str
     duration: float
+    """Time [s] from each renewal to the end."""
     token: str = field(default_factory=lambda: secrets.token_hex(16))
+    """Proof of ownership."""
     expires_at: float = math.inf
+    """[s]"""
 
     def renewed(self, now: float) -> Self:
         """Return it for its duration from now [s] on."""
@@ -118,55 +119,53 @@ class Lease:
 
 @dataclass(frozen=True)
 class DaemonEvent:
-    """An event with its cause and a remedy for the user: that of a fault follows from its cause.
-
-    amplifiers: names of those that are lost, or do not reply.
-    """
+    """An event with its cause."""
 
     trigger: Trigger
     cause: str = ""
     remedy: str | None = None
+    """For the user; the remedy of a fault follows from its cause instead."""
     lease: Lease | None = None
     amplifiers: tuple[str, ...] = ()
+    """Names of those that are lost, or do not reply."""
 
 
 class Loss(NamedTuple):
-    """A loss of amplifiers: since when [s], why, and their names.
-
-    All others were closed because of these; no names: it is not known which are lost.
-    """
+    """A loss of amplifiers, because of which all others were closed."""
 
     at: float
+    """[s]"""
     cause: str
     names: tuple[str, ...] = ()
+    """Empty if it is not known which amplifiers are lost."""
 
 
 @dataclass(frozen=True)
 class Operation:
-    """The operation of the plate: its state and everything that the next transition depends on.
-
-    is_latched: a clear is required before arming; lost: while amplifiers cannot be reached;
-    degraded: names of armed ones that do not reply but may still play, as said last; lease: of who
-    armed, in the states of ENERGISED alone. epoch: rises with every change of state, and
-    with a stop, fault or loss that changes none: what began before must not go on.
-    """
+    """The state of the plate and everything that the next transition depends on."""
 
     state: DaemonState = DaemonState.NOT_READY
     cause: str = "the daemon is starting"
     remedy: str | None = None
     is_latched: bool = False
+    """Whether a clear is required before arming."""
     lost: Loss | None = None
+    """Set while amplifiers cannot be reached."""
     degraded: tuple[str, ...] = ()
+    """Names of armed amplifiers that do not reply but may still play, as reported last."""
     lease: Lease | None = None
+    """Of the client that armed; in the states of `ENERGISED` alone."""
     epoch: int = 0
+    """Rises with every change of state, and with a stop, fault or loss that changes none: actions
+    that began in an earlier epoch must not go on."""
 
     @property
     def next_step(self) -> str | None:
-        """What to do so that something can play: the remedy, or what a state without one needs."""
+        """What to do before anything can play: the remedy, or the next step of the state."""
         return self.remedy or _NEXT_STEPS.get(self.state)
 
     def lease_at(self, now: float) -> Lease | None:
-        """The lease, unless it has expired at a time [s]."""
+        """Return the lease, or None if it has expired at a time [s]."""
         return self.lease if self.lease is not None and now < self.lease.expires_at else None
 
     def is_lease_over(self, now: float) -> bool:
@@ -176,7 +175,7 @@ class Operation:
 
 
 class Transition(NamedTuple):
-    """Next state and actions."""
+    """The next state, and the actions on the way there."""
 
     to: DaemonState
     actions: tuple[Action, ...] = ()
@@ -185,8 +184,14 @@ class Transition(NamedTuple):
 _SILENT = (DaemonState.SWITCH_ON_DISABLED, DaemonState.READY_TO_SWITCH_ON)
 ENERGISED = (DaemonState.SWITCHED_ON, DaemonState.OPERATION_ENABLED)
 """States in which amplifiers have or get high voltage."""
-_OVERTAKING = (*(Trigger.STOP, Trigger.DISARM, Trigger.FAULT, Trigger.LINK_LOST, Trigger.CLOSE),)
-"""Events before which nothing may have begun that goes on after them."""
+_OVERTAKING = {
+    Trigger.STOP,
+    Trigger.DISARM,
+    Trigger.FAULT,
+    Trigger.LINK_LOST,
+    Trigger.CLOSE,
+}
+"""Events that begin an epoch: what began before them must not go on."""
 _LATCHING = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
 _CLEARABLE = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
 
@@ -194,7 +199,7 @@ _CLEARABLE = (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
 def _from(
     states: Iterable[DaemonState], trigger: Trigger, to: DaemonState | None, *actions: Action
 ) -> dict[tuple[DaemonState, Trigger], Transition]:
-    """A transition from each of several states; to: None for the same state."""
+    """Return a transition from each of several states; to: None for the same state."""
     return {(state, trigger): Transition(to or state, actions) for state in states}
 
 
@@ -208,7 +213,8 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
         ENERGISED,
         Trigger.DISARM,
         DaemonState.SWITCH_ON_DISABLED,
-        *(Action.DISARM, Action.VERIFY),
+        Action.DISARM,
+        Action.VERIFY,
     ),
     **_from(DaemonState, Trigger.STOP, None, Action.STOP),
     **_from((*_SILENT, *ENERGISED), Trigger.STOP, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
@@ -226,7 +232,8 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
         (*_SILENT, *ENERGISED, *_LATCHING),
         Trigger.LINK_LOST,
         DaemonState.COMM_LOST,
-        *(Action.STOP, Action.RECONNECT),
+        Action.STOP,
+        Action.RECONNECT,
     ),
     # Read back as silent: a stop would latch an amplifier that is back at once.
     **_from(
@@ -241,7 +248,7 @@ TRANSITIONS: dict[tuple[DaemonState, Trigger], Transition] = {
     ),
     **_from(DaemonState, Trigger.CLOSE, DaemonState.NOT_READY, Action.CLOSE),
 }
-"""Transitions by state and trigger; of two rows the later one holds."""
+"""Transitions by state and trigger; a later row replaces an earlier one."""
 
 _WHEN_LATCHED = TRANSITIONS | {
     **_from([DaemonState.NOT_READY], Trigger.OPENED, DaemonState.QUICK_STOP_ACTIVE, Action.STOP),
@@ -267,7 +274,7 @@ def failed(operation: Operation, cause: str) -> Operation:
     epoch = operation.epoch + 1
     if operation.state in (DaemonState.NOT_READY, DaemonState.COMM_LOST):
         return replace(operation, is_latched=True, epoch=epoch)
-    return Operation(DaemonState.FAULT, cause, acknowledge(cause), is_latched=True, epoch=epoch)
+    return Operation(DaemonState.FAULT, cause, fault_remedy(cause), is_latched=True, epoch=epoch)
 
 
 def _with_event(operation: Operation, event: DaemonEvent, now: float) -> Operation:
@@ -298,7 +305,7 @@ def _enter(before: Operation, updated: Operation, to: DaemonState, event: Daemon
     if before.lost is not None and is_back:
         cause = f"all amplifiers reply again and are disarmed; before: {before.lost.cause}"
     is_fault = to in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
-    remedy = acknowledge(cause) if is_fault else event.remedy
+    remedy = fault_remedy(cause) if is_fault else event.remedy
     if to is before.state:
         # A persisting fault may have a new cause.
         is_new_cause = event.trigger in (Trigger.FAULT, Trigger.LINK_CHANGED) and bool(event.cause)
@@ -326,8 +333,8 @@ _logger = logging.getLogger(__name__)
 class DeferredCalls:
     """Calls callbacks a moment later, one per iteration of the event loop, in order.
 
-    An exception of one is logged and affects no other. Of more pending calls than a bound the
-    oldest are dropped.
+    An exception of one is logged and affects no other. Beyond 256 pending calls the oldest are
+    dropped.
     """
 
     def __init__(self) -> None:
@@ -356,7 +363,7 @@ class DeferredCalls:
 
 
 def call_guarded(callback: Callable[[], object]) -> None:
-    """Call an observer; its exception is only logged."""
+    """Call an observer; log its exception instead of raising it."""
     try:
         callback()
     except Exception:
@@ -366,11 +373,11 @@ def call_guarded(callback: Callable[[], object]) -> None:
 READ_BACK_INTERVAL = 0.02  # s
 
 _ENABLED = STATES["OPERATION_ENABLED"]
-_DISARMED = (STATES["SWITCH_ON_DISABLED"],)
+_DISARMED = STATES["SWITCH_ON_DISABLED"]
 
 
 def are_silent(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> bool:
-    """Whether all amplifiers report that nothing plays, and nothing can before they are armed."""
+    """Whether all amplifiers report that they are disarmed and silent."""
     return not is_any_armed(statuses) and all(
         amplifiers[name].is_silent(status) for name, status in statuses.items()
     )
@@ -382,9 +389,9 @@ def is_any_armed(statuses: Mapping[str, Values]) -> bool:
 
 
 def find_problem(statuses: Mapping[str, Values], amplifiers: Mapping[str, Amplifier]) -> str | None:
-    """Describe the first amplifier that is not disarmed, not at level zero or in a fault."""
+    """Return what is wrong with the first amplifier that is armed, in a fault or not silent."""
     for name, status in statuses.items():
-        if status["state"] not in _DISARMED or status["fault"]:
+        if status["state"] != _DISARMED or status["fault"]:
             fault = f", fault {name_of(FAULTS, status['fault'])}" if status["fault"] else ""
             return f"amplifier {name} is in {name_of(STATES, status['state'])}{fault}"
         if not amplifiers[name].is_silent(status):

@@ -29,7 +29,7 @@ from controller.api.jsonrpc import RpcError
 from controller.api.methods import StatusResult
 from controller.daemon.config import DaemonSection, file_of, is_daemon_document
 from controller.effects.layout import LayoutSection
-from controller.operation.operator import DUMP_PATTERN
+from controller.operation.fault_dumps import DUMP_PATTERN
 from drivers.errors import LinkError
 from drivers.protocol.definition import EVENT_RECORD, IDENTITY, MESSAGES, NAK_RECORD
 from drivers.protocol.records import Record, Rows

@@ -17,8 +17,8 @@ import pytest
 
 from chain import set_chain
 from controller.daemon.messages import LatencyStatistics
+from controller.operation.fault_dumps import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
 from controller.operation.operation_states import DaemonState, Operation
-from controller.operation.operator import DUMP_PATTERN, MAX_DUMPS, FaultDumps, write_dump
 from controller.process.daemon_process import ServiceManager
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
@@ -327,7 +327,7 @@ def test_dumps_use_one_thread_when_disk_hangs(
 
     dumps = FaultDumps(tmp_path)
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
-        patched.setattr("controller.operation.operator.write_dump", hang)
+        patched.setattr("controller.operation.fault_dumps.write_dump", hang)
         for now[0] in (0.0, 10.0, 20.0):
             dumps.state_changed(Operation(), FAULT)
         assert hangs.wait(20)

@@ -26,8 +26,8 @@ from controller.effects.effect import Region
 from controller.effects.kinds import Buzz
 from controller.effects.layout import SurfaceLayout
 from controller.effects.player import EffectPlayer
-from controller.operation.links import Supervisor
 from controller.operation.operation_states import DaemonEvent, DaemonState, Lease, Trigger
+from controller.operation.supervisor import Supervisor
 from controller.play.intent import Target
 from controller.play.joint_answers import answered, selection_of
 from controller.play.layer_contents import Content, Selection

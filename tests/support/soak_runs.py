@@ -31,8 +31,8 @@ from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, File, Texture
 from controller.effects.layout import SurfaceLayout, default_effects
 from controller.effects.player import EffectPlayer
-from controller.operation.links import Supervisor
 from controller.operation.operation_states import DaemonEvent, DaemonState, Trigger
+from controller.operation.supervisor import Supervisor
 from controller.play.intent import IntentSource
 from controller.play.planner import PlayReport
 from controller.sources.touch import Touch, TouchFrame

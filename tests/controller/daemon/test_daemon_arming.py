@@ -15,7 +15,6 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
 from controller.daemon.methods import check_lease
-from controller.operation.links import Supervisor
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,
@@ -25,6 +24,7 @@ from controller.operation.operation_states import (
     Trigger,
     step,
 )
+from controller.operation.supervisor import Supervisor
 from daemons import (
     ENABLED,
     PATIENCE,
@@ -277,7 +277,7 @@ async def test_client_that_arms_after_the_end_of_a_lease_inherits_nothing(
     """Between the end of a lease and its event: disarmed first, then armed anew."""
     async with ready_daemon(tmp_path) as (bench, era):
         supervisor = bench.daemon._supervisor
-        monkeypatch.setattr(supervisor, "tick", lambda: None)  # its event comes later
+        monkeypatch.setattr(supervisor, "check_lease", lambda: None)  # its event comes later
         states: list[str] = []
         await era.arm("me", lease_s=60)
         expire(supervisor)

@@ -1,10 +1,8 @@
-"""What a stop and the status say an amplifier may play: the same, and never too little.
+"""The operation of a plate and its supervisor, in virtual time with an obedient amplifier.
 
-The operation's states against a table written by hand.
-
-Every transition with every observer and every action raising: silent, then armed again.
-
-The supervisor in virtual time, with a control loop and an obedient amplifier.
+States against a table written by hand; every transition with every observer and every action
+raising; courses of faults and losses; and what a stop and the status say an amplifier may play: the
+same, and never too little.
 """
 
 import asyncio
@@ -17,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from controller.daemon.messages import amplifier_statuses
-from controller.operation import operator
+from controller.operation import supervisor as supervisor_module
 from controller.operation.operation_states import (
     TRANSITIONS,
     Action,
@@ -26,8 +24,8 @@ from controller.operation.operation_states import (
     DeferredCalls,
     Operation,
     Trigger,
-    acknowledge,
     failed,
+    fault_remedy,
     step,
 )
 from controller.play.loop import Controller
@@ -44,11 +42,20 @@ from stop_path import stop_path
 from virtual_lines import in_virtual_time, run_virtual
 
 STEPS: Sequence[Step] = (
-    *("ARM", "ARM", "DISARM", "CLEAR", "STOP", {"touch": ["finger"]}),
-    *("obey", "obey", {"fault": {"kind": "unplug"}}, {"fault": {"kind": "drop"}}),
+    "ARM",
+    "ARM",
+    "DISARM",
+    "CLEAR",
+    "STOP",
+    {"touch": ["finger"]},
+    "obey",
+    "obey",
+    {"fault": {"kind": "unplug"}},
+    {"fault": {"kind": "drop"}},
     {"fault": {"kind": "drop", "toward": "host"}},
     {"fault": {"kind": "drop", "share": 0.7}},
-    *({"becomes": "ANOTHER"}, {"becomes": "SIM-a"}),
+    {"becomes": "ANOTHER"},
+    {"becomes": "SIM-a"},
     {"answers": {"to": ["Stop", "GetStatus"], "levels": [1000, 0, 0]}},
 )
 """What happens to a plate and its amplifiers, at random: reached, lost, exchanged, loud or mute."""
@@ -127,14 +134,15 @@ ANOTHER = {"becomes": "ANOTHER"}
 LOUD = {"answers": {"to": ["Stop", "GetStatus"], "levels": [1000, 0, 0]}}
 STATES: Mapping[str, tuple[Sequence[Step], str, float | None]] = {
     "never reached": ([], MAY_PLAY, None),
-    "never reached, another answers": (*([ANOTHER, "recovers", {"waits": 3}], MAY_PLAY, None),),
+    "never reached, another answers": ([ANOTHER, "recovers", {"waits": 3}], MAY_PLAY, None),
     "lost while disarmed": ([*REACHED, *LOST], ELAPSED, 0.0),
     "lost while armed": ([*REACHED, "ARM", *LOST], ELAPSED, 0.0),
     "mute while armed": ([*REACHED, "ARM", MUTE], ELAPSED, 0.0),
     "lost, and opened anew in vain": ([*REACHED, "ARM", MUTE, {"waits": 20}], ELAPSED, 0.0),
     "lost, another answers": (
         [*REACHED, "ARM", UNPLUG, ANOTHER, "recovers", {"waits": 3}],
-        *(ELAPSED, 0.0),
+        ELAPSED,
+        0.0,
     ),
     "shows a level": ([*REACHED, "ARM", LOUD], MAY_PLAY, None),
     "shows a level, then lost": ([*REACHED, LOUD, {"waits": 1}, MUTE], MAY_PLAY, None),
@@ -202,7 +210,7 @@ FAULT_REACTION_ACTIVE .    .    .    .    .   .     =:s  .   .    FA: CL:sn NR:x
 FAULT                 .    .    SD:v .    .   .     =:s  =:c =:s  .   CL:sn NR:x
 COMM_LOST             .    .    .    .    .   .     =:s  .   .    .   =:n   NR:x
 """
-STATES_STATES = {
+STATE_CODES = {
     "NR": DaemonState.NOT_READY,
     "SD": DaemonState.SWITCH_ON_DISABLED,
     "RS": DaemonState.READY_TO_SWITCH_ON,
@@ -262,11 +270,11 @@ def test_step_follows_table(state: DaemonState, trigger: Trigger) -> None:
             case Trigger.OPENED if state is DaemonState.NOT_READY and operation.is_latched:
                 expected = (DaemonState.QUICK_STOP_ACTIVE, [Action.STOP])
             case _:
-                expected = (STATES_STATES.get(to, state), [ACTIONS[letter] for letter in letters])
+                expected = (STATE_CODES.get(to, state), [ACTIONS[letter] for letter in letters])
         assert (after.state, [*actions]) == expected
         if after.state is not state:
             is_fault = after.state in (DaemonState.FAULT_REACTION_ACTIVE, DaemonState.FAULT)
-            remedy = acknowledge("because") if is_fault else "do this"
+            remedy = fault_remedy("because") if is_fault else "do this"
             assert (after.cause, after.remedy) == ("because", remedy)
         if trigger is Trigger.STOP:
             assert after.is_latched
@@ -330,9 +338,9 @@ def test_unexpected_exception_is_latched(state: DaemonState) -> None:
 
 def test_remedy_of_every_fault_of_an_amplifier_is_its_own() -> None:
     """In whatever words it is reported; of any other cause it is to find it."""
-    remedies = {acknowledge(f"amplifier main: got FAULT with fault {name}") for name in FAULTS}
+    remedies = {fault_remedy(f"amplifier main: got FAULT with fault {name}") for name in FAULTS}
     assert len(remedies) == len(FAULTS)
-    assert acknowledge("a bug") == acknowledge("fault NONE")
+    assert fault_remedy("a bug") == fault_remedy("fault NONE")
 
 
 READY, ENABLED = DaemonState.READY_TO_SWITCH_ON, DaemonState.OPERATION_ENABLED
@@ -393,7 +401,7 @@ async def enter(made: Watched, state: DaemonState) -> None:
     made.far_end.asked.clear()
 
 
-TRANSITIONS_STEPS = [
+OPEN_TRANSITIONS = [
     (state, trigger)
     for state, trigger in TRANSITIONS
     if state is not DaemonState.NOT_READY and trigger is not Trigger.CLOSE
@@ -404,7 +412,7 @@ TRANSITIONS_STEPS = [
 @in_virtual_time
 async def test_failing_observer_changes_no_transition(observer: str) -> None:
     """Whatever state and event: silent after what silences, and it can be armed again."""
-    for state, trigger in TRANSITIONS_STEPS:
+    for state, trigger in OPEN_TRANSITIONS:
         async with watched() as made:
             await enter(made, state)
             made.failing = observer
@@ -420,10 +428,10 @@ async def test_failing_observer_changes_no_transition(observer: str) -> None:
     ("state", "trigger", "action", "name"),
     [
         (state, trigger, action, name)
-        for (state, trigger), (action, name) in product(TRANSITIONS_STEPS, METHODS)
+        for (state, trigger), (action, name) in product(OPEN_TRANSITIONS, METHODS)
         if action in TRANSITIONS[state, trigger].actions
     ]
-    + [(state, trigger, None, "step") for state, trigger in TRANSITIONS_STEPS],
+    + [(state, trigger, None, "step") for state, trigger in OPEN_TRANSITIONS],
 )
 @in_virtual_time
 async def test_failing_action_ends_in_a_stop(
@@ -439,7 +447,7 @@ async def test_failing_action_ends_in_a_stop(
     """
     async with watched() as made:
         await enter(made, state)
-        place = made.controller if action else operator
+        place = made.controller if action else supervisor_module
         work, failures = getattr(place, name), [Planted(name)]
 
         def fail_once(*args: object) -> object:
@@ -485,7 +493,6 @@ def test_stop_takes_one_turn_and_few_functions() -> None:
 
 
 ARMED, STOPPED = "OPERATION_ENABLED", "QUICK_STOP_ACTIVE"
-LINKS_ENABLED = DaemonState.OPERATION_ENABLED
 ARM, STOP, CLEAR = (DaemonEvent(each) for each in (Trigger.ARM, Trigger.STOP, Trigger.CLEAR))
 
 
@@ -629,7 +636,7 @@ async def test_second_clear_leaves_a_plate_alone_that_the_first_has_cleared() ->
         await daemon.handle(ARM)
         await asyncio.gather(*clears, return_exceptions=True)
         await asyncio.sleep(0.1)
-        assert daemon.state is LINKS_ENABLED
+        assert daemon.state is ENABLED
         assert daemon.far_end.state == ARMED
 
 
@@ -665,7 +672,7 @@ async def test_stop_in_progress_is_not_repeated(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A look at the amplifiers finds it at work; one after its end, without silence, does not."""
-    monkeypatch.setattr("controller.operation.links.STATUS_INTERVAL", 0.02)
+    monkeypatch.setattr("controller.operation.supervisor.STATUS_INTERVAL", 0.02)
     async with watched("main") as daemon:
         daemon.answer("Stop", "GetStatus", levels=[1000, 0, 0], state="QUICK_STOP_ACTIVE")
         stopping = asyncio.ensure_future(daemon.supervisor.stop("a test"))
@@ -697,7 +704,7 @@ async def test_reports_of_an_amplifier_are_shown(caplog: pytest.LogCaptureFixtur
         await daemon.handle(ARM)
         daemon.answer("Ping", "GetStatus", flags=0b101, temperature=2000)
         await asyncio.sleep(1)
-        assert daemon.state is LINKS_ENABLED
+        assert daemon.state is ENABLED
         assert reports().keys() == {"limited", "hot"}
         assert "panel 1" in reports()["limited"]
         assert sum(hasattr(record, "remedy") for record in caplog.records) == 2

@@ -1,0 +1,617 @@
+"""The supervisor of a plate: its operation, its links, and what is done about faults and losses.
+
+The supervisor alone owns the operation. An event changes it (`step`), the actions that follow are
+carried out by the controller, and the outcome of each at the amplifiers is the next event. Actions
+come before observers, which are called a moment later, each guarded (`DeferredCalls`).
+
+The supervisor also runs the control loop, polls disarmed amplifiers, and opens lost ones again.
+"""
+
+import asyncio
+import contextlib
+import logging
+import secrets
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal, TypeVar
+
+from controller.operation.operation_states import (
+    ENERGISED,
+    READ_BACK_INTERVAL,
+    Action,
+    DaemonEvent,
+    DaemonState,
+    DeferredCalls,
+    Lease,
+    Operation,
+    Trigger,
+    are_silent,
+    call_guarded,
+    failed,
+    fault_remedy,
+    find_problem,
+    is_any_armed,
+    step,
+)
+from controller.play.loop import Controller
+from controller.play.planner import Observers
+from drivers.errors import (
+    CommandRefused,
+    DriverError,
+    FrameError,
+    LinkDegraded,
+    LinkError,
+    Preempted,
+    WrongAmplifier,
+)
+from drivers.host.amplifier import Amplifier
+from drivers.host.dialogue import Stopped
+from drivers.host.group import GroupState
+from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
+from drivers.protocol.records import Values
+from model.errors import InputError
+from registry import threads
+from registry.plugins import failure_text
+from registry.threads import pauses
+
+STATUS_INTERVAL = 0.5  # s; between status requests to disarmed amplifiers
+_RECHECK = 0.05  # s; of whether the watchdog of a lost amplifier has passed
+_MAX_READ_BACKS = 15
+_EPOCHS = 2**31  # a daemon begins at one of these by chance; all are exact as numbers of JSON
+
+LEASE_OVER = DaemonEvent(Trigger.DISARM, "the arming lease was not renewed", "arm again")
+_REOPENING = "the daemon reconnects by itself and stays disarmed"
+_SILENT = (GroupState.DISARMED, GroupState.STOPPED)
+
+_LOG_LEVELS = {
+    DaemonState.COMM_LOST: logging.ERROR,
+    DaemonState.FAULT_REACTION_ACTIVE: logging.ERROR,
+}
+
+LinkChange = Literal["degraded", "restored", "lost", "retry", "reopened"]
+StateObserver = Callable[[Operation, Operation], None]
+"""Receives the operation before and after a change."""
+
+_logger = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+
+class Supervisor:
+    """Operates the amplifiers of a controller: applies events, and keeps the links open.
+
+    Create the controller with the supervisor's `connected`, set `controller`, and call `observe`
+    before any other observer. An unexpected exception in a transition or action stops all
+    amplifiers and ends in FAULT.
+
+    state_changed: called a moment after every change of the state or its epoch; link_changed:
+    receives the kind of change, the amplifiers concerned where they are known, and a message;
+    alive: called after each cycle of the control loop, which runs in every state.
+    """
+
+    controller: Controller
+    """Opens, arms and stops the amplifiers; to be set first, since it is made with `connected`."""
+
+    def __init__(
+        self,
+        *,
+        state_changed: Sequence[StateObserver],
+        link_changed: Callable[[LinkChange, Sequence[str], str], None],
+        alive: Callable[[], None],
+    ) -> None:
+        # Not the epoch of a daemon before, whose clients may still be connected.
+        self.operation = Operation(epoch=secrets.randbelow(_EPOCHS))
+        self.started = asyncio.Event()  # the amplifiers are open, or searched for
+        self._closing = asyncio.Event()
+        self._changed = asyncio.Event()  # to another state, since `run` has looked at it
+        self._state_observers = (_log_transition, *state_changed)
+        self._link_observer, self._alive = link_changed, alive
+        self._reports = DeferredCalls()
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._loss_lock = asyncio.Lock()  # held until the lost amplifiers are closed
+        self._clears: list[int] = []  # epochs of those in progress
+        self._lease_timer: asyncio.TimerHandle | None = None
+
+    def observe(self, loop: Observers) -> None:
+        """Follow refusals, losses and cycles of the control loop."""
+        loop.refused.append(self._check_own_stop)
+        loop.link_lost.append(self._link_lost)
+        loop.cycle_completed.append(self._cycle_completed)
+
+    def connected(self, amplifiers: Mapping[str, Amplifier]) -> None:
+        """Listen to amplifiers, by name, whose lines have just been opened."""
+        for name, amplifier in amplifiers.items():
+            amplifier.listeners = [partial(self._amplifier_event, name)]  # of each attempt
+
+    async def run(self) -> None:
+        """Open the amplifiers, run the control loop, and reconnect after every loss, until `close`.
+
+        Amplifiers that do not reply at the start, or refuse, are searched for as after a loss; one
+        in a fault leads to the state FAULT. Raises CommandError and InputError for amplifiers that
+        do not fit the configuration, RuntimeError if the control loop ends early.
+        """
+        loop = asyncio.create_task(self._run_control_loop(), name="control loop")
+        try:
+            await self._open()
+            self.started.set()
+            while self.operation.state is not DaemonState.NOT_READY:
+                if loop.done():
+                    raise RuntimeError("control loop has ended before the daemon")
+                self._changed.clear()
+                if self._must_reopen:
+                    await self._restore_link()
+                else:
+                    await self._poll()
+        finally:
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            loop.cancel()
+            await asyncio.gather(loop, return_exceptions=True)
+            self._reports.flush()
+
+    async def close(self, cause: str) -> None:
+        """Ramp down, read back, disarm and close the amplifiers; then `run` ends."""
+        self._closing.set()
+        await self.handle(DaemonEvent(Trigger.CLOSE, cause))
+        self._reports.flush()
+
+    async def handle(self, event: DaemonEvent) -> None:
+        """Apply an event and carry out its actions; raises the error of an action.
+
+        The actions are completed even if the caller is cancelled.
+        """
+        try:
+            await asyncio.shield(self._spawn(self._applied(event)))
+        except (DriverError, asyncio.CancelledError):
+            raise
+        except Exception as error:
+            await self._fail(error)
+            raise
+
+    def post(self, event: DaemonEvent) -> None:
+        """Apply an event at once and carry out its actions in a task."""
+        self._spawn(self._in_background(self._applied(event)))
+
+    def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
+        """Quick-stop all amplifiers in any state; await the outcome of each, by name.
+
+        The requests to the amplifiers are queued when this returns.
+        """
+        stopping = self._spawn(self._stopped(self.controller.stop_all()))
+        self._step(DaemonEvent(Trigger.STOP, cause, remedy))
+        return asyncio.shield(stopping)
+
+    def stop_anyhow(self) -> Awaitable[object]:
+        """Stop all amplifiers, and latch that, if a client's stop request has failed on its way."""
+        cause = "stopped, though the request failed on its way"
+        try:
+            return asyncio.ensure_future(self.controller.group.stop())
+        finally:
+            call_guarded(partial(self._step, DaemonEvent(Trigger.STOP, cause, fault_remedy(cause))))
+
+    def renew(self, lease: Lease) -> Lease:
+        """Return the lease of the client that armed, renewed; it must not have ended."""
+        renewed = lease.renewed(threads.now())
+        self.operation = replace(self.operation, lease=renewed)
+        return renewed
+
+    def withdraw(self, token: str, cause: str) -> None:
+        """Disarm if the lease of a token is still in force."""
+        lease = self.operation.lease
+        if lease is not None and lease.token == token:
+            self.post(DaemonEvent(Trigger.DISARM, cause, "arm again"))
+
+    def assume_energised(self, now: float) -> bool:
+        """Whether a lost amplifier may still be playing at a time [s]."""
+        return self.operation.lost is not None and any(
+            now < self.what_may_play(name).may_play_until for name in self.controller.urls
+        )
+
+    def what_may_play(self, name: str) -> Stopped:
+        """Return what an amplifier may be playing, and why no more is known."""
+        lost = self.operation.lost
+        is_named = lost is not None and name in (lost.names or self.controller.urls)
+        return self.controller.what_may_play(name, self.operation.cause if is_named else "")
+
+    def _applied(self, event: DaemonEvent) -> Coroutine[Any, Any, None]:
+        """Apply an event; await its actions."""
+        actions = self._step(event)
+        return self._carry_out(actions, self.operation.epoch)
+
+    def _step(self, event: DaemonEvent) -> tuple[Action, ...]:
+        """Apply one transition; return its actions."""
+        before, now = self.operation, threads.now()
+        try:
+            self.operation, actions = step(before, event, now)
+        except Exception as error:
+            self.operation, actions = failed(before, failure_text(error)), (Action.STOP,)
+        self._report_transition(before)
+        return actions
+
+    def _report_transition(self, before: Operation) -> None:
+        """Notify the observers of a new epoch, deferred; watch a lease that has begun."""
+        if self.operation.epoch == before.epoch:
+            return
+        self._changed.set()
+        for observer in self._state_observers:
+            call_guarded(partial(self._reports.add, partial(observer, before, self.operation)))
+        if self._lease_timer is not None:
+            self._lease_timer.cancel()
+        if self.operation.state is DaemonState.OPERATION_ENABLED:
+            self.check_lease()
+
+    def check_lease(self) -> None:
+        """Disarm if the lease has expired, else check again when it will have."""
+        operation, now = self.operation, threads.now()
+        if operation.is_lease_over(now):
+            self.post(LEASE_OVER)
+        elif operation.lease is not None:
+            pause = operation.lease.expires_at - now
+            self._lease_timer = asyncio.get_running_loop().call_later(pause, self.check_lease)
+
+    async def _fail(self, error: Exception) -> None:
+        """Stop all amplifiers after an unexpected exception, which is a fault."""
+        before, self.operation = self.operation, failed(self.operation, failure_text(error))
+        self._report_transition(before)
+        await asyncio.shield(self._spawn(self._stop()))
+        if self.operation.state is DaemonState.COMM_LOST:  # what should have closed them has failed
+            await self._carry_out([Action.RECONNECT], self.operation.epoch)
+
+    def _spawn(self, work: Coroutine[Any, Any, _T]) -> "asyncio.Task[_T]":
+        """Run work in a task that `run` waits for."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _in_background(self, work: Awaitable[object]) -> None:
+        """Await work without a caller: its errors are already part of the state."""
+        try:
+            await work
+        except DriverError as error:
+            _logger.info("failed: %s", error)
+        except Exception as error:
+            _logger.exception("failed, stopping all amplifiers")
+            await self._fail(error)
+
+    async def _carry_out(self, actions: Sequence[Action], epoch: int) -> None:
+        """Carry out the actions of a transition to an epoch, one after the other."""
+        for action in actions:
+            match action:
+                case Action.VERIFY:
+                    await self._over_link(self._verify(epoch), epoch)
+                case Action.ARM:
+                    await self._over_link(self._arm(), epoch)
+                case Action.DISARM:
+                    await self._over_link(self.controller.disarm(), epoch)
+                case Action.STOP:
+                    await self._stop()
+                case Action.REACT:
+                    await self._stop()
+                    await self.handle(DaemonEvent(Trigger.REACTION_DONE))
+                case Action.CLEAR:
+                    await self._over_link(self._clear(epoch), epoch)
+                case Action.RECONNECT:
+                    await self.controller.release()
+                    self._changed.set()
+                case Action.CLOSE:
+                    await self.controller.close()
+
+    async def _over_link(self, work: Awaitable[object], epoch: int) -> None:
+        """Await work that needs the link; a loss or refusal becomes an event, then is raised.
+
+        A refusal is no event if a later epoch or a stop in progress explains it.
+        """
+        try:
+            await work
+        except LinkError as error:
+            if isinstance(error, LinkDegraded) and self.operation.state is DaemonState.SWITCHED_ON:
+                await self.handle(DaemonEvent(Trigger.DISARM, "an amplifier did not reply to arm"))
+            else:
+                await self._handle_loss(error)
+            raise
+        except DriverError as error:
+            is_stopping = isinstance(error, Preempted) and self.operation.is_latched
+            if epoch == self.operation.epoch and not is_stopping:
+                await self.handle(DaemonEvent(Trigger.FAULT, str(error)))
+            raise
+
+    async def _arm(self) -> None:
+        await self.controller.arm()
+        await self.handle(DaemonEvent(Trigger.ARMED, self.operation.cause))
+
+    async def _stop(self) -> None:
+        await self._stopped(self.controller.stop())
+
+    async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
+        """Await a stop; the loss of an amplifier is handled after its return."""
+        stopped = await stopping
+        self._spawn(self._check_links())  # which may stop all once more
+        return stopped
+
+    async def _verify(self, epoch: int) -> None:
+        """Disarm what still plays, then read back all amplifiers."""
+        is_armed = is_any_armed(await self.controller.group.statuses())
+        if is_armed and epoch == self.operation.epoch:
+            await self.controller.disarm()
+        problem = await self._read_back(epoch)
+        if epoch != self.operation.epoch:
+            return  # stopped, or verified and armed, in the meantime
+        if problem is None:
+            cause = "all amplifiers are disarmed, at level zero and without a fault"
+            await self.handle(DaemonEvent(Trigger.VERIFIED, cause))
+        else:
+            await self.handle(DaemonEvent(Trigger.FAULT, problem))
+
+    async def _clear(self, epoch: int) -> None:
+        self._clears.append(epoch)
+        try:
+            problem = await self._read_back(epoch, clears=True)
+        finally:
+            self._clears.remove(epoch)
+        self._check_none_since(epoch)
+        if problem is None:
+            await self.handle(DaemonEvent(Trigger.VERIFIED, "acknowledged, and the cause is gone"))
+            return
+        await self.handle(DaemonEvent(Trigger.FAULT, problem))
+        raise CommandRefused(f"{problem}; the cause persists, so nothing was cleared")
+
+    def _check_none_since(self, epoch: int) -> None:
+        """Raise Preempted if a stop, fault or other clear came after the request."""
+        if epoch != self.operation.epoch:
+            raise Preempted(
+                "not cleared: a stop, fault or other clear came after the request; find the cause "
+                "of what is latched, then clear again"
+            )
+
+    async def _read_back(self, epoch: int, *, clears: bool = False) -> str | None:
+        """Read back until all amplifiers are silent; return the problem that remains, if any.
+
+        clears: whether Clear is sent before each read; an amplifier that is still ramping down
+        ignores it. Ends early when the epoch rises.
+        """
+        problem = None
+        for _ in range(_MAX_READ_BACKS):
+            if clears:
+                self._check_none_since(epoch)
+                await self.controller.clear()
+            group = self.controller.group
+            problem = find_problem(await group.statuses(), group.amplifiers)
+            if problem is None or epoch != self.operation.epoch:
+                break
+            await asyncio.sleep(READ_BACK_INTERVAL)
+        return problem
+
+    async def _open(self) -> None:
+        """Open and verify the amplifiers; search for them if one does not reply as expected."""
+        event = DaemonEvent(Trigger.OPENED, "every amplifier has replied")
+        try:
+            await self.controller.open()
+        except (LinkError, CommandRefused, FrameError) as error:
+            lost = self._not_opened(error)
+            event = DaemonEvent(Trigger.NOT_FOUND, str(error), _remedy_of(error), amplifiers=lost)
+        if self._closing.is_set():
+            await self.controller.close()
+        else:
+            await self._in_background(self.handle(event))
+
+    @property
+    def _must_reopen(self) -> bool:
+        """Whether amplifiers are lost, and all lines are closed."""
+        return self.operation.state is DaemonState.COMM_LOST and self.controller.is_released
+
+    async def _restore_link(self) -> None:
+        """Reopen the amplifiers, with growing pauses; leave COMM_LOST once they are all silent."""
+        try:
+            try:
+                await self._reconnect()
+            finally:
+                if self.operation.state is DaemonState.COMM_LOST:
+                    await self.controller.release()
+        except DriverError as error:
+            _logger.info("failed: %s", error)
+        except Exception:
+            _logger.exception("reconnection failed")
+            await self._pause(STATUS_INTERVAL)
+
+    async def _reconnect(self) -> None:
+        for pause in pauses():
+            if self.operation.state is not DaemonState.COMM_LOST:
+                return
+            if await self._reopen():
+                break
+            await self._pause(pause)
+        while self.assume_energised(threads.now()) and not self._closing.is_set():
+            await self._pause(_RECHECK)
+            await self.controller.group.statuses()  # what was loud may be silent by now
+        if self.controller.group.is_open:  # none was lost again
+            await self.handle(DaemonEvent(Trigger.RECONNECTED))
+
+    async def _reopen(self) -> bool:
+        """Open and disarm all amplifiers, or release them; return whether that worked.
+
+        Ports stay open between attempts: a board may restart whenever its own is opened.
+        """
+        try:
+            await self.controller.open()
+            await self.controller.disarm()  # a short loss may not have expired the watchdog
+        except (DriverError, InputError) as error:
+            names, lost = self._not_opened(error), self.operation.lost
+            if lost is not None:
+                self.operation = replace(
+                    self.operation,
+                    cause=str(error),
+                    remedy=_remedy_of(error),
+                    lost=lost._replace(names=names or lost.names),
+                )
+            if self.controller.group.is_open:
+                await self.controller.release()
+            return False
+        self._link_changed("reopened", (), "all amplifiers reply again and are disarmed")
+        return True
+
+    def _not_opened(self, error: Exception) -> tuple[str, ...]:
+        """Report that amplifiers could not be opened; return the names of the lost, if known."""
+        lost = error.lost if isinstance(error, LinkError) else ()
+        self._link_changed("retry", lost, str(error))
+        return lost
+
+    async def _pause(self, duration: float) -> None:
+        """Wait for a time [s]; `close` or a stop, which opens lines at once, ends it."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(duration):
+                await self._changed.wait()
+                self._changed.clear()
+
+    async def _handle_loss(self, error: LinkError) -> None:
+        """Handle a loss; concurrent reports of the same loss wait until it is handled."""
+        async with self._loss_lock:
+            group = self.controller.group
+            lost = *group.members.lost_by, *group.members.degraded
+            if self.operation.state is not DaemonState.COMM_LOST:
+                self._link_changed("lost", lost, str(error))
+            cause = f"amplifier {', '.join(lost)}: {error}" if lost else str(error)
+            event = DaemonEvent(Trigger.LINK_LOST, cause, _remedy_of(error), amplifiers=lost)
+            await self.handle(event)
+
+    async def _check_links(self) -> None:
+        """Handle the loss of an amplifier unless it is handled already."""
+        causes = self.controller.group.members.lost_by.values()
+        if causes and not self._is_loss_handled:
+            try:
+                await self._handle_loss(LinkError(next(iter(causes))))
+            except Exception:
+                _logger.exception("handling of a lost link failed")
+
+    @property
+    def _is_loss_handled(self) -> bool:
+        """Whether amplifiers are lost or closed already."""
+        return self.operation.state in (DaemonState.COMM_LOST, DaemonState.NOT_READY)
+
+    def _link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        report = partial(self._link_observer, change, lost, message)
+        call_guarded(partial(self._reports.add, report))
+
+    async def _run_control_loop(self) -> None:
+        """Run the control loop; an unforeseen exception is a fault, which can be cleared."""
+        while True:
+            try:
+                await self.controller.cycle.run()
+            except Exception as error:
+                _logger.exception("control loop failed, stopping all amplifiers")
+                await self._stop_after(error)
+            await asyncio.sleep(_RECHECK)
+
+    async def _stop_after(self, error: Exception) -> None:
+        """Stop all amplifiers until that works; no heartbeat goes before."""
+        while True:
+            try:
+                return await self._fail(error)
+            except Exception:
+                _logger.exception("stop after a failure of the control loop failed")
+                await asyncio.sleep(_RECHECK)
+
+    def _cycle_completed(self) -> None:
+        self._check_own_stop(
+            "the control loop has stopped the amplifiers, because an exchange failed"
+        )
+        self._check_degraded()
+        call_guarded(self._alive)
+
+    def _link_lost(self, cause: str) -> None:
+        if not self._is_loss_handled:
+            self._spawn(self._in_background(self._handle_loss(LinkError(cause))))
+
+    def _check_own_stop(self, cause: str) -> None:
+        """Post a fault if the control loop itself has stopped the amplifiers of an armed plate."""
+        is_armed = self.operation.state is DaemonState.OPERATION_ENABLED
+        if is_armed and self.controller.group.state in _SILENT:
+            self.post(DaemonEvent(Trigger.FAULT, cause))
+
+    def _check_degraded(self) -> None:
+        """Report that armed amplifiers have ceased to reply, or that all reply again."""
+        group, operation = self.controller.group, self.operation
+        degraded = group.members.degraded
+        is_said = bool(degraded) is bool(operation.degraded)
+        if operation.state is not DaemonState.OPERATION_ENABLED or is_said or group.members.lost_by:
+            return  # of one that is lost the next heartbeat says so
+        change: LinkChange = "restored"
+        remedy: str | None
+        level, remedy = logging.INFO, None
+        cause = "all amplifiers reply again and play what they should"
+        if degraded:
+            change, level, remedy = "degraded", logging.WARNING, "check cables and supply"
+            why = group.amplifiers[degraded[0]].silence_cause
+            cause = f"amplifier {', '.join(degraded)} does not reply; nothing new is played: {why}"
+        self.post(DaemonEvent(Trigger.LINK_CHANGED, cause, remedy, amplifiers=degraded))
+        _logger.log(level, "link: %s: %s", change, cause, extra={"topic": "link"})
+        self._link_changed(change, degraded, cause)
+
+    def _amplifier_event(self, name: str, event: Values) -> None:
+        """Post a fault that an amplifier reports unsolicited, ahead of the next heartbeat."""
+        if not event["fault"] or self.operation.state not in ENERGISED:
+            return
+        channel = "" if event["channel"] == NO_CHANNEL else f", channel {event['channel']}"
+        cause = f"amplifier {name} reports {name_of(FAULTS, event['fault'])}{channel}"
+        self.post(DaemonEvent(Trigger.FAULT, cause))
+
+    async def _poll(self) -> None:
+        """Wait for the next interval or a change of state, then check disarmed amplifiers.
+
+        The control loop reads the status of armed ones.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STATUS_INTERVAL):
+                while self.operation.state is not DaemonState.NOT_READY and not self._must_reopen:
+                    await self._changed.wait()
+                    self._changed.clear()
+                return
+        if self.controller.group.state not in _SILENT:
+            return
+        try:
+            await self._check_disarmed()
+        except LinkError as error:
+            if not self.controller.group.members.is_degraded_only(error):
+                await self._in_background(self._handle_loss(error))
+        except DriverError:
+            pass  # preempted by another request, which reports for itself
+        except Exception:
+            _logger.exception("status read failed")
+
+    async def _check_disarmed(self) -> None:
+        """Read all statuses; post a fault, or repeat a stop that has not silenced all."""
+        epoch, group = self.operation.epoch, self.controller.group
+        statuses = await group.statuses()
+        if epoch != self.operation.epoch or group.members.silencing:
+            return  # they may have been read before, or during a ramp
+        problem, state = find_problem(statuses, group.amplifiers), self.operation.state
+        if problem is not None and state is DaemonState.READY_TO_SWITCH_ON:
+            await self._in_background(self.handle(DaemonEvent(Trigger.FAULT, problem)))
+        elif (
+            not are_silent(statuses, group.amplifiers)
+            and state in (DaemonState.QUICK_STOP_ACTIVE, DaemonState.FAULT)
+            and self.operation.epoch not in self._clears  # a clear reads back for itself
+        ):
+            _logger.error("stop repeated: %s", problem)
+            await self._stop()
+
+
+def _remedy_of(error: Exception) -> str:
+    """Return the remedy for amplifiers that cannot be opened."""
+    return (
+        _REOPENING
+        if isinstance(error, WrongAmplifier)
+        else f"check cables and supply; {_REOPENING}"
+    )
+
+
+def _log_transition(before: Operation, after: Operation) -> None:
+    if after.state is before.state:
+        return
+    _logger.log(
+        _LOG_LEVELS.get(after.state, logging.INFO),
+        "%s -> %s: %s",
+        before.state,
+        after.state,
+        after.cause,
+        extra={"topic": "state", "cause": after.cause, "remedy": after.remedy},
+    )

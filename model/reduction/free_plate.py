@@ -15,10 +15,10 @@ z = w² / q, T_j the sums over the truncated modes. By q it changes as
 
     h dA / d ln q = sum phi phi' (-q lambda g²) + sum T_j (-(c + z dc / dz) / q).
 
-All stiffness of a plate is taken as E h³ and all its mass as h (`model.structure.plate.SCALED`); a
-plate with other parts is refused (`check_scales`). That is exact for a thin plate; by shear,
-rotary inertia and the layer at its edges the response of the paper's plate then differs by 0.1 %
-for 2 % of thickness, and 0.3 % for 5 %.
+All stiffness of a plate is taken as E h³ and all its mass as h (laws of scale of the fields of
+`model.structure.plate.Plate`); a plate with other parts is refused (`check_scales`). That is exact
+for a thin plate; by shear, rotary inertia and the layer at its edges the response of the paper's
+plate then differs by 0.1 % for 2 % of thickness, and 0.3 % for 5 %.
 
 Contribution of the truncated modes to a receptance, from a few static solves.
 

@@ -191,6 +191,13 @@ class ActuatorSection(Section):
         """The actuator of a name on a plate; count: of the rig's actuators."""
 
     @classmethod
+    def stated(cls, actuator: Actuator) -> dict[str, Any]:
+        """Values of the keys that state what a fit changes of an actuator, as `made` reads them."""
+        found: dict[str, Any] = {"at": [actuator.x, actuator.y]}
+        found |= {key: getattr(actuator, name) for name, key in cls.keys.items()}
+        return found | {"gains": [[f, size, math.degrees(a)] for f, size, a in actuator.gains]}
+
+    @classmethod
     @abstractmethod
     def problems(cls, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """What keys require of each other: problems by key.

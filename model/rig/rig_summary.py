@@ -14,7 +14,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from model.arrays import FloatArray
 from model.config.document import ConfigError, ConfigProblem, Document
-from model.config.fields import Quantity, quantities
+from model.config.fields import quantities
 from model.config.file_kinds import CheckedFile, ConfigKind
 from model.errors import InputError
 from model.quantities import percent
 from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, limits_of, rig_of
-from model.rig.sections import LimitsSection, PlateSection, RigSection
+from model.rig.rig_file import example_rig_path, rig_of
+from model.rig.sections import PLAIN_KEYS, LimitsSection, RigSection
 from model.structure.attachments import (
     DEFAULT_POINTS,
     GRAVITY,
@@ -196,12 +196,11 @@ def _hazards(one: Exciter, section: ExciterSection, rig: Rig) -> Iterator[str]:
 
 
 FURTHER = {
-    name: each.dimension
-    for name, field in PlateSection.model_fields.items()
-    for each in field.metadata
-    if isinstance(each, Quantity) and name not in {"length", "width", "loss_factor"}
+    each.name: PLAIN_KEYS[each.name]
+    for each in fields(Plate)
+    if each.name in PLAIN_KEYS and not each.metadata.get("has_own_row")
 }
-"""Keys of the plate that are plain quantities and have no line of their own in a summary."""
+"""Dimensions of the keys of a plate that are listed together in a summary."""
 
 
 def plate_summary(rig: Rig) -> dict[str, Any]:
@@ -351,7 +350,7 @@ def _check(document: Document) -> CheckedFile:
         problems += error.problems
     urls = _urls(document)
     counts = rig.channel_counts if rig else Counter[str]()
-    limits = rig.limits if rig else limits_of(LimitsSection())
+    limits = rig.limits if rig else LimitsSection().made()
     wrong, warnings = resolve_name(_CHECK)(urls, channels=counts, limits=limits)
     if rig is not None:
         support = support_problem(rig.plate, rig.eras, loads=rig.masses)

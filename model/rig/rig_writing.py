@@ -25,7 +25,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.sections import PlateSection, RigSection
 from model.structure.materials import known_material
-from model.structure.plate import Material
+from model.structure.plate import FOLLOWED_FIELDS
 
 _PER_LINE = 4
 _SAME, _NONE = 1e-4, 1e-6  # relative; and what counts as nothing of every quantity
@@ -46,11 +46,12 @@ def rewritten_text(
     mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
     InputError where the text, read as a rig, has other values.
     """
+    section = Validation(document, RigSection).finish()
     rows: list[Rows] = []
 
     def change(data: CommentedMap) -> None:
-        own = _values(before, document)
-        for path, value in _values(after, document).items():
+        own = _values(before, section)
+        for path, value in _values(after, section).items():
             if value != own[path] or path in _restated(after):
                 _put(data, path, value, rows)
         for era in after.eras:
@@ -74,7 +75,7 @@ def rewritten_text(
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
     back = rig_of(parse_document(document.source, text), mesh=mesh)
-    read, expected = ([*_numbers(each, document)] for each in (back, after))
+    read, expected = ([*_numbers(each, section)] for each in (back, after))
     if len(read) != len(expected) or not all(
         math.isclose(one, other, rel_tol=_SAME, abs_tol=_NONE)
         for one, other in zip(read, expected, strict=True)
@@ -89,39 +90,18 @@ def rewritten_text(
 Rows: TypeAlias = list[list[float]]
 
 
-def _values(rig: Rig, document: Document) -> dict[KeyPath, Any]:
+def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     """Values of a rig that a fit may change, by where its file has them, as it states them."""
-    plate, layers = rig.plate, rig.laminate.layers if rig.laminate else ()
     found: dict[KeyPath, Any] = {("uncertainty",): asdict(rig.uncertainty)}
     # New keys come first in their block.
-    stated: Any = document.data["plate"]
-    whole = layers[0] if layers else plate  # a single layer of what depends on frequency
-    for number, part in enumerate(layers) if "layers" in stated else ((None, whole),):
-        path = ("plate",) if number is None else ("plate", "layers", number)
-        found[*path, "material"] = _material(
-            part.material, is_across=stated.get("grain") == "width"
-        )
-        found[*path, "thickness"] = part.thickness
-    found["plate", "loss_factor"] = plate.loss_factor
-    found["plate", "loss_exponent"] = plate.loss_exponent
-    found["plate", "modes"] = [
-        [math.exp(shift / 2), math.exp(loss)] for shift, loss in plate.mode_deviations
-    ]
+    of_plate = section.plate.stated(rig.plate, rig.laminate)
+    found |= {("plate", *path): value for path, value in of_plate.items()}
     for era in rig.eras:
-        found["eras", era.name, "at"] = [era.x, era.y]
-        for field, key in KINDS[type(era)].keys.items():
-            found["eras", era.name, key] = getattr(era, field)
-        found["eras", era.name, "gains"] = [[f, size, math.degrees(a)] for f, size, a in era.gains]
+        of_era = KINDS[type(era)].stated(era)
+        found |= {("eras", era.name, key): value for key, value in of_era.items()}
     for name, number in zip(rig.foot_names, rig.feet, strict=True):
         found["supports", name, "stiffness"] = rig.masses[number].stiffness
     return found
-
-
-def _material(material: Material, *, is_across: bool) -> dict[str, Any]:
-    """Numbers of a material as a file states them, whose grain may run across the plate."""
-    along = material.turned() if is_across else material
-    ratio = "nu" if material.orthotropy is None else "nu12"
-    return {"name": material.name, **along.moduli, "rho": material.rho, ratio: along.nu}
 
 
 def _restated(after: Rig) -> set[KeyPath]:
@@ -132,13 +112,13 @@ def _restated(after: Rig) -> set[KeyPath]:
     return {("plate", "loss_factor"), *own}
 
 
-def _numbers(rig: Rig, document: Document) -> Iterator[float]:
+def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
     """Yield all numbers of a rig that are written."""
     # A file's own masses come before its supports, and those that were found after both.
     masses = sorted(
         rig.masses, key=lambda each: (each.stiffness > 0, round(each.x, 5), round(each.y, 5))
     )
-    parts: list[Any] = [_values(rig, document), [(each.x, each.y, each.mass) for each in masses]]
+    parts: list[Any] = [_values(rig, section), [(each.x, each.y, each.mass) for each in masses]]
     while parts:
         match parts.pop():
             case int() | float() as number:
@@ -200,7 +180,7 @@ _SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
 _PLACED = {"eras", "masses", "supports"}
 """Those of what has a place on the plate."""
 
-_OF_THEORY = {"length", "width", "thickness", "material", "grain", "layers", "bond", "air_gap"}
+_OF_THEORY = PlateSection.model_fields.keys() - {*FOLLOWED_FIELDS, "modes"}
 """Keys of a plate that decide the modes to which its `modes` are relative."""
 
 _REWRITTEN = ("plate", "mesh", "eras", "masses", "laminate", "uncertainty")

@@ -3,6 +3,9 @@
 Bounds are wide: they catch values in the wrong unit.
 """
 
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -17,6 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
+from model.config.document import KeyPath
 from model.config.fields import (
     DAMPING,
     DENSITY,
@@ -50,11 +54,32 @@ from model.rig.actuator_keys import (
     ThresholdSet,
     check_ascending,
     check_url,
+    place_on,
 )
 from model.rig.rig import BOUNDS, Uncertainty
-from model.structure.attachments import DEFAULT_POINTS, FootKind
+from model.structure.attachments import (
+    DEFAULT_POINTS,
+    EDGE_FOOT,
+    FEET,
+    FEET_DEVIATE,
+    FOOT_LOSS,
+    FootKind,
+    PointLoad,
+    edge_points,
+)
 from model.structure.materials import KnownMaterial, known_material, material_names
-from model.structure.plate import MAX_LOSS_EXPONENT, Bond
+from model.structure.plate import (
+    MAX_LOSS_EXPONENT,
+    AirGap,
+    Bond,
+    Laminate,
+    LaminateLayer,
+    Material,
+    Orthotropy,
+    Plate,
+    equivalent_plate,
+)
+from registry.limits import GuardLimits
 
 
 class _MaterialByName:
@@ -149,6 +174,23 @@ class MaterialSection(Section):
     Limits: 2 rows or more, by ascending frequency
     """
 
+    def of_thickness(self, thickness: float) -> Material:
+        """Make the material, the same at any thickness; raises InputError for one of no solid."""
+        if self.E is not None and self.nu is not None:
+            return Material(self.name, self.E, self.rho, self.nu)
+        E1, E2, nu12 = self.E1, self.E2, self.nu12
+        G12, G13, G23 = self.G12, self.G13, self.G23
+        # see model.rig.rig_file
+        assert E1 and E2 and G12 and G13 and G23 and nu12 is not None  # noqa: S101, PT018
+        shares = Orthotropy(E2 / E1, G12 / E1, G13 / E1, G23 / E1)
+        return Material(self.name, E1, self.rho, nu12, shares)
+
+    @staticmethod
+    def stated(material: Material) -> dict[str, Any]:
+        """The keys that state a material, the inverse of `of_thickness`."""
+        ratio = "nu" if material.orthotropy is None else "nu12"
+        return {"name": material.name, **material.moduli, "rho": material.rho, ratio: material.nu}
+
 
 MaterialOrName = Annotated[MaterialSection | KnownMaterial, _MaterialByName()]
 
@@ -171,6 +213,18 @@ class LayerSection(Section):
 
     Limits: 2 rows or more, by ascending frequency
     """
+
+    def made(self) -> LaminateLayer:
+        """Make the layer; by_frequency of its material holds if it states no losses of its own."""
+        rows = self.by_frequency
+        if rows is None and self.loss_factor is None:
+            rows = [*(self.material.by_frequency or ())]
+        return LaminateLayer(
+            self.material.of_thickness(self.thickness),
+            self.thickness,
+            loss_factor=self.loss_factor or 0.0,
+            by_frequency=tuple(rows or ()),
+        )
 
 
 class AirGapSection(Section):
@@ -256,6 +310,79 @@ class PlateSection(Section):
     Limits: rows of [0.8 to 1.25, 0.01 to 100]
     """
 
+    @property
+    def laminate(self) -> Laminate | None:
+        """The laminate of the plate; None for a homogeneous one.
+
+        A single layer stands for a material that depends on frequency.
+        """
+        if self.layers is not None:
+            return Laminate(tuple(each.made() for each in self.layers), bond=self.bond)
+        known, thickness = self.material, self.thickness
+        if known is None or not known.by_frequency or thickness is None:
+            return None
+        alone = known.of_thickness(thickness)
+        return Laminate((LaminateLayer(alone, thickness, by_frequency=tuple(known.by_frequency)),))
+
+    def made(self, *, frequency_max: float) -> Plate:
+        """Make the plate; what is like a laminate is so at the highest frequency [Hz]."""
+        # The greater one of a mounted panel's and of the material itself, if none is stated.
+        known = self.material.own_loss if isinstance(self.material, KnownMaterial) else 0.0
+        default = max(known, Plate.loss_factor)
+        own: dict[str, Any] = {name: getattr(self, name) for name in PLAIN_KEYS}
+        own |= {
+            "loss_factor": default if self.loss_factor is None else self.loss_factor,
+            "mode_deviations": tuple((2 * math.log(f), math.log(loss)) for f, loss in self.modes),
+            "air_gap": None if self.air_gap is None else AirGap(**self.air_gap.model_dump()),
+        }
+        laminate = self.laminate
+        if laminate is not None:
+            plate = equivalent_plate(
+                laminate, length=self.length, width=self.width, frequency=frequency_max
+            )
+            return replace(plate, **own)
+        assert self.thickness is not None  # noqa: S101  see model.rig.rig_file
+        assert self.material is not None  # noqa: S101
+        material = self.material.of_thickness(self.thickness)
+        if self.grain == "width":
+            material = material.turned()
+        return Plate(thickness=self.thickness, material=material, **own)
+
+    def stated(self, plate: Plate, laminate: Laminate | None) -> dict[KeyPath, Any]:
+        """Values of these keys, by path, that state another plate: the inverse of `made`.
+
+        laminate: of which that plate is made. Of the same form as this section: as many layers, an
+        air gap if there is one, and the same grain and bond.
+        """
+        layers = laminate.layers if laminate else ()
+        found: dict[KeyPath, Any] = {}
+        if self.layers is None:
+            whole = layers[0] if layers else plate
+            along = whole.material.turned() if self.grain == "width" else whole.material
+            found["material",] = MaterialSection.stated(along)
+            found["thickness",] = whole.thickness
+        else:
+            for number, layer in enumerate(layers):
+                found["layers", number, "material"] = MaterialSection.stated(layer.material)
+                found["layers", number, "thickness"] = layer.thickness
+        if self.air_gap is not None and plate.air_gap is not None:
+            found |= {("air_gap", key): each for key, each in asdict(plate.air_gap).items()}
+        found["loss_factor",] = plate.loss_factor
+        found |= {(name,): getattr(plate, name) for name in PLAIN_KEYS}
+        found["modes",] = [
+            [math.exp(shift / 2), math.exp(loss)] for shift, loss in plate.mode_deviations
+        ]
+        return found
+
+
+PLAIN_KEYS: Mapping[str, Dimension] = {
+    name: each.dimension
+    for name, key in PlateSection.model_fields.items()
+    for each in key.metadata
+    if isinstance(each, Quantity) and name in Plate.__dataclass_fields__
+}
+"""Dimensions of the keys of a plate that are quantities with the value of a field of `Plate`."""
+
 
 Edges = Literal["edges"]
 Points = Annotated[int, Field(ge=3, le=40)]
@@ -296,6 +423,17 @@ class MassSection(Section):
 
     points: Points = DEFAULT_POINTS
     """Of each edge, at which a frame acts; more for many waves along it."""
+
+    def made(self, plate: Plate) -> tuple[PointLoad, ...]:
+        """Make the mass on a plate, or those of a frame along its edges."""
+        if self.at is not None:
+            x, y = place_on(plate, self.at)
+            return (PointLoad(x, y, mass=self.mass or 0.0, foot=self.foot),)
+        per_length = self.mass_per_length or 0.0
+        return tuple(
+            PointLoad(x, y, mass=per_length * length, foot=EDGE_FOOT)
+            for x, y, length in edge_points(plate, self.points)
+        )
 
 
 class SupportSection(Section):
@@ -341,6 +479,30 @@ class SupportSection(Section):
 
     points: Points = DEFAULT_POINTS
     """Of each edge, at which it acts; more for many waves along it."""
+
+    def made(self, plate: Plate) -> tuple[PointLoad, ...]:
+        """Make the foot under a plate, or springs along its edges."""
+        damping, loss_factor = self.damping or 0.0, self.loss_factor
+        if loss_factor is None:
+            loss_factor = FOOT_LOSS if self.damping is None else 0.0
+        spring = PointLoad(0.0, 0.0, damping=damping, loss_factor=loss_factor)
+        if self.at is not None:
+            stiffness = self.stiffness or FEET[self.kind or "foam"]
+            x, y = place_on(plate, self.at)
+            foot = replace(spring, x=x, y=y, foot=self.foot)
+            return (replace(foot, stiffness=stiffness, is_foot=True),)
+        edge, per_length = 2 * (plate.length + plate.width), self.stiffness_per_length or 0.0
+        return tuple(
+            replace(
+                spring,
+                x=x,
+                y=y,
+                stiffness=per_length * length,
+                damping=damping * length / edge,
+                foot=EDGE_FOOT,
+            )
+            for x, y, length in edge_points(plate, self.points)
+        )
 
 
 class AmplifierSection(Section):
@@ -418,6 +580,11 @@ class UncertaintySection(Section):
     Default: 0.3 where a rig has feet, else 0
     """
 
+    def made(self, *, has_feet: bool) -> Uncertainty:
+        """Make the uncertainty of a rig; that of its feet, if none is stated, as `FEET_DEVIATE`."""
+        unknown = {"supports": FEET_DEVIATE} if has_feet else {}
+        return Uncertainty(**(unknown | self.model_dump(exclude_none=True)))
+
 
 class FingertipSection(Section):
     """The load of a fingertip, see `Fingertip`; a key left out has the default's value."""
@@ -479,6 +646,12 @@ class LimitsSection(Section):
     so that none of its seconds has more although some are delayed on their way; a set refused
     for it is played as soon as it is allowed.
     """
+
+    def made(self) -> GuardLimits:
+        """Make the limits, infinite where none is stated."""
+        low, high = self.frequency
+        given = self.model_dump(exclude={"frequency"}, exclude_none=True)
+        return GuardLimits(frequency_min=low, frequency_max=high, **given)
 
 
 class RigSection(Section):

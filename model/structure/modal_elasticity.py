@@ -19,7 +19,7 @@ import numpy as np
 
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.errors import InputError
-from model.structure.plate import LOSS_FREQUENCY, SCALED, Plate
+from model.structure.plate import LOSS_FREQUENCY, Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +132,13 @@ def check_scales(
     """Raise InputError for factors on thickness or modulus of a plate with a part that stays.
 
     What is solved of a plate then serves for others by `modal_receptance`, unless it has parts
-    whose mass or stiffness does not go with them (`model.structure.plate.SCALED`). remedy: the end
-    of the message.
+    whose mass or stiffness does not go with them: fields of `Plate` without a law of scale. remedy:
+    the end of the message.
     """
     stays = [
         each.name
         for each in fields(plate)
-        if each.name not in SCALED and getattr(plate, each.name) != each.default
+        if not each.metadata.get("scaling") and getattr(plate, each.name) != each.default
     ]
     if stays and any(np.any(np.asarray(factor) != 1) for factor in factors):
         raise InputError(

@@ -39,7 +39,7 @@ import cmath
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import numpy as np
@@ -318,51 +318,78 @@ class AirGap:
 
 MAX_LOSS_FACTOR, MAX_LOSS_EXPONENT = 1.0, 2.0
 
-SCALED = {
-    "length": "no mass or stiffness by itself",
-    "width": "no mass or stiffness by itself",
-    "thickness": "mass as h, bending stiffness as h³",
-    "material": "stiffness as E",
-    "loss_factor": "a share of the stiffness",
-    "loss_exponent": "a share of the stiffness",
-    "mode_deviations": "factors of the stiffness",
-    "laminate": "taken as the homogeneous plate; a soft adhesive makes it up to a fifth less",
-    "air_gap": "taken as the homogeneous plate; air of 0.5 mm or more makes it up to a fifth less",
-}
-"""How mass and stiffness by each field of a plate go with its thickness h and modulus E.
-
-All as the plate's own, h and E h³: so one solution serves for other thicknesses and moduli, where
-two plates are told apart within a fifth of their difference. Fields that are not listed follow
-other laws, as a mass that stays does: a plate with one must be solved for each thickness.
-"""
-
 SHEAR_CORRECTION = 5 / 6
 
 LOSS_FREQUENCY = 150.0
 """Frequency [Hz] at which a plate has its loss factor, where that varies."""
 
 
+def _meaning(
+    scaling: str, *, is_of_theory: bool = True, has_own_row: bool = False
+) -> dict[str, str | bool]:
+    """What a field of `Plate` means to code that treats all fields alike, as its metadata.
+
+    A field without it has parts of another law, which stay as they are, and is of the theory.
+
+    scaling: how its mass and stiffness go with thickness h and modulus E. All go as those of the
+    plate, h and E h³, or are a share of them: so one solution serves for other thicknesses and
+    moduli, where two plates are told apart within a fifth of their difference. A plate with a field
+    of another law must be solved for each thickness.
+    is_of_theory: whether it decides the modes of the plate's theory. If not, a table of the plate
+    follows a change of it, and identified modes remain those of the changed plate.
+    has_own_row: whether a summary shows it in a row of its own, not among the further quantities.
+    """
+    return {"scaling": scaling, "is_of_theory": is_of_theory, "has_own_row": has_own_row}
+
+
 @dataclass(frozen=True)
 class Plate(Sheet):
-    """A rectangular plate of constant thickness with its corner at the origin.
+    """A rectangular plate of constant thickness with its corner at the origin."""
 
-    length [m] along x, width [m] along y, thickness [m]; loss_factor is the structural loss
-    factor eta of a hysteretic stiffness (1 + i eta) K. The paper does not print it; 1 % is the
-    usual order for a metal or glass panel with its bonded layers. It is the one at LOSS_FREQUENCY
-    and varies as the power loss_exponent of the frequency. mode_deviations: of the lowest elastic
-    modes, ascending, logarithms of eigenvalue and loss factor relative to those of the theory, as
-    `era rig identify` finds them (`model.structure.modal_elasticity`).
+    length: float = field(metadata=_meaning("no mass or stiffness by itself", has_own_row=True))
+    """Along x [m]."""
+
+    width: float = field(metadata=_meaning("no mass or stiffness by itself", has_own_row=True))
+    """Along y [m]."""
+
+    thickness: float = field(metadata=_meaning("mass as h, bending stiffness as h³"))
+    """Of a laminate that of the equivalent homogeneous plate [m]."""
+
+    material: Material = field(metadata=_meaning("stiffness as E"))
+    """Of a laminate that of the equivalent homogeneous plate."""
+
+    loss_factor: float = field(
+        default=0.01, metadata=_meaning("a share of the stiffness", is_of_theory=False)
+    )
+    """Structural loss factor eta of a hysteretic stiffness (1 + i eta) K, at LOSS_FREQUENCY.
+
+    The paper does not print it; 1 % is the usual order for a metal or glass panel with its bonded
+    layers.
     """
 
-    length: float
-    width: float
-    thickness: float
-    material: Material
-    loss_factor: float = 0.01
-    loss_exponent: float = 0.0
-    mode_deviations: tuple[tuple[float, float], ...] = ()
-    laminate: Laminate | None = None
-    air_gap: AirGap | None = None
+    loss_exponent: float = field(
+        default=0.0, metadata=_meaning("a share of the stiffness", is_of_theory=False)
+    )
+    """The loss factor varies as this power of the frequency."""
+
+    mode_deviations: tuple[tuple[float, float], ...] = field(
+        default=(), metadata=_meaning("factors of the stiffness", is_of_theory=False)
+    )
+    """Of the lowest elastic modes, ascending: logarithms of eigenvalue and of loss factor relative
+    to those of the theory, as `era rig identify` finds them (`model.structure.modal_elasticity`).
+    """
+
+    laminate: Laminate | None = field(
+        default=None,
+        metadata=_meaning("as the homogeneous plate; a soft adhesive makes it up to a fifth less"),
+    )
+    """Layers that are solved as they are; None for a homogeneous plate."""
+
+    air_gap: AirGap | None = field(
+        default=None,
+        metadata=_meaning("as the homogeneous plate; air of 0.5 mm or more makes it a fifth less"),
+    )
+    """Air between the plate and a rigid wall; None for a plate in the open."""
 
     def __post_init__(self) -> None:
         """Refuse dimensions out of range."""
@@ -452,6 +479,12 @@ class Plate(Sheet):
     def contains(self, x: float, y: float) -> bool:
         """Whether a point [m] lies on the plate, its edges included."""
         return 0 <= x <= self.length and 0 <= y <= self.width
+
+
+FOLLOWED_FIELDS = tuple(
+    each.name for each in fields(Plate) if not each.metadata.get("is_of_theory", True)
+)
+"""Fields of a plate that a table follows, and that leave the modes of the plate's theory alone."""
 
 
 _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty

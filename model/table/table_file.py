@@ -55,7 +55,7 @@ from model.spectral.modes import PlateMesh
 from model.structure.attachments import check_supported, footprints_of
 from model.structure.exciter import Actuator
 from model.structure.modal_elasticity import Dispersion, check_scales
-from model.structure.plate import Plate
+from model.structure.plate import FOLLOWED_FIELDS, Plate
 from model.table.table import PAPER_GRID, LocalizationTable, Raster, default_drive_frequencies
 from model.vibration import estimate_error, finer_mesh
 from registry.wording import first_problem
@@ -511,9 +511,8 @@ _SAME_PLACE = 1e-9  # m
 _MAX_SCALE, _MAX_SCALE_ON_AIR = 0.1, 0.01  # mass and stiffness of air do not follow the plate's
 
 
-_FOLLOWED = ("masses", "uncertainty", "fingertip", "threshold")
-_FOLLOWED_OF_PLATE = ("loss_factor", "loss_exponent", "mode_deviations")
-"""Fields of a rig and its plate that may differ, beside `LEARNED` of its ERAs.
+_FOLLOWED_OF_RIG = ("masses", "uncertainty", "fingertip", "threshold")
+"""Fields of a rig that may differ, beside those of its plate and `LEARNED` of its ERAs.
 
 All others must be the table's.
 """
@@ -532,9 +531,9 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
     others = {era.name: era for era in rig.eras}
     like = replace(
         table,
-        plate=_taking(before.scaled(modulus=stiffer, thickness=thicker), after, _FOLLOWED_OF_PLATE),
+        plate=_taking(before.scaled(modulus=stiffer, thickness=thicker), after, FOLLOWED_FIELDS),
         eras=tuple(_taking(era, others.get(era.name, era), era.LEARNED) for era in table.eras),
-        **{name: getattr(rig, name) for name in _FOLLOWED},
+        **{name: getattr(rig, name) for name in _FOLLOWED_OF_RIG},
     )
     if different := differences(like, rig):
         raise InputError(

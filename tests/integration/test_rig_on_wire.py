@@ -54,7 +54,7 @@ from model.errors import InputError
 from model.identification.learned_plate import load_learned
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
-from model.structure.plate import SCALED
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from plates import write_rig
@@ -250,7 +250,7 @@ def test_plate_with_a_part_that_does_not_scale_is_refused_before_it_is_measured(
     tmp_path: Path, typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     """Before a port is opened, where none is; also of a known thickness, which would not help."""
-    monkeypatch.delitem(SCALED, "loss_exponent")
+    monkeypatch.setattr(Plate.__dataclass_fields__["loss_exponent"], "metadata", {})
     known = "uncertainty: {thickness: 0}\nplate:\n  loss_exponent: 0.2\n"
     write_rig(tmp_path / "rig.yaml", ("plate:\n", known), mesh="auto")
     with pytest.raises(InputError, match=r"^plate\.loss_exponent: (?!.*set unc).*era rig identify"):

@@ -9,8 +9,9 @@ import inspect
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,14 +27,15 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig import sections
 from model.rig.actuator_keys import KINDS
-from model.rig.rig import Rig
-from model.rig.rig_file import load_rig, parse_rig
+from model.rig.rig import Rig, differences
+from model.rig.rig_file import load_rig, parse_rig, rig_of
 from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
 from model.rig.rig_writing import rewritten_text
 from model.rig.sections import PlateSection
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
 from model.structure.materials import EXCITER_TYPES, KNOWN_MATERIALS
+from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Material, Plate
 from model.table.table_file import build_table, table_following
 from model.vibration import natural_modes
 from plates import exciter_rig, exciter_rig_text
@@ -91,8 +93,14 @@ PLAIN = {key: each for key, field in FIELDS.items() for each in quantities(field
 def rig_with(key: str, mesh: str, stiffness: float = 17e3, more: float = 0.02) -> Rig:
     """A plate whose key is so much more of one unit than otherwise, on four springs."""
     start = PLATE.get(key) or FIELDS[key].default or 0.0
-    data = {
-        "plate": {**PLATE, "material": GLASS, key: start + more * min(1.0, PLAIN[key].at_most)},
+    plate = {**PLATE, "material": GLASS, key: start + more * min(1.0, PLAIN[key].at_most)}
+    return parse_rig("rig.json", json.dumps(rig_data(plate, mesh, stiffness)))
+
+
+def rig_data(plate: dict[str, Any], mesh: str, stiffness: float) -> dict[str, Any]:
+    """A rig file of a plate on four springs."""
+    return {
+        "plate": plate,
         "mesh": mesh,
         "eras": {
             name: {
@@ -107,7 +115,6 @@ def rig_with(key: str, mesh: str, stiffness: float = 17e3, more: float = 0.02) -
         "amplifiers": {"main": {"url": "sim://"}},
         "limits": {"frequency": [40, 300]},
     }
-    return parse_rig("rig.json", json.dumps(data))
 
 
 @pytest.mark.parametrize("key", [key for key in PLAIN if key != "thickness"])
@@ -134,6 +141,56 @@ def test_a_key_is_in_elements_and_polynomials_and_in_the_summary(key: str) -> No
     summary = plate_summary(soft)
     shown = {**summary, **summary["further"]}
     assert shown[PLAIN[key].dimension.key(key)] == getattr(soft.plate, key)
+
+
+LAYERS = [{"material": {**GLASS, "name": each}, "thickness": 0.001} for each in "ab"]
+FORMS: dict[str, dict[str, Any]] = {
+    "laminate": {"layers": LAYERS},
+    "air_gap": {"material": GLASS, "thickness": 0.002, "air_gap": {"depth": 0.004}},
+}
+"""Keys of a plate that has the field."""
+
+
+@pytest.mark.parametrize("name", [each.name for each in fields(Plate)])
+def test_a_field_that_differs_is_written_and_followed_as_it_says(name: str) -> None:
+    """Of each field, also a new one: the rig's text states it, and reads back.
+
+    A table follows fields beside the theory, a thickness and a modulus of all layers, no other.
+    """
+    keys = FORMS.get(name, {"material": GLASS, "thickness": 0.002})
+    data = rig_data({"length": 0.3, "width": 0.2, **keys}, "10x8 Legendre", 17e3)
+    for era in data["eras"].values():
+        era["damping"] = 3.0
+    document = parse_document("rig.json", json.dumps(data))
+    before = rig_of(document)
+    after = with_other(before, name)
+    back = parse_rig("rig.yaml", rewritten_text(document, before, after, comment="Other"))
+    assert differences(back, after) == []
+    assert differences(back, before) != []
+    table = build_table(before, frequencies=np.array([80.0, 150.0]))
+    if name in {*FOLLOWED_FIELDS, "thickness", "material", "laminate"}:
+        assert table_following(table, after).fingerprint == after.fingerprint
+        return
+    with pytest.raises(InputError, match=f"plate.{name}"):
+        table_following(table, after)
+
+
+def with_other(rig: Rig, name: str) -> Rig:
+    """The rig with another value of a field of its plate, on the same mesh."""
+    plate = rig.plate
+    match getattr(plate, name):
+        case float() as value:
+            return replace(rig, plate=replace(plate, **{name: 1.01 * value or 0.1}))
+        case Laminate() as laminate:
+            laminate = laminate.scaled(modulus=1.02)
+            return replace(rig, plate=plate.scaled(modulus=1.02), laminate=laminate)
+        case Material():
+            return replace(rig, plate=plate.scaled(modulus=1.02))
+        case AirGap() as gap:
+            return replace(rig, plate=replace(plate, air_gap=replace(gap, depth=0.005)))
+    assert name == "mode_deviations"
+    deviations = ((2 * math.log(1.02), math.log(0.9)),)  # a row of six digits in the file
+    return replace(rig, plate=replace(plate, mode_deviations=deviations))
 
 
 OWN = (

@@ -10,7 +10,7 @@ import argparse
 from typing import Any
 
 from benchmarks.setting import support
-from era_haptics.lab.conformance.judge_client import Late
+from era_haptics.lab.conformance.judge_client import TooLate
 
 judged_line: Any = support("judged_line")
 
@@ -21,7 +21,7 @@ def main() -> None:
     judged_line.DELAY = parser.parse_args().reply / 2000
     for kind, name in judged_line.PROTOCOLS.items():
         results = judged_line.judged(kind)
-        late = sum(isinstance(each.finding, Late) for each in results)
+        late = sum(isinstance(each.finding, TooLate) for each in results)
         print(f"{name:11} {sum(each.seconds for each in results):5.1f} s, {late} without a verdict")
 
 

@@ -16,7 +16,7 @@ from drivers.playing import Layer, Tone
 from drivers.wires.serial_line import SerialWire
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 CHANNELS = 4
@@ -31,7 +31,7 @@ class _Port:
     def __init__(self, name: str) -> None:
         self.line = Line(SerialWire(921_600, sequence=0), name)
         self.line.open(self)
-        amplifier = Amplifier(name, channels=CHANNELS)
+        amplifier = SimulatedAmplifier(name, channels=CHANNELS)
         self._end = SerialAmplifiers({1: amplifier}, self._reply)
 
     def write(self, data: bytes) -> None:

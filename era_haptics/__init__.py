@@ -20,10 +20,13 @@ from era_haptics.packages import check_packages, drop_foreign_backend
 check_packages()
 drop_foreign_backend()
 
-_IMPORT = re.compile(r"^from (\S+) import (\w+) as", re.MULTILINE)
+_IMPORT = re.compile(r"^from (\S+) import (\w+)", re.MULTILINE)
+_NAME = re.compile(r"^from \S+ import (\w+) as (\w+)$|^(\w+) = (\w+)$", re.MULTILINE)
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_HOMES = {name: module for module, name in _IMPORT.findall(_STUB)}
-"""The module that defines each name."""
+_MODULES = {own: module for module, own in _IMPORT.findall(_STUB)}
+_OWN = {name or alias: own or known for own, name, alias, known in _NAME.findall(_STUB)}
+_HOMES = {name: (_MODULES[own], own) for name, own in _OWN.items()}
+"""The module that defines each name, and the name that it has there."""
 
 __all__ = sorted(_HOMES)
 
@@ -35,7 +38,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"unknown name era_haptics.{name}; known are {', '.join(__all__)}")
     try:
-        found = getattr(import_module(_HOMES[name]), name)
+        module, own = _HOMES[name]
+        found = getattr(import_module(module), own)
     except ModuleNotFoundError as error:
         if needed := posix_needed(error):
             raise ImportError(needed, name=error.name) from error

@@ -58,9 +58,12 @@ from model.vibration import PlateMap as PlateMap
 from model.vibration import Tone as Tone
 from registry.limits import GuardLimits as GuardLimits
 from sim.plant.excited_plate import FeltFinger as FeltFinger
-from sim.plant.excited_plate import Playback as Playback
+from sim.plant.excited_plate import PlatePlayback
 from sim.plant.excited_plate import Vibration as Vibration
-from sim.plant.fingers import Record as Record
+from sim.plant.fingers import FingerRecord
 
-_HOMES: dict[str, str]
+Playback = PlatePlayback
+Record = FingerRecord
+
+_HOMES: dict[str, tuple[str, str]]
 __all__: list[str]

@@ -43,8 +43,8 @@ from model.structure.attachments import check_loads, footprints_of
 from model.study.contrast_maps import ContrastMap
 from model.table.table import LocalizationTable, default_drive_frequencies
 from model.vibration import PlateMap, Tone, plate_map
-from sim.plant.excited_plate import LEVEL_WINDOW, Playback, play, play_signals
-from sim.plant.fingers import Record
+from sim.plant.excited_plate import LEVEL_WINDOW, PlatePlayback, play, play_signals
+from sim.plant.fingers import FingerRecord
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
 
 
@@ -164,7 +164,7 @@ class SolvedPlate:
         loads: Sequence[float] = (),
         duration: float | None = None,
         sample_rate: float | None = None,
-    ) -> Playback:
+    ) -> PlatePlayback:
         """Compute what fingers feel during a duration [s], from rest, by default until steady.
 
         target: positions [m] of fingers that all of it is for, by default the fingers of an answer,
@@ -296,7 +296,7 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
     return contrast_map_figure(table, found)
 
 
-def draw_playback(playback: Playback) -> Figure:
+def draw_playback(playback: PlatePlayback) -> Figure:
     """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
     The peak within a period of the lowest frequency, of signals within 30 ms: the mean over the
@@ -305,7 +305,7 @@ def draw_playback(playback: Playback) -> Figure:
     Example:
         >>> era.draw_playback(plate.play(only)).savefig("playback.png")
     """
-    expect(playback, Playback, what="playback", made_by="plate.play(pattern, target)")
+    expect(playback, PlatePlayback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()
     period = 1 / min(playback.frequencies, default=1 / LEVEL_WINDOW)
@@ -331,7 +331,7 @@ def draw_playback(playback: Playback) -> Figure:
     return figure
 
 
-def _peaks(record: Record, period: float) -> tuple[FloatArray, FloatArray]:
+def _peaks(record: FingerRecord, period: float) -> tuple[FloatArray, FloatArray]:
     """Times (n,) [s] and the largest acceleration (n, p) [m/s²] within the period before each."""
     step = record.times[1] - record.times[0]
     width = min(max(1, round(period / step)), len(record.times))

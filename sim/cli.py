@@ -14,9 +14,9 @@ from sim.soft_amp.soft_amp_cli import port_option, soft_amp
 
 if TYPE_CHECKING:
     from sim.control import SimulationContext
-    from sim.far_ends.wire_assignment import Wire
+    from sim.far_ends.wire_assignment import SimulatedWire
     from sim.plant.fingers import Accelerometer
-    from sim.process.simulation import PlateView, Simulation
+    from sim.process.simulation import Simulation, SimulationView
 
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command("soft-amp")(soft_amp)
@@ -121,7 +121,7 @@ def sim(
     with exit_on_signal():
         from model.config.fields import parse_point
         from model.rig.rig_file import load_rig
-        from sim.far_ends.wire_assignment import Wire, assign_wires, choose_lines, links_of
+        from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
         from sim.faults import FaultFile, load_faults
         from sim.firmware import find_firmware
         from sim.plant.imperfections import Imperfections, draw_imperfections
@@ -130,7 +130,7 @@ def sim(
         from sim.transport.simulated_line import PROMPT
 
         drawn = seed_of_plate(exact=exact, seed=seed)
-        defaults = Wire(
+        defaults = SimulatedWire(
             "serial",
             speed=speed,
             shared=shared,
@@ -183,7 +183,9 @@ def sim(
         _run(simulation, virtual_time=virtual_time)
 
 
-def _common_wire(defaults: "Wire", ports: Mapping[str, int | None]) -> "Wire | None":
+def _common_wire(
+    defaults: "SimulatedWire", ports: Mapping[str, int | None]
+) -> "SimulatedWire | None":
     """The wire of all amplifiers, by the one option given; ports: None for options not given."""
     from dataclasses import replace
 
@@ -246,13 +248,13 @@ class _LiveView:
         from rich.live import Live
 
         self._live = Live(auto_refresh=False)
-        self._plate: PlateView | None = None
+        self._plate: SimulationView | None = None
 
     def __call__(self, context: "SimulationContext") -> None:
-        from sim.process.simulation import PlateView, draw
+        from sim.process.simulation import SimulationView, draw
 
         if self._plate is None:
-            self._plate = PlateView(context.bench)
+            self._plate = SimulationView(context.bench)
             context.bench.probes.append(self._plate)
             self._live.start()
         self._live.update(draw(context, self._plate), refresh=True)

@@ -120,7 +120,7 @@ def read(form: type[_T], request: Request) -> _T:
         raise InputError(f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")) from None
 
 
-class Fingers(_Form):
+class FingersRequest(_Form):
     """All fingers: positions, those without weight, and loads times that of the rig's fingertip."""
 
     fingers: dict[str, _At]
@@ -134,20 +134,20 @@ class Fingers(_Form):
         return self
 
 
-class Finger(_Form):
+class FingerRequest(_Form):
     """One finger by its id."""
 
     finger: Annotated[str, Field(min_length=1, max_length=40)]
 
 
-class Touch(Finger):
+class TouchRequest(FingerRequest):
     """One finger, where it is, and its load if it has another one."""
 
     at_m: _At
     load: FiniteFloat | None = None
 
 
-class Window(_Form):
+class WindowRequest(_Form):
     """A window of time [s]."""
 
     since_s: FiniteFloat
@@ -160,13 +160,13 @@ class Window(_Form):
         return self
 
 
-class Tones(Window):
+class TonesRequest(WindowRequest):
     """Frequencies [Hz] within a window."""
 
     frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)]
 
 
-class Sensor(_Form):
+class SensorRequest(_Form):
     """A place, and fields of an `Accelerometer`; nothing else."""
 
     model_config = ConfigDict(extra="forbid")
@@ -178,19 +178,19 @@ class Sensor(_Form):
     scale: FiniteFloat = 1.0
 
 
-class Sensors(_Form):
+class SensorsRequest(_Form):
     """All sensors by name."""
 
-    sensors: dict[str, Sensor]
+    sensors: dict[str, SensorRequest]
 
 
-class File(_Form):
+class RecordRequest(_Form):
     """A file to record to."""
 
     file: Annotated[str, Field(min_length=1)]
 
 
-class PlateChange(_Form):
+class PlateRequest(_Form):
     """Factors of the plate as it was at first, and masses [x, y, kg]; nothing else."""
 
     model_config = ConfigDict(extra="forbid")
@@ -201,7 +201,7 @@ class PlateChange(_Form):
     masses: list[_Mass] = []
 
 
-class Step(_Form):
+class StepRequest(_Form):
     """Virtual time to go on by [s]."""
 
     seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
@@ -294,16 +294,16 @@ Operation: TypeAlias = Callable[[SimulationContext, Request, float], Awaitable[R
 
 
 async def _fingers(context: SimulationContext, request: Request, now: float) -> Response:
-    given = read(Fingers, request)
+    given = read(FingersRequest, request)
     return _placed(context, given.fingers, now, observers=given.observers, loads=given.loads)
 
 
 async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
-    name, bench = read(Finger, request).finger, context.bench
+    name, bench = read(FingerRequest, request).finger, context.bench
     if (name in bench.positions) != (request["op"] == "move"):
         state = "already" if name in bench.positions else "not"
         raise InputError(f"finger {name!r} is {state} on the plate")
-    given = read(Touch, request)
+    given = read(TouchRequest, request)
     loads = dict(bench.loads)
     if given.load is not None:
         loads[name] = given.load
@@ -312,7 +312,7 @@ async def _touch_or_move(context: SimulationContext, request: Request, now: floa
 
 
 async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
-    name, present = read(Finger, request).finger, context.bench.positions
+    name, present = read(FingerRequest, request).finger, context.bench.positions
     if name not in present:
         raise InputError(f"finger {name!r} is not on the plate")
     rest = {id: at for id, at in present.items() if id != name}
@@ -333,7 +333,7 @@ def _placed(
 
 
 async def _felt(context: SimulationContext, request: Request, now: float) -> Response:
-    window = read(Window, request)
+    window = read(WindowRequest, request)
     await context.solved(
         window.until_s
     )  # in a thread, as the fits below: amplifiers must go on replying
@@ -360,7 +360,7 @@ async def _felt(context: SimulationContext, request: Request, now: float) -> Res
 async def _sensors(context: SimulationContext, request: Request, now: float) -> Response:
     sensors = [
         Accelerometer(name, *each.at_m, **each.model_dump(exclude={"at_m"}, exclude_unset=True))
-        for name, each in read(Sensors, request).sensors.items()
+        for name, each in read(SensorsRequest, request).sensors.items()
     ]
     context.bench.advance(now)
     context.accelerometers.place(sensors)
@@ -380,7 +380,7 @@ async def _signals(context: SimulationContext, request: Request, now: float) -> 
 
 
 async def _tones(context: SimulationContext, request: Request, now: float) -> Response:
-    frequencies, nyquist = read(Tones, request).frequencies_hz, context.bench.sample_rate / 2
+    frequencies, nyquist = read(TonesRequest, request).frequencies_hz, context.bench.sample_rate / 2
     if len(set(frequencies)) < len(frequencies) or max(frequencies) >= nyquist:
         raise InputError(f"frequencies_hz must be different ones below {nyquist:g} Hz")
     recording = _recorded(context, request, now)
@@ -396,13 +396,13 @@ async def _tones(context: SimulationContext, request: Request, now: float) -> Re
 
 
 def _recorded(context: SimulationContext, request: Request, now: float) -> Recording:
-    window = read(Window, request)
+    window = read(WindowRequest, request)
     context.bench.advance(now)
     return context.accelerometers.read(window.since_s, window.until_s)
 
 
 async def _record(context: SimulationContext, request: Request, now: float) -> Response:
-    file = read(File, request).file
+    file = read(RecordRequest, request).file
     context.bench.advance(now)
     context.record(Path(file))
     return {"ok": True, "time_s": context.bench.time}
@@ -420,11 +420,11 @@ async def _finish(context: SimulationContext, request: Request, now: float) -> R
 
 
 async def _plate(context: SimulationContext, request: Request, now: float) -> Response:
-    context.bench.change_plate(_changed(context, read(PlateChange, request)), now=now)
+    context.bench.change_plate(_changed(context, read(PlateRequest, request)), now=now)
     return {"ok": True, "time_s": context.bench.time}
 
 
-def _changed(context: SimulationContext, change: PlateChange) -> PlateErrors:
+def _changed(context: SimulationContext, change: PlateRequest) -> PlateErrors:
     first, rig = context.first_plate, context.bench.rig
     names = [era.name for era in rig.eras]
     if not change.stiffness.keys() <= set(names):
@@ -535,7 +535,7 @@ async def _recover(context: SimulationContext, request: Request, now: float) -> 
 
 
 async def _step(context: SimulationContext, request: Request, now: float) -> Response:
-    seconds = read(Step, request).seconds
+    seconds = read(StepRequest, request).seconds
     if context.step is None:
         raise InputError("step needs virtual time: start era sim with --virtual-time")
     await context.step(seconds)

@@ -84,7 +84,7 @@ _MAX_NAME = 10
 
 
 @dataclass(frozen=True)
-class Format:
+class RecordingFormat:
     """A file format.
 
     start: the first bytes of a file; max_values: limit that bounds memory; cannot_hold: why
@@ -175,11 +175,15 @@ def _short_names(names: Sequence[str], sample_rate: float) -> str | None:
     return f"names must have at most {_MAX_NAME} characters, got {long[0]!r}" if long else None
 
 
-_UFF = Format(_write_uff, b"    -1", 1 << 22, _short_names)  # as text in memory, 20 bytes a value
+_UFF = RecordingFormat(
+    _write_uff, b"    -1", 1 << 22, _short_names
+)  # as text in memory, 20 bytes a value
 
 FORMATS = {
-    ".csv": Format(_write_csv, b"time_s", 1 << 24),
-    ".wav": Format(_write_wav, b"RIFF", 1 << 24, _whole_rate, lambda path: (sidecar(path),)),
+    ".csv": RecordingFormat(_write_csv, b"time_s", 1 << 24),
+    ".wav": RecordingFormat(
+        _write_wav, b"RIFF", 1 << 24, _whole_rate, lambda path: (sidecar(path),)
+    ),
     ".uff": _UFF,
     ".unv": _UFF,
 }
@@ -228,7 +232,7 @@ def max_values(path: Path) -> int:
     return _format_of(path).max_values
 
 
-def _format_of(path: Path) -> Format:
+def _format_of(path: Path) -> RecordingFormat:
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: suffix must be one of {', '.join(FORMATS)}")
     return FORMATS[path.suffix.lower()]

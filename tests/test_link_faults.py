@@ -24,7 +24,7 @@ from model.rig.rig import Rig
 from real_wires import WIRES, HostedRig, rig_on_wire
 from registry import threads as clock
 from registry.threads import no_long_collections
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from virtual_lines import in_virtual_time
 
@@ -32,10 +32,10 @@ WATCHDOG = 0.25  # s
 THREE_HEARTBEATS = 0.150  # s
 FOUR = (0.2,) * 4  # levels
 SLOW_WIRES = {
-    "serial, 115 200 baud": Wire("serial", speed=115_200, unpluggable=True),
-    "modbus+rtu, 115 200 baud": Wire("modbus-rtu", speed=115_200, unpluggable=True),
-    "modbus+rtu, 19 200 baud": Wire("modbus-rtu", speed=19_200, unpluggable=True),
-    "can+slcan, 125 kbit/s": Wire("slcan", speed=125_000, unpluggable=True),
+    "serial, 115 200 baud": SimulatedWire("serial", speed=115_200, unpluggable=True),
+    "modbus+rtu, 115 200 baud": SimulatedWire("modbus-rtu", speed=115_200, unpluggable=True),
+    "modbus+rtu, 19 200 baud": SimulatedWire("modbus-rtu", speed=19_200, unpluggable=True),
+    "can+slcan, 125 kbit/s": SimulatedWire("slcan", speed=125_000, unpluggable=True),
 }
 ALL_WIRES = {**WIRES, **SLOW_WIRES}
 SLOWEST = ("modbus+rtu, 19 200 baud", "can+slcan, 125 kbit/s")

@@ -19,7 +19,7 @@ from drivers.protocol.definition import CLOCK_TURN, FEATURES
 from model.answer.answer_report import Timing
 from model.rig.rig import Rig
 from registry import threads
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 
 _rig_on_wire: Any = support("rig_on_wire")
@@ -44,10 +44,10 @@ class Arrangement:
     is_bus: bool = False
     has_mark: bool = True
 
-    def wires(self, names: tuple[str, ...], seed: int) -> Mapping[str, Wire]:
+    def wires(self, names: tuple[str, ...], seed: int) -> Mapping[str, SimulatedWire]:
         """The wires by amplifier."""
         return {
-            name: Wire(
+            name: SimulatedWire(
                 self.wire,
                 SPEEDS.get(self.wire),
                 shared=True,

@@ -24,7 +24,7 @@ from model.answer.answer_report import Timing
 from model.config.fields import Circle
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.simulated_line import PROMPT
 
@@ -62,7 +62,7 @@ async def _run(pattern: Pattern, level_db_sl: float, pair: int, seed: int) -> tu
     drawn = draw_imperfections(rig, seed=1000 + seed)
     on: Any
     async with _chain.armed(
-        Wire("serial", speed=921_600, shared=True, line_kind=PROMPT, seed=drawn.seed),
+        SimulatedWire("serial", speed=921_600, shared=True, line_kind=PROMPT, seed=drawn.seed),
         rig,
         table,
         intent_source=EffectPlayer(layout.for_table(table.frequencies)),

@@ -25,7 +25,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.table.table_file import cached_table
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier as SimulatedAmplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 _ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ from drivers.protocol.definition import MESSAGES, read_request
 from drivers.protocol.sets import Assembly, is_last, unpack_layers
 from drivers.wires.serial_frames import Frame, FrameReader, frame_length, unpack_words
 from model.rig.rig import Rig
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
 BAUD = 921_600
@@ -101,7 +101,7 @@ class _Device:
         self._changed = changed
         self._reader, self._assembly = FrameReader(), Assembly()
         self._staged: dict[int, frozenset[int]] = {}
-        self._end = SerialAmplifiers({1: Amplifier(name, channels=channels)}, self._reply)
+        self._end = SerialAmplifiers({1: SimulatedAmplifier(name, channels=channels)}, self._reply)
         self._line = _Server(self._arrived)
         self._line.listen()
         self.url = self._line.url

@@ -20,7 +20,7 @@ from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
 from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, motion_of, realised
-from sim.plant.plant import Placement
+from sim.plant.plant import FingerPlacement
 
 STRONGEST = 0.040  # s
 
@@ -78,7 +78,7 @@ class Log:
             self.steps.append((bench.time, lambda part: part._apply(index, playing, clock)))
             apply(index, playing, clock)
 
-        def placed(placement: Placement) -> None:
+        def placed(placement: FingerPlacement) -> None:
             self.steps.append((placement.time, lambda part: part._place(placement)))
             place(placement)
 

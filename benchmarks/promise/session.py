@@ -36,7 +36,7 @@ from controller.play.planner import PlayReport
 from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS
 from registry import threads
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import draw_imperfections
 from sim.transport.simulated_line import PROMPT
 
@@ -161,11 +161,13 @@ class _Session:
         self._last = case.contents - 1
 
     @property
-    def _wires(self) -> Wire | dict[str, Wire]:
+    def _wires(self) -> SimulatedWire | dict[str, SimulatedWire]:
         """One line of all amplifiers, or one of each."""
         case = self._case
         kind = case.line or PROMPT
-        one = Wire("serial", speed=921_600, shared=True, line_kind=kind, seed=self._drawn.seed)
+        one = SimulatedWire(
+            "serial", speed=921_600, shared=True, line_kind=kind, seed=self._drawn.seed
+        )
         if case.is_one_bus:
             return one
         return {name: replace(one, shared=False, line=name) for name in self._rig.amplifiers}

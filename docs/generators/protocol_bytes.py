@@ -17,7 +17,7 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import More, Wire
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -107,7 +107,7 @@ class _Exchange:
     """
 
     def __init__(self, kind: str, number: int) -> None:
-        self.amplifier = Amplifier("a", channels=4)
+        self.amplifier = SimulatedAmplifier("a", channels=4)
         self._lines: list[str] = []
         self._is_can, self._is_tcp = kind == "can", kind == "tcp"
         far = {1: self.amplifier}

@@ -24,7 +24,14 @@ Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
 def with_entries(page: str) -> str:
     """The page with every block as its comment and the source have it."""
-    return _BLOCK.sub(lambda block: block[1] + "\n".join(_entries(block[2])) + "\n", page)
+    return _BLOCK.sub(lambda block: block[1] + _public("\n".join(_entries(block[2]))) + "\n", page)
+
+
+def _public(text: str) -> str:
+    """A text with the public name of every class that has another one where it is defined."""
+    for name, (_, own) in era_haptics._HOMES.items():
+        text = text if name == own else re.sub(rf"\b{own}\b", name, text)
+    return text
 
 
 def named(page: str) -> set[str]:

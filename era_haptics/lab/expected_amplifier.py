@@ -44,7 +44,7 @@ from era_haptics.lab.expected_output import (
     ExpectedClock,
     ExpectedOutputs,
     Interval,
-    Report,
+    ReportMismatch,
     Unclear,
     one_of,
 )
@@ -166,8 +166,8 @@ class ExpectedStates:
 
     def __init__(
         self,
-        report: Report,
-        always: Report,
+        report: ReportMismatch,
+        always: ReportMismatch,
         *,
         unclear: Unclear | None = None,
         may_fail: bool = True,

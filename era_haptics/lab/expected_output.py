@@ -240,7 +240,7 @@ _LAYERS, _VOICES = QUANTITIES["layer_count"].maximum, QUANTITIES["voices"].maxim
 _ALL_LAYERS = {*range(_LAYERS)}
 
 
-class Report(Protocol):
+class ReportMismatch(Protocol):
     """Takes a violation: rule, time [s], what must be what, and what was seen."""
 
     def __call__(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
@@ -272,7 +272,7 @@ class ExpectedOutputs:
         self,
         can: Values,
         *,
-        report: Report,
+        report: ReportMismatch,
         unclear: Unclear | None,
         slack: float,
         cause: str,
@@ -440,7 +440,7 @@ class ExpectedOutputs:
         return max(sum(voice.peak(time) for voice in voices) for voices in self.playback.all_voices)
 
     def check_levels(
-        self, levels: Sequence[float], when: Interval, report_low: Report | None
+        self, levels: Sequence[float], when: Interval, report_low: ReportMismatch | None
     ) -> float:
         """Compare levels of channels; returns the largest level that one surely has.
 
@@ -497,7 +497,7 @@ _DRIFT = DRIFT + QUANTITIES["rate"].high
 class ExpectedClock:
     """The clock of one amplifier, unknown at first; report: takes what is wrong; slack [s]."""
 
-    def __init__(self, report: Report, slack: float) -> None:
+    def __init__(self, report: ReportMismatch, slack: float) -> None:
         self._report, self._slack = report, slack
         self._read: tuple[int, Interval] | None = None  # the last one, and when
         self._marked: Interval | None = None

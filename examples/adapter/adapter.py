@@ -21,7 +21,7 @@ from typing import Protocol
 from drivers.playing import Voice
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, QUANTITIES, STATUS, STATUS_FLAGS
 from drivers.protocol.records import Refusal, Values
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import make_terminal
 
@@ -61,7 +61,7 @@ class Device(Protocol):
         """Connect anew if that is needed, and have all outputs off, confirmed."""
 
 
-class AdaptedAmplifier(Amplifier):
+class AdaptedAmplifier(SimulatedAmplifier):
     """An amplifier whose levels are not 0 before those of its device are; is_lost: it fails."""
 
     def __init__(self, name: str, *, channels: int) -> None:

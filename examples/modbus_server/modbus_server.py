@@ -33,7 +33,7 @@ from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
 from drivers.wires.modbus_frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
 from registry import threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 
 UNIT, BAUD = 1, 115_200
 STEP = 0.001  # s; between looks at the watchdog
@@ -43,7 +43,7 @@ _COUNTS = range(1, 124)  # registers of a write
 class Unit:
     """An amplifier under a number, as registers: a message is written, then its reply is read."""
 
-    def __init__(self, amplifier: Amplifier, number: int) -> None:
+    def __init__(self, amplifier: SimulatedAmplifier, number: int) -> None:
         self.amplifier, self.number = amplifier, number
         self.is_rtu = False  # where number 0 is a broadcast
         self.moves_to = 0  # the number that SetAddress has given it
@@ -105,7 +105,7 @@ class Unit:
         self.number, self.moves_to = self.moves_to or self.number, 0
 
 
-unit = Unit(Amplifier("pymodbus", channels=4), UNIT)
+unit = Unit(SimulatedAmplifier("pymodbus", channels=4), UNIT)
 
 
 def check_unit(number: int) -> None:

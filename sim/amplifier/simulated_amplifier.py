@@ -227,7 +227,7 @@ class SensorPort(Protocol):
         """Forget the reading, as without supply."""
 
 
-class Amplifier:
+class SimulatedAmplifier:
     """An amplifier with a name and a number of channels; times [s] of any one clock.
 
     listeners: called with the values of every Event, and its time [s]. capabilities: others hold

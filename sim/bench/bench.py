@@ -49,21 +49,21 @@ from model.structure.plate import Plate
 from model.transients.base_motion import Motion
 from registry import threads
 from sim.amplifier.readings import AmplifierClock, StraightClock
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant import imperfections as second_harmonic
 from sim.plant.fingers import (
     KEPT,
     Accelerometer,
-    Felt,
+    FeltVibration,
+    FingerRecord,
     Fingers,
     Position,
-    Record,
     measure_vibration,
     positions,
     readings,
 )
 from sim.plant.imperfections import Imperfections, PlateErrors, motion_of, realised
-from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Placement, Plant
+from sim.plant.plant import SAMPLE_RATE, FingerPlacement, LoadedPlate, Plant
 
 WRONG = 0.5e-6
 """Most by which a clock of the plate is wrong [s]: 0.1 degrees of 500 Hz, when it is replaced."""
@@ -151,7 +151,7 @@ class SampledPlate(Protocol):
 
 
 @dataclass(frozen=True)
-class Measurement:
+class ToneMeasurement:
     """Tones [Hz] that are measured over a window [s]; number: of the reading."""
 
     number: int
@@ -169,7 +169,7 @@ class ToneReader:
     def __init__(
         self,
         plate: SampledPlate,
-        measurement: Measurement,
+        measurement: ToneMeasurement,
         sensors: Sequence[Accelerometer],
         *,
         start: float,
@@ -237,7 +237,12 @@ class Sensing:
     """The sensors of an amplifier that plays on a plate; feet: those at its ERAs."""
 
     def __init__(
-        self, plate: SampledPlate, amplifier: Amplifier, feet: Sequence[Accelerometer], *, seed: int
+        self,
+        plate: SampledPlate,
+        amplifier: SimulatedAmplifier,
+        feet: Sequence[Accelerometer],
+        *,
+        seed: int,
     ) -> None:
         self._plate = plate
         self._amplifier = amplifier
@@ -300,7 +305,7 @@ class Sensing:
 
     def _measure(self, values: Values, now: float) -> Values:
         """Begin to measure, unless it is the same again: its reply was lost."""
-        measurement = Measurement(
+        measurement = ToneMeasurement(
             values["reading"],
             _Q["window"].from_wire(values["window"]),
             tuple(_Q["frequency"].from_wire(each) for each in values["frequencies"]),
@@ -309,7 +314,7 @@ class Sensing:
             self._begin(measurement, now)
         return self._reading(_MAX_SENSORS, now)
 
-    def _begin(self, measurement: Measurement, now: float) -> None:
+    def _begin(self, measurement: ToneMeasurement, now: float) -> None:
         ascending = sorted(measurement.frequencies)
         if not ascending or ascending[-1] > self._frequency_max:
             limit = self._frequency_max
@@ -405,13 +410,13 @@ class Bench:
         self._fingers = Fingers(self._plant.reduced)
         self._is_sampling = False
         # Fingers that are not on the plate in time yet; the newest, and those that load the plate.
-        self._placements: deque[Placement] = deque()
+        self._placements: deque[FingerPlacement] = deque()
         self.positions: Mapping[str, Position] = {}
         self._contacts: Mapping[str, FingertipLoad] = {}
         self.observers: frozenset[str] = frozenset()  # fingers without weight
         self.loads: Mapping[str, float] = {}  # by finger, relative to the rig's fingertip
-        self.amplifiers: Mapping[str, Amplifier] = {
-            name: Amplifier(
+        self.amplifiers: Mapping[str, SimulatedAmplifier] = {
+            name: SimulatedAmplifier(
                 name,
                 channels=_channel_count(rig, name),
                 is_output=name in rig.outputs,
@@ -529,13 +534,13 @@ class Bench:
         if self._contacts != before:
             solution = self._plant.solution(self._contacts, time=self.time)
             solve = partial(_tabulated, solution, self.sample_rate)
-        placement = Placement(self.time, positions, self._contacts, solve)
+        placement = FingerPlacement(self.time, positions, self._contacts, solve)
         if len(self._placements) > 1 and placement.supersedes(*list(self._placements)[-2:]):
             self._placements.pop()
         self._placements.append(placement)
 
     @property
-    def unsolved(self) -> Placement | None:
+    def unsolved(self) -> FingerPlacement | None:
         """The first of the fingers that are to be placed whose plate is not solved, if any."""
         return next((one for one in self._placements if not one.is_solved), None)
 
@@ -561,7 +566,7 @@ class Bench:
         """Replace the sensors of the first amplifier beside those at its ERAs."""
         self._sensing[0].place(sensors)
 
-    def records(self, since: float, until: float) -> tuple[dict[str, Record], list[float]]:
+    def records(self, since: float, until: float) -> tuple[dict[str, FingerRecord], list[float]]:
         """The record of each finger in a window of the last ten seconds [s], by id.
 
         Also the frequencies [Hz] driven in it, ascending.
@@ -569,7 +574,7 @@ class Bench:
         self._sample_plate(until)
         return self._fingers.felt(since, until), self._frequencies(since, until)
 
-    def felt(self, since: float, until: float) -> dict[str, Felt]:
+    def felt(self, since: float, until: float) -> dict[str, FeltVibration]:
         """Vibration at each finger in such a window, by id."""
         records, frequencies = self.records(since, until)
         return {name: measure_vibration(record, frequencies) for name, record in records.items()}
@@ -618,7 +623,7 @@ class Bench:
         """Advance the plate by a second at most, to a finger that is unsolved."""
         self._sample_plate(self._sampled_until + _MAX_STEP, solves=False)
 
-    def _place(self, placement: Placement) -> None:
+    def _place(self, placement: FingerPlacement) -> None:
         """Advance the plate to the time of a placement, and put its fingers on it."""
         self._sample_until(placement.time)
         before = self._plant.reduced

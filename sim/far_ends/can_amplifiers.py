@@ -64,7 +64,7 @@ from drivers.wires.can_frames import (
 from registry import threads
 from sim.amplifier.simulated_amplifier import SILENCING_RAMP
 from sim.bench.amplifier_device import AmplifierDevice
-from sim.transport.far_end import AmplifierPort, FarEnd, Send, Served
+from sim.transport.far_end import AmplifierPort, FarEnd, Send, TimedFarEnd
 from sim.transport.simulated_line import TwoWayLine
 
 TOGGLE = 0x0503_0000
@@ -463,7 +463,7 @@ class BusNodes:
         for frame in unpack_frames(data):
             self._bus.send(frame, sender=self._hear)
 
-    def _connect(self, device: AmplifierDevice) -> tuple[TwoWayLine, Served]:
+    def _connect(self, device: AmplifierDevice) -> tuple[TwoWayLine, TimedFarEnd]:
         def send(frames: bytes) -> None:
             for frame in unpack_frames(frames):
                 line.outward.send(pack_frames([frame]))
@@ -479,7 +479,7 @@ class BusNodes:
             finds_damage=True,
         )
         end = CanAmplifiers({device.address: device}, send)
-        served = Served(end)
+        served = TimedFarEnd(end)
         device.boot_listeners.append(boot)
         boot()
         return line, served

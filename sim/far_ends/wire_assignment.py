@@ -36,7 +36,7 @@ Devices = Sequence[AmplifierDevice]
 
 
 @dataclass(frozen=True)
-class Wire:
+class SimulatedWire:
     """How simulated amplifiers are reached.
 
     kind: a key of `_OPENERS`; speed [bit/s]: None for no transmission time, or that of the kind
@@ -64,7 +64,7 @@ class Wire:
 
 
 @asynccontextmanager
-async def open_wire(wire: Wire, devices: Devices) -> Urls:
+async def open_wire(wire: SimulatedWire, devices: Devices) -> Urls:
     """The far end of a wire with these devices; entering it may raise LinkError.
 
     Amplifiers that do not share a serial wire have a line each.
@@ -77,12 +77,12 @@ async def open_wire(wire: Wire, devices: Devices) -> Urls:
 
 
 @asynccontextmanager
-async def open_wires(wires: Mapping[str, Wire], devices: Devices) -> Urls:
+async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Urls:
     """The far ends of devices on several wires, both by name; equal wires are shared.
 
     Yields the URLs by name, in the order of the devices. Raises LinkError.
     """
-    lines: dict[Wire, list[AmplifierDevice]] = {}
+    lines: dict[SimulatedWire, list[AmplifierDevice]] = {}
     for device in devices:
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
@@ -99,19 +99,19 @@ def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
     return {device.address: device for device in devices}
 
 
-def _default_line(wire: Wire) -> str:
+def _default_line(wire: SimulatedWire) -> str:
     """The default kind of line of a wire; of a serial line by the port of its URL."""
     port = Path(wire.line).name.rstrip("0123456789")
     return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
 
-def _speed(wire: Wire, default: int) -> int | None:
+def _speed(wire: SimulatedWire, default: int) -> int | None:
     """Bits per second of a line: as given, the default where it is not prompt, or None."""
     return wire.speed or (None if wire.line_kind in (None, PROMPT) else default)
 
 
 @asynccontextmanager
-async def _serial(wire: Wire, devices: Devices) -> Urls:
+async def _serial(wire: SimulatedWire, devices: Devices) -> Urls:
     numbered = _numbered(devices) if len(devices) > 1 else {ADDRESS: devices[0]}
     speed = _speed(wire, BAUD)
     async with TerminalEnd(
@@ -129,7 +129,7 @@ async def _serial(wire: Wire, devices: Devices) -> Urls:
 
 
 @asynccontextmanager
-async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
+async def _modbus_rtu(wire: SimulatedWire, devices: Devices) -> Urls:
     speed = _speed(wire, RTU_BAUD)
     async with TerminalEnd(
         devices[0],
@@ -143,7 +143,7 @@ async def _modbus_rtu(wire: Wire, devices: Devices) -> Urls:
 
 
 @asynccontextmanager
-async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
+async def _modbus_tcp(wire: SimulatedWire, devices: Devices) -> Urls:
     registers = ModbusAmplifiers(_numbered(devices), lambda data: None, is_rtu=False)
     delays = delays_of(wire.line_kind, wire.seed, devices[0].name)
     async with TcpEnd(devices[0], registers.of_connection, delays=delays, port=wire.port) as end:
@@ -152,13 +152,13 @@ async def _modbus_tcp(wire: Wire, devices: Devices) -> Urls:
 
 
 @contextmanager
-def _bus_with(wire: Wire, devices: Devices) -> Iterator[CanBus]:
+def _bus_with(wire: SimulatedWire, devices: Devices) -> Iterator[CanBus]:
     with closing(CanBus(_speed(wire, BITRATE))) as bus, closing(BusNodes(bus, devices)):
         yield bus
 
 
 @asynccontextmanager
-async def _slcan(wire: Wire, devices: Devices) -> Urls:
+async def _slcan(wire: SimulatedWire, devices: Devices) -> Urls:
     with _bus_with(wire, devices) as bus:
         async with TerminalEnd(
             devices[0],
@@ -172,7 +172,7 @@ async def _slcan(wire: Wire, devices: Devices) -> Urls:
 
 
 @asynccontextmanager
-async def _socketcand(wire: Wire, devices: Devices) -> Urls:
+async def _socketcand(wire: SimulatedWire, devices: Devices) -> Urls:
     with _bus_with(wire, devices) as bus:
         async with TcpEnd(
             devices[0],
@@ -187,7 +187,7 @@ async def _socketcand(wire: Wire, devices: Devices) -> Urls:
 
 
 _OPENERS: Mapping[
-    str, Callable[[Wire, Devices], AbstractAsyncContextManager[Mapping[str, str]]]
+    str, Callable[[SimulatedWire, Devices], AbstractAsyncContextManager[Mapping[str, str]]]
 ] = {
     "serial": _serial,
     "modbus-tcp": _modbus_tcp,
@@ -217,15 +217,19 @@ _LINE_OF_WIRE = {
 
 
 def assign_wires(
-    amplifiers: Mapping[str, str], *, common: Wire | None, options: Sequence[str], defaults: Wire
-) -> dict[str, Wire]:
+    amplifiers: Mapping[str, str],
+    *,
+    common: SimulatedWire | None,
+    options: Sequence[str],
+    defaults: SimulatedWire,
+) -> dict[str, SimulatedWire]:
     """The wire of each amplifier, by name.
 
     amplifiers: URLs by name; options: texts like `main=modbus-tcp:5020`; common: the wire of all
     others, None to follow their URLs; defaults: speed and sharing of those wires. Equal wires are
     shared. Raises InputError.
     """
-    assigned: dict[str, Wire] = {}
+    assigned: dict[str, SimulatedWire] = {}
     for text in options:
         name, equals, kind = text.partition("=")
         if not equals:
@@ -242,7 +246,9 @@ def assign_wires(
     }
 
 
-def choose_lines(wires: Mapping[str, Wire], options: Sequence[str]) -> dict[str, Wire]:
+def choose_lines(
+    wires: Mapping[str, SimulatedWire], options: Sequence[str]
+) -> dict[str, SimulatedWire]:
     """Wires by amplifier with the kinds of line that options name: `KIND` or `NAME=KIND`.
 
     A name stands for all amplifiers of its line, and counts more than what is for all. Raises
@@ -265,7 +271,7 @@ def choose_lines(wires: Mapping[str, Wire], options: Sequence[str]) -> dict[str,
     }
 
 
-def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:
+def links_of(wires: Mapping[str, SimulatedWire]) -> dict[str, Path]:
     """Paths of the rig's URLs at which terminals are placed, by one of the amplifiers on each.
 
     Those in /dev are of real ports.
@@ -278,7 +284,7 @@ def links_of(wires: Mapping[str, Wire]) -> dict[str, Path]:
     return {name: Path(path) for path, name in names.items()}
 
 
-def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:
+def _wire_of_option(text: str, option: str, defaults: SimulatedWire) -> SimulatedWire:
     kind, colon, port = text.partition(":")
     if kind in _KIND_OF_SCHEME.values() and bool(colon) <= (kind in _PORTED):
         if not colon:
@@ -288,7 +294,7 @@ def _wire_of_option(text: str, option: str, defaults: Wire) -> Wire:
     raise InputError(f"--wire {option}: wire must be one of {', '.join(_KINDS)}, got {text!r}")
 
 
-def _wire_of_url(name: str, url: str, defaults: Wire) -> Wire:
+def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
     """The wire that a URL names; amplifiers whose URLs name one line share it."""
     kind, place = _KIND_OF_SCHEME.get(url.partition("://")[0].lower()), Place()
     if kind is not None:

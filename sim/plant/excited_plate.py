@@ -36,7 +36,7 @@ from model.transients.shaping import ONSET_WINDOW
 from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
 from sim.plant import imperfections as second_harmonic
-from sim.plant.fingers import Record, felt_peaks, fit_tones
+from sim.plant.fingers import FingerRecord, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Plant
 
@@ -96,12 +96,12 @@ class Vibration:
 
     frequencies: tuple[float, ...]
     fingers: tuple[int, ...]
-    records: tuple[Record, ...]
+    records: tuple[FingerRecord, ...]
     harmonics: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Playback:
+class PlatePlayback:
     """Records of fingertips while layers played, from rest at time 0.
 
     vibrations: each layer alone; a finger that none is for is quiet; settled [s]: end of the
@@ -135,7 +135,7 @@ class Playback:
         return tuple(sorted({each for one in self.vibrations for each in one.frequencies}))
 
     @cached_property
-    def records(self) -> tuple[Record, ...]:
+    def records(self) -> tuple[FingerRecord, ...]:
         """Record of each finger, of all layers together, in the order in which they were given."""
         return tuple(
             replace(alone[0], accelerations=np.sum([one.accelerations for one in alone], axis=0))
@@ -143,12 +143,12 @@ class Playback:
         )
 
     @property
-    def targets(self) -> tuple[Record, ...]:
+    def targets(self) -> tuple[FingerRecord, ...]:
         """Records of the fingers that have a layer."""
         return tuple([self.records[number] for number in self._own])
 
     @property
-    def quiet(self) -> tuple[Record, ...]:
+    def quiet(self) -> tuple[FingerRecord, ...]:
         """Records of the fingers that have none."""
         return tuple([each for number, each in enumerate(self.records) if number not in self._own])
 
@@ -230,7 +230,7 @@ class Playback:
         own, others = (np.sqrt(powers[some].sum(axis=0)) for some in (is_own, ~is_own))
         return decibels(own @ self.records[number].weights), decibels(others.max(axis=-1))
 
-    def _powers(self, record: Record, frequencies: Sequence[float]) -> FloatArray:
+    def _powers(self, record: FingerRecord, frequencies: Sequence[float]) -> FloatArray:
         """Power to threshold at the points of a finger (1 + w, p): steady, then over time."""
         times, (count, step) = record.times, self._window
         inside = times >= max(self.settled, times[-1] - STEADY)
@@ -256,7 +256,7 @@ def play(
     *,
     duration: float | None,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
-) -> Playback:
+) -> PlatePlayback:
     """Play layers for a duration [s] on a plate at rest, under fingers, by number in the layers.
 
     duration: at least the onsets and RINGING time constants of the slowest vibration (0.2 to 0.9 s
@@ -295,7 +295,7 @@ def play(
         driven_at = tuple(frequencies.tolist())
         harmonics = tuple([2 * each for each in driven_at]) if any(shares.values()) else ()
         vibrations.append(Vibration(driven_at, layer.fingers, records, harmonics))
-    return Playback(tuple(vibrations), settled, rig.threshold)
+    return PlatePlayback(tuple(vibrations), settled, rig.threshold)
 
 
 def play_signals(
@@ -306,7 +306,7 @@ def play_signals(
     *,
     sample_rate: float,
     imperfections: Imperfections = Imperfections(),  # noqa: B008  frozen
-) -> Playback:
+) -> PlatePlayback:
     """Play signals (eras, n) in full strokes on a plate at rest, for all fingers with a stimulus.
 
     Records have the signals' samples [Hz]; the rest as of `play`.
@@ -327,7 +327,7 @@ def play_signals(
     )
     records = _records(rig, fingers, np.arange(len(felt)) / sample_rate, felt)
     own = tuple([number for number, each in enumerate(fingers) if each.stimulus])
-    return Playback((Vibration((), own, records),), 0.0, rig.threshold)
+    return PlatePlayback((Vibration((), own, records),), 0.0, rig.threshold)
 
 
 def _plant_under(
@@ -351,11 +351,13 @@ def _points(rig: Rig, fingers: Sequence[Finger]) -> FloatArray:
 
 def _records(
     rig: Rig, fingers: Sequence[Finger], times: FloatArray, felt: FloatArray
-) -> tuple[Record, ...]:
+) -> tuple[FingerRecord, ...]:
     """Accelerations (n, p) at the points of all fingertips as a record of each finger."""
     plate, split = rig.plate, np.split(felt, len(fingers), axis=1)
     return tuple(
-        Record(fingertip_points(*each.at, plate), fingertip_weights(*each.at, plate), times, part)
+        FingerRecord(
+            fingertip_points(*each.at, plate), fingertip_weights(*each.at, plate), times, part
+        )
         for each, part in zip(fingers, split, strict=True)
     )
 

@@ -45,7 +45,7 @@ class FingerPositions:
 
 
 @dataclass(frozen=True)
-class Record:
+class FingerRecord:
     """Accelerations under one finger while it stayed at one position.
 
     points (p, 2) [m], the centre first, weights (p,) in the mean over the tip; times (n,) [s];
@@ -95,7 +95,7 @@ class Fingers:
         while self._pieces and self._pieces[0][1][-1] < times[-1] - KEPT:
             self._pieces.popleft()
 
-    def felt(self, since: float, until: float) -> dict[str, Record]:
+    def felt(self, since: float, until: float) -> dict[str, FingerRecord]:
         """The record of each finger in since <= t <= until [s], at its last position.
 
         Of a finger that moved only the part after the last move is included.
@@ -128,7 +128,7 @@ def _join(
     *,
     since: float,
     until: float,
-) -> Record:
+) -> FingerRecord:
     """The record of one finger from the pieces at its last position."""
     stay: list[tuple[FloatArray, FloatArray]] = []
     for layout, times, accelerations in reversed(pieces):
@@ -139,7 +139,7 @@ def _join(
         inside = (times >= since) & (times <= until)
         stay.append((times[inside], accelerations[inside, layout.columns[name]]))
     stay.reverse()
-    return Record(
+    return FingerRecord(
         points=last.points[last.columns[name]],
         weights=last.weights[last.columns[name]],
         times=np.concatenate([times for times, _ in stay]),
@@ -148,7 +148,7 @@ def _join(
 
 
 @dataclass(frozen=True)
-class Felt:
+class FeltVibration:
     """points (p, 2) [m]; frequencies (f,) [Hz]; amplitude (f, p) [m/s²]; peak (p,) [m/s²].
 
     weights (p,): of the points in the mean over the fingertip.
@@ -161,7 +161,7 @@ class Felt:
     peak: FloatArray
 
 
-def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
+def measure_vibration(record: FingerRecord, frequencies: Sequence[float]) -> FeltVibration:
     """Peak at each point up to 1 kHz, and the amplitude of each frequency [Hz] by least squares.
 
     The fit of sines and cosines assumes steady vibration: the window must exclude transients, and
@@ -175,7 +175,7 @@ def measure_vibration(record: Record, frequencies: Sequence[float]) -> Felt:
     else:
         amplitude = np.abs(fit_tones(times - times[0], samples, frequencies))
         peak = felt_peaks(times, samples)
-    return Felt(record.points, record.weights, tuple(frequencies), amplitude, peak)
+    return FeltVibration(record.points, record.weights, tuple(frequencies), amplitude, peak)
 
 
 def felt_peaks(times: FloatArray, samples: FloatArray) -> FloatArray:

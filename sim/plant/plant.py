@@ -159,7 +159,7 @@ def _solve_unloaded(
     return plate_in_time(reduced, eras, loads=loads)
 
 
-class Placement:
+class FingerPlacement:
     """Positions [m] and loads of all fingers by id from a time [s] on.
 
     solve: returns the plate under them, may be called in any thread, and is called once; None where
@@ -182,7 +182,7 @@ class Placement:
         self._lock = threading.Lock()
         self._loaded: LoadedPlate | None = None
 
-    def supersedes(self, before: "Placement", last: "Placement") -> bool:
+    def supersedes(self, before: "FingerPlacement", last: "FingerPlacement") -> bool:
         """Whether the last one can be left out, as of fingers that slide faster than is solved.
 
         Its solution has not begun, and it only moved the same fingers.

@@ -30,7 +30,7 @@ from registry.threads import no_long_collections
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench, keep_time
 from sim.control import SimulationContext, control_socket
-from sim.far_ends.wire_assignment import Wire, open_wires
+from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import FaultFile
 from sim.firmware import FirmwareBench, running
 from sim.plant.fingers import Accelerometer, Position
@@ -78,7 +78,7 @@ class Simulation:
     """
 
     rig: Rig
-    wires: Mapping[str, Wire]
+    wires: Mapping[str, SimulatedWire]
     faults: FaultFile = field(default_factory=lambda: FaultFile(faults=[]))
     fingers: Mapping[str, Position] = field(default_factory=dict)
     imperfections: Imperfections = field(default_factory=Imperfections)
@@ -236,7 +236,7 @@ _COLUMNS, _ROWS = 28, 10
 _DECAY = 0.5  # of the peaks per picture
 
 
-class PlateView:
+class SimulationView:
     """Peak accelerations over a lattice of the plate (rows, columns) [m/s²], fading with time."""
 
     def __init__(self, bench: Bench) -> None:
@@ -264,7 +264,7 @@ class PlateView:
         return peaks.reshape(_ROWS, _COLUMNS)
 
 
-def draw(context: SimulationContext, plate: PlateView) -> RenderableType:
+def draw(context: SimulationContext, plate: SimulationView) -> RenderableType:
     """Render the present state; without fingers it fits on 24 lines of 80 columns."""
     bench = context.bench
     amplifiers = Table("amplifier", "state", "fault", "set", "level of each channel")

@@ -20,7 +20,14 @@ from types import FrameType
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.soft_amp.engine import Counters, Settings, counters_in, library, start_engine, take_over
+from sim.soft_amp.engine import (
+    Counters,
+    SoftAmplifierSettings,
+    counters_in,
+    library,
+    start_engine,
+    take_over,
+)
 from sim.soft_amp.jack import NoSound
 from sim.soft_amp.output import Output, open_output
 
@@ -38,7 +45,7 @@ class _Ended(Exception):
 
 def main() -> None:
     """Play until a signal comes, or the device has gone."""
-    settings = Settings(**json.loads(sys.argv[1]))
+    settings = SoftAmplifierSettings(**json.loads(sys.argv[1]))
     counters_file, terminal, listening, parent, rate = map(int, sys.argv[2:])
     _end_with_parent()
     signal.signal(signal.SIGTERM, _end)
@@ -87,7 +94,7 @@ def main() -> None:
         os._exit(REFUSED)
 
 
-def _awaited(settings: Settings, *, rate: int) -> Output:
+def _awaited(settings: SoftAmplifierSettings, *, rate: int) -> Output:
     """The device, as soon as it is there, with why it is not until then; rate [Hz]: meanwhile."""
     while True:
         try:

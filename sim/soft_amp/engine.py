@@ -111,7 +111,7 @@ class Protocol(IntEnum):
 
 
 @dataclass(frozen=True)
-class Settings:
+class SoftAmplifierSettings:
     """A software amplifier; its values pass as JSON.
 
     device: `jack`, `jack:CLIENT`, or a name or number of PortAudio; rate [Hz] and block [frames]:
@@ -165,7 +165,7 @@ _LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
-class Place:
+class SoftAmplifierLine:
     """A line; terminal, listening: its descriptors, -1 for none. url: of the first amplifier."""
 
     url: str
@@ -181,7 +181,7 @@ class Place:
 
 
 @contextmanager
-def terminal_place(link: Path | None) -> Iterator[Place]:
+def terminal_place(link: Path | None) -> Iterator[SoftAmplifierLine]:
     """A pseudo-terminal, and a symbolic link to it while this lasts; raises InputError."""
     import tty  # not on Windows
 
@@ -197,11 +197,11 @@ def terminal_place(link: Path | None) -> Iterator[Place]:
         path = os.ttyname(far)
         if link is not None:
             path = stack.enter_context(linked(link, to=path))
-        yield Place(f"serial://{path}", terminal=near)
+        yield SoftAmplifierLine(f"serial://{path}", terminal=near)
 
 
 @contextmanager
-def tcp_place(port: int, *, protocol: Protocol) -> Iterator[Place]:
+def tcp_place(port: int, *, protocol: Protocol) -> Iterator[SoftAmplifierLine]:
     """A port of this machine alone, 0 for any; raises InputError."""
     try:
         listening = socket.create_server((_LOOPBACK, port), backlog=4)
@@ -213,7 +213,7 @@ def tcp_place(port: int, *, protocol: Protocol) -> Iterator[Place]:
         listening.setblocking(False)
         scheme = "serial+tcp" if protocol is Protocol.SERIAL else "modbus+tcp"
         url = f"{scheme}://{_LOOPBACK}:{listening.getsockname()[1]}"
-        yield Place(url, listening=listening.fileno())
+        yield SoftAmplifierLine(url, listening=listening.fileno())
 
 
 class Counters(ctypes.Structure):
@@ -289,7 +289,7 @@ class JackCalls(ctypes.Structure):
 
 
 def start_engine(
-    settings: Settings,
+    settings: SoftAmplifierSettings,
     *,
     rate: int,
     counters: Counters,

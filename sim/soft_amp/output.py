@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from drivers.errors import LinkError
 from model.errors import InputError
 from registry.plugins import did_you_mean
-from sim.soft_amp.engine import JackCalls, Settings, address_of, check_rate
+from sim.soft_amp.engine import JackCalls, SoftAmplifierSettings, address_of, check_rate
 from sim.soft_amp.engine import library as engine
 from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, NoSound, jack_name, libjack
 
@@ -34,7 +34,7 @@ _CALLED_BY_ENGINE = {
 class JackOutput:
     """As many ports as the amplifier has channels, each connected to the next one of a client."""
 
-    def __init__(self, settings: Settings, *, destination: str) -> None:
+    def __init__(self, settings: SoftAmplifierSettings, *, destination: str) -> None:
         self._client = JackClient(CLIENT)
         try:
             self.rate = check_rate(self._client.rate, what="JACK server")
@@ -190,7 +190,7 @@ _REFUSED = {-9997: "--rate", -9998: "--channels"}
 class PortAudioOutput:
     """A stream of interleaved floats; the callback is C, without Python."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SoftAmplifierSettings) -> None:
         self._library = sounddevice()
         # A device that came since is not seen otherwise.
         self._library._terminate()
@@ -255,7 +255,7 @@ Output: TypeAlias = JackOutput | PortAudioOutput
 """An open device with its name, rate [Hz] and block [frames], 0 if it varies; see either."""
 
 
-def open_output(settings: Settings) -> Output:
+def open_output(settings: SoftAmplifierSettings) -> Output:
     """Open the device of an amplifier; InputError, LinkError where it is busy or gone.
 
     NoSound where there is no sound server or card yet.

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.errors import InputError
-from sim.soft_amp.engine import Law, Protocol, Settings
+from sim.soft_amp.engine import Law, Protocol, SoftAmplifierSettings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from sim.soft_amp.engine import Place
+    from sim.soft_amp.engine import SoftAmplifierLine
 
 
 def port_option(served: str) -> Any:
@@ -89,7 +89,7 @@ def soft_amp(
     from model.commands.options import print_report
     from sim.soft_amp.engine import library
     from sim.soft_amp.output import listed_devices
-    from sim.soft_amp.supervisor import Supervisor
+    from sim.soft_amp.supervisor import SoftAmplifierSupervisor
 
     if list_devices:
         print_report(*listed_devices(), as_json=as_json)
@@ -100,7 +100,7 @@ def soft_amp(
         missing = "--device" if device is None else "--channels"
         raise InputError(f"{missing} is missing; era soft-amp --list lists devices")
     protocol = Protocol.SERIAL if modbus_tcp is None else Protocol.MODBUS
-    settings = Settings(
+    settings = SoftAmplifierSettings(
         device=device,
         channels=channels,
         protocol=protocol,
@@ -113,7 +113,7 @@ def soft_amp(
     )
     library()  # compiled here, where its errors are reported
     with _place(serial=serial, tcp=tcp, modbus_tcp=modbus_tcp, link=link) as place:
-        supervisor = Supervisor(
+        supervisor = SoftAmplifierSupervisor(
             settings,
             place,
             report=lambda line: print(f"soft-amp: {line}", file=sys.stderr, flush=True),
@@ -142,7 +142,7 @@ def _serial_number(given: str | None, *, device: str) -> str:
 
 def _place(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
-) -> "AbstractContextManager[Place]":
+) -> "AbstractContextManager[SoftAmplifierLine]":
     from sim.soft_amp.engine import tcp_place, terminal_place
 
     ports = {

@@ -19,7 +19,13 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.soft_amp.__main__ import LOST, OTHER_RATE
-from sim.soft_amp.engine import Counters, Place, Settings, counters_in, new_file
+from sim.soft_amp.engine import (
+    Counters,
+    SoftAmplifierLine,
+    SoftAmplifierSettings,
+    counters_in,
+    new_file,
+)
 
 STALL = 0.1
 """Time [s] without a rendered block, after which the process that plays is killed."""
@@ -35,14 +41,20 @@ _BLOCKS = 4  # that a stall lasts at least
 _ENDED = {LOST: "the device was lost", OTHER_RATE: "the device has another rate"}
 
 
-class Supervisor:
+class SoftAmplifierSupervisor:
     """Run an amplifier at a place; report: takes a line for each event.
 
     It starts at once. Events after `start` go to `report`; errors of the start are raised:
     InputError, LinkError.
     """
 
-    def __init__(self, settings: Settings, place: Place, *, report: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        settings: SoftAmplifierSettings,
+        place: SoftAmplifierLine,
+        *,
+        report: Callable[[str], None],
+    ) -> None:
         self._settings = settings
         self._place = place
         self._report = report

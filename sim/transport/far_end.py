@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 from drivers.errors import LinkError
 from model.errors import InputError
 from registry import files, threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults import Faults
 from sim.transport.simulated_line import LineDelays, TwoWayLine
@@ -248,7 +248,7 @@ class FarEnd(ABC):
         """Send nothing more."""
 
 
-AmplifierPort: TypeAlias = Amplifier | AmplifierDevice
+AmplifierPort: TypeAlias = SimulatedAmplifier | AmplifierDevice
 """An amplifier as far ends serve it: alone, or on a bench with faults."""
 
 Send = Callable[[bytes], None]
@@ -256,7 +256,7 @@ MakeEnd = Callable[[Send], FarEnd]
 """Makes a far end, of the function that it sends by; no bytes: the connection ends."""
 
 
-class Served:
+class TimedFarEnd:
     """A far end with its timer."""
 
     def __init__(self, end: FarEnd) -> None:
@@ -313,7 +313,7 @@ class TerminalEnd:
             delays=delays,
             byte_time=byte_time,
         )
-        self._served = Served(make_end(self._line.outward.send))
+        self._served = TimedFarEnd(make_end(self._line.outward.send))
         self._terminal = make_terminal(self._line.inward.send, unpluggable=unpluggable)
         self.port = self._terminal.port
         """The path of the host's side."""
@@ -356,7 +356,7 @@ class TcpEnd:
         self.delays = delays
         self.faults = device.faults if faults is None else faults
         self.make_end = make_end
-        self.connections: set[_Connection] = set()
+        self.connections: set[_TcpClient] = set()
         self._device = device
         self._server: asyncio.Server | None = None
 
@@ -369,7 +369,7 @@ class TcpEnd:
         """Listen."""
         loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(lambda: _Connection(self), HOST, self.port)
+            self._server = await loop.create_server(lambda: _TcpClient(self), HOST, self.port)
         except OSError as error:
             raise LinkError(
                 f"port {self.port}: cannot listen: {error.strerror or error}; choose another, or "
@@ -392,7 +392,7 @@ class TcpEnd:
                 connection.transport.abort()
 
 
-class _Connection(asyncio.Protocol):
+class _TcpClient(asyncio.Protocol):
     """One client; what is damaged on its way is lost, as TCP finds it."""
 
     def __init__(self, port: TcpEnd) -> None:
@@ -413,7 +413,7 @@ class _Connection(asyncio.Protocol):
             delays=self._port.delays,
             finds_damage=True,
         )
-        self._served = Served(self._port.make_end(self._line.outward.send))
+        self._served = TimedFarEnd(self._port.make_end(self._line.outward.send))
 
     def data_received(self, data: bytes) -> None:
         self._line.inward.send(data)

@@ -169,7 +169,7 @@ def delays_of(kind: str | None, *line: object) -> LineDelays | None:
 _PIECE = 0.01  # s; of the wire's time, of what arrives at once
 
 
-class Line:
+class SimulatedLine:
     """One direction of a wire, in the running event loop.
 
     deliver: called with each frame that arrives, and when [s]; delays: None for none;
@@ -237,7 +237,7 @@ class Line:
 
 
 class TwoWayLine:
-    """Both directions: `inward` to the amplifier, `outward` to the host; see `Line`.
+    """Both directions: `inward` to the amplifier, `outward` to the host; see `SimulatedLine`.
 
     to_amplifier: called with frames and times [s]; to_host: with frames; delays: None for none.
     """
@@ -253,7 +253,7 @@ class TwoWayLine:
         finds_damage: bool = False,
     ) -> None:
         make = partial(
-            Line,
+            SimulatedLine,
             faults=faults,
             delays=delays,
             byte_time=byte_time,

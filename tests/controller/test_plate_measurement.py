@@ -32,7 +32,7 @@ from model.structure.attachments import PointLoad
 from model.table.table_file import build_table
 from real_wires import SHARED_WIRES, WIRES, FarSide, far_side, on_two_amplifiers
 from sim.bench import bench
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.fingers import Accelerometer
 from sim.sensors import Accelerometers
 from virtual_lines import run_virtual
@@ -117,7 +117,7 @@ async def measured(
     ],
 )
 def test_two_amplifiers_hear_each_other_where_their_clocks_are_held(
-    wire: Wire, bound: float, rig: Rig, truth: Rig
+    wire: SimulatedWire, bound: float, rig: Rig, truth: Rig
 ) -> None:
     """All responses as a direct solution; but for 3 us, 20 us, 200 us (0.6 rad) at 500 Hz.
 

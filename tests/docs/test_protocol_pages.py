@@ -15,7 +15,7 @@ from drivers.playing import Playback
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from era_haptics.lab.conformance.contract import CHECKS
 from protocol_bytes import BYTES
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import ObjectServer
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference"
@@ -118,7 +118,7 @@ def test_monitor_reads_the_frames_of_the_page_by_the_dbc() -> None:
 def test_master_finds_the_objects_of_the_eds_in_the_amplifier() -> None:
     """`canopen` reads it; every object has the subindices and sizes that the far end serves."""
     sheet = canopen.import_od(str(DOCS / "amplifier.eds"), node_id=1)
-    objects = ObjectServer(Amplifier("a", channels=4), 1)
+    objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
     for index, entry in sheet.items():
         if index < 0x1000:
             continue
@@ -339,7 +339,7 @@ def test_data_name_the_registers_that_the_page_shows() -> None:
 
 def test_each_read_of_the_status_object_is_a_status() -> None:
     """It uses up a Mark, as can.md says: the next subindex is of its own moment."""
-    amplifier = Amplifier("a", channels=4)
+    amplifier = SimulatedAmplifier("a", channels=4)
     objects = ObjectServer(amplifier, 1)
     (high,) = (at for at, word in enumerate(listed_words()["Status"], 1) if word == 0x6000)
     amplifier.handle("Mark", {}, 1.0)

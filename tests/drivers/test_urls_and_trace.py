@@ -30,7 +30,7 @@ from long_form import full_disk
 from protocol_tables import records
 from real_wires import LATER, WORD
 from real_wires import age as age
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import ObjectServer, SdoAbort
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, judged
 
@@ -80,7 +80,7 @@ def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch
 
 def test_objects_are_as_many_as_the_amplifier_states(age: str) -> None:
     """Those of 4 channels and 8 layers, and the one that is added under the next subindex."""
-    objects = ObjectServer(Amplifier("a", channels=4), 1)
+    objects = ObjectServer(SimulatedAmplifier("a", channels=4), 1)
     if age == "older":
         assert objects.read(0x2002, 0, 0.0) == bytes([_OLDER]), (
             "each row of READINGS has its value in sim/amplifier/readings.py"

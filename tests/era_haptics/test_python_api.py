@@ -80,16 +80,23 @@ def modules_after(program: str) -> set[str]:
 
 def test_every_name_is_loaded_from_where_type_checkers_find_it() -> None:
     """The table of homes against the imports of the stub."""
-    homes = {
-        alias.name: node.module
-        for node in ast.parse(STUB.read_text("utf-8")).body
+    body = ast.parse(STUB.read_text("utf-8")).body
+    imported = {
+        alias.name: (node.module, alias.name, alias.asname)
+        for node in body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
+    homes = {name: (module, own) for module, own, name in imported.values() if name}
+    homes |= {
+        ast.unparse(node.targets[0]): imported[ast.unparse(node.value)][:2]
+        for node in body
+        if isinstance(node, ast.Assign)
+    }
     assert homes == era._HOMES
     assert sorted(homes) == sorted(era.__all__) == sorted(dir(era))
-    for name in era.__all__:
-        assert getattr(era, name).__name__ == name
+    for name, (_, own) in homes.items():
+        assert getattr(era, name).__name__ == own
 
 
 def test_unknown_name_lists_the_known_ones() -> None:

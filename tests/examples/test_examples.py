@@ -55,7 +55,7 @@ from era_haptics.lab.conformance import judge_client
 from era_haptics.lab.conformance.contract import of_kind
 from model.rig.rig_file import load_rig
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from sim.transport.far_end import make_terminal
 from typed_page import Reader, Typed, installed_program, read_steps
@@ -345,7 +345,7 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Any:
 @asynccontextmanager
 async def unix_wire_served(path: Path) -> AsyncIterator[asyncio.Server]:
     """Two amplifiers at a socket, of which the server hears one host."""
-    far = {number: Amplifier(str(number), channels=1) for number in (1, 2)}
+    far = {number: SimulatedAmplifier(str(number), channels=1) for number in (1, 2)}
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
 

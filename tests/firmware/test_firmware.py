@@ -78,7 +78,7 @@ from long_form import shortly
 from model.arrays import FloatArray
 from real_wires import MASTERS, damage, drive
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier as SimulatedAmplifierAmplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmplifierAmplifier
 from typed_page import installed_program
 from virtual_lines import judged
 

@@ -88,25 +88,27 @@ from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
 from several_fingers import write_schedule
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
 from typed_page import ERA
 from virtual_lines import in_virtual_time, run_virtual
 
 NAMES = ("a", "b", "c", "d")
 BUSES = {
-    "serial": Wire("serial", speed=921_600, shared=True),
-    "modbus-rtu": Wire("modbus-rtu", speed=115_200),
-    "slcan": Wire("slcan", speed=500_000),
+    "serial": SimulatedWire("serial", speed=921_600, shared=True),
+    "modbus-rtu": SimulatedWire("modbus-rtu", speed=115_200),
+    "slcan": SimulatedWire("slcan", speed=500_000),
 }
 """Wires that all four share."""
 LINES = {
-    "serial": dict.fromkeys(NAMES, Wire("serial", speed=921_600)),  # not shared: one line each
+    "serial": dict.fromkeys(
+        NAMES, SimulatedWire("serial", speed=921_600)
+    ),  # not shared: one line each
     "mixed": {
-        "a": Wire("serial", speed=921_600),
-        "b": Wire("modbus-rtu", speed=115_200),
-        "c": Wire("slcan", speed=500_000),
-        "d": Wire("modbus-tcp"),
+        "a": SimulatedWire("serial", speed=921_600),
+        "b": SimulatedWire("modbus-rtu", speed=115_200),
+        "c": SimulatedWire("slcan", speed=500_000),
+        "d": SimulatedWire("modbus-tcp"),
     },
 }
 """Four wires for four amplifiers."""
@@ -121,7 +123,7 @@ ALL = OWN + FED + 0.010 + 0.015  # s; and its reaction, and the stop of the othe
 LEVEL = 0.2
 
 
-def four_amplifiers(wires: Mapping[str, Wire]) -> AbstractAsyncContextManager[Chain]:
+def four_amplifiers(wires: Mapping[str, SimulatedWire]) -> AbstractAsyncContextManager[Chain]:
     """The example's sixteen ERAs on a coarse mesh, armed."""
     rig = load_rig(Path(model.__file__).parents[1] / "examples" / "table.yaml")
     rig = replace(rig, mesh=Mesh(8, 8, rig.plate.length, rig.plate.width))

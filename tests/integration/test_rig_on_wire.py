@@ -60,7 +60,7 @@ from model.table.table_file import build_table
 from plates import write_rig
 from real_wires import WIRES, FarSide, far_side
 from registry import threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.plant.fingers import Accelerometer
 from virtual_lines import VirtualLoop, run_virtual
 
@@ -176,7 +176,7 @@ def test_amplifier_that_is_not_there_or_has_no_sensors_is_named(
     """By its port or its name, before anything plays."""
     with pytest.raises(LinkError, match="/dev/nowhere"):
         typed("check", "--url", "serial:///dev/nowhere?baud=921600", "--yes", on=plate)
-    monkeypatch.setattr(Amplifier, "attach", lambda amplifier, sensing: None)
+    monkeypatch.setattr(SimulatedAmplifier, "attach", lambda amplifier, sensing: None)
     with pytest.raises(CommandError, match=r"main.*sensors"):
         typed("check", "--url", PORT, "--yes", on=plate)
 

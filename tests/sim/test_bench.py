@@ -39,7 +39,7 @@ from sim.bench.bench import WRONG, Bench, StraightClocks
 from sim.control import SimulationContext, carry_out
 from sim.plant.fingers import Accelerometer
 from sim.plant.imperfections import Imperfections, motion_of
-from sim.plant.plant import LoadedPlate, Placement
+from sim.plant.plant import FingerPlacement, LoadedPlate
 from sim.sensors import Accelerometers
 from virtual_lines import in_virtual_time
 
@@ -421,13 +421,13 @@ def rig(coarse_rig: Rig) -> Rig:
 @pytest.fixture
 def let_solve(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Solutions wait for this event."""
-    event, solved = threading.Event(), Placement.solved
+    event, solved = threading.Event(), FingerPlacement.solved
 
-    def wait(placement: Placement) -> LoadedPlate | None:
+    def wait(placement: FingerPlacement) -> LoadedPlate | None:
         assert event.wait(60)
         return solved(placement)
 
-    monkeypatch.setattr(Placement, "solved", wait)
+    monkeypatch.setattr(FingerPlacement, "solved", wait)
     return event
 
 

@@ -41,7 +41,7 @@ from real_wires import WIRES, far_side
 from registry.limits import GuardLimits
 from sim.bench.bench import Bench
 from sim.control import LINE_MAX, SimulationContext, carry_out, control_socket
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.plant.imperfections import Imperfections, PlateErrors
 from virtual_lines import in_virtual_time
 
@@ -413,7 +413,7 @@ async def test_witness_relays_a_wire_until_interrupted(
 ) -> None:
     """A session through the relay passes; a full disk only makes the capture incomplete."""
     capture = tmp_path / "capture.txt"
-    async with far_side(Wire("serial"), coarse_rig) as far:
+    async with far_side(SimulatedWire("serial"), coarse_rig) as far:
         options = ("--slack", "5000", "--record", str(capture))
         code = "import sys; from controller.cli.main import main; sys.exit(main())"
         process = await asyncio.create_subprocess_exec(

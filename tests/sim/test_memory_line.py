@@ -26,7 +26,7 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.memory_line import MemoryPort
 from sim.process.simulation import STEP, SteppedLoop
-from sim.transport.simulated_line import Line as SimulatedLineLine
+from sim.transport.simulated_line import SimulatedLine as SimulatedLineLine
 from virtual_lines import in_virtual_time
 
 

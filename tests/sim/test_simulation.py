@@ -22,7 +22,7 @@ from plates import write_rig
 from recordings import read_recording
 from sim.bench.bench import Bench
 from sim.control import SimulationContext
-from sim.process.simulation import PlateView, draw
+from sim.process.simulation import SimulationView, draw
 
 ROOT = example_rig_path().parent.parent
 TIMEOUT = 120  # s; for a loaded machine, not an expectation
@@ -100,7 +100,7 @@ def test_sim_refuses_bad_usage_in_one_line(
     assert err.count("\n") == 1
 
 
-def shown(context: SimulationContext, plate: PlateView) -> str:
+def shown(context: SimulationContext, plate: SimulationView) -> str:
     """The view as text on a usual terminal."""
     console = Console(width=80, force_terminal=False)
     with console.capture() as capture:
@@ -117,7 +117,7 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     """y points upwards; peaks are darkest near the driven ERA; nothing at rest."""
     bench = Bench(coarse_rig, now=0.0)
     context = SimulationContext(bench, urls={"main": "serial:///dev/pts/7?baud=921600"})
-    plate = PlateView(bench)
+    plate = SimulationView(bench)
     bench.probes.append(plate)
     untouched = shown(context, plate).splitlines()
     assert len(untouched) < 24

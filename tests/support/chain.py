@@ -40,7 +40,7 @@ from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
-from era_haptics.lab.witness.capture import Violation
+from era_haptics.lab.witness.capture import RuleViolation
 from era_haptics.lab.witness.witness_cli import parse_endpoint
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
@@ -53,10 +53,10 @@ from registry import threads
 from registry.limits import GuardLimits
 from set_table import STROKE, BuzzNewestContact, SetTable, SetTiming, make_rig
 from sim.amplifier.readings import AmplifierSummary
-from sim.amplifier.simulated_amplifier import Amplifier
-from sim.far_ends.wire_assignment import Wire
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
-from sim.plant.fingers import Accelerometer, Felt
+from sim.plant.fingers import Accelerometer, FeltVibration
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.sensors import Accelerometers, Recording
 from virtual_lines import MemoryMachine, run_virtual
@@ -139,7 +139,7 @@ class Chain:
     @asynccontextmanager
     async def on(
         cls,
-        wires: Wire | Mapping[str, Wire],
+        wires: SimulatedWire | Mapping[str, SimulatedWire],
         rig: Rig,
         table: Any,
         *,
@@ -309,7 +309,7 @@ class FarEnd:
         self.name = name
         self.disturb = disturb
         self.device = far.devices[name]
-        self.amplifier = cast(Amplifier, far.bench.amplifiers[name])
+        self.amplifier = cast(SimulatedAmplifier, far.bench.amplifiers[name])
         self.asked: list[tuple[float, str, Values]] = []
         self.answer: Callable[[str, Values], Values | None] = lambda name, values: None
         self.obey = self.device.handle
@@ -432,7 +432,7 @@ async def set_chain(
     rig = make_rig(names, GuardLimits(40.0, 500.0, 1.0, rate=rate, on_time=on_time))
     table = SetTable({"SW": Tone(110.0, 20e-6, math.pi / 2)}, rig.plate)
     options = {"passing": (0.0, 0.0), "capabilities": {"knots": knots}, **options}
-    async with of.on(Wire(wire, unpluggable=True), rig, table, **options) as chain:
+    async with of.on(SimulatedWire(wire, unpluggable=True), rig, table, **options) as chain:
         chain.is_felt = chain.must_be_felt = False
         yield chain
 
@@ -530,8 +530,8 @@ class Heard:
     end: float
     patterns: tuple[Mapping[str, Any], ...] = ()
     clocks: Mapping[str, float] = field(default_factory=dict)
-    steady: Mapping[str, Felt] = field(default_factory=dict)
-    onset: Mapping[str, Felt] = field(default_factory=dict)
+    steady: Mapping[str, FeltVibration] = field(default_factory=dict)
+    onset: Mapping[str, FeltVibration] = field(default_factory=dict)
     phasors: ComplexArray | None = None
     fading: Recording | None = None
 
@@ -542,7 +542,7 @@ class Played:
 
     heard: list[Heard]
     summaries: Sequence[AmplifierSummary]
-    violations: Sequence[Violation]
+    violations: Sequence[RuleViolation]
 
 
 def play_stream(
@@ -561,7 +561,7 @@ def play_stream(
 
     async def run() -> Played:
         async with Streamed.on(
-            {name: Wire(kind, speed=SPEEDS.get(kind)) for name, kind in wires.items()},
+            {name: SimulatedWire(kind, speed=SPEEDS.get(kind)) for name, kind in wires.items()},
             rig,
             table,
             plate=plate,
@@ -798,7 +798,7 @@ class Scene(Chain):
 
 def play(
     wire: str, scenario: Sequence[Callable[[Scene], Any]], *, amplifiers: Sequence[str] = ("main",)
-) -> tuple[Scene, list[Violation]]:
+) -> tuple[Scene, list[RuleViolation]]:
     """Play the steps of a scenario on a wire of this kind; returns what the witness found."""
 
     async def steps(scene: Scene) -> None:
@@ -807,12 +807,12 @@ def play(
             if done is not None:
                 await done
 
-    async def run() -> tuple[Scene, list[Violation]]:
+    async def run() -> tuple[Scene, list[RuleViolation]]:
         rig = make_rig(amplifiers, GuardLimits(40.0, 500.0, 0.5))
         table = SetTable(ALONE, rig.plate, SHARED)
         judged = {"channels": 3, "level": 0.5, "slew": 100}
         options: dict[str, Any] = {"judged": judged, "sensed_every": SENSED_EVERY}
-        async with Scene.on(Wire(wire), rig, table, **options) as scene:
+        async with Scene.on(SimulatedWire(wire), rig, table, **options) as scene:
             scene.witness.contacts(threads.now(), ())
             await scene.tried(scene.open())
             if not scene.errors:

@@ -61,7 +61,7 @@ from plates import small_table, write_rig
 from real_wires import WIRES, FarSide, far_side
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from typed_page import ERA
 from virtual_lines import VirtualLoop
 
@@ -362,7 +362,7 @@ def silent_from(far: FarSide) -> float:
 def silent_from_of(far: FarSide, name: str) -> float:
     """The same of one amplifier; what has faded is no longer among its tones."""
     far.summary()
-    one = cast(Amplifier, far.bench.amplifiers[name])
+    one = cast(SimulatedAmplifier, far.bench.amplifiers[name])
     ends = [tone.silent_from for output in one.outputs for tone in output]
     return max([one._silent_from, *ends])
 

@@ -36,7 +36,7 @@ from drivers.wires.can_frames import SLCAN, TextReader, pack_frames, unpack_fram
 from drivers.wires.serial_frames import Frame, FrameReader, encode_frame, pack_words, unpack_words
 from model.arrays import FloatArray
 from registry import threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 
@@ -273,7 +273,7 @@ class Sent(NamedTuple):
 class Pair:
     """Firmware and simulated amplifier on a serial line, at one time [s] that the caller moves."""
 
-    def __init__(self, firmware: MovedFirmware, amplifier: Amplifier) -> None:
+    def __init__(self, firmware: MovedFirmware, amplifier: SimulatedAmplifier) -> None:
         self.firmware, self.amplifier = firmware, amplifier
         self.time = 0.0
         self._requests = 0

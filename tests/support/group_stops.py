@@ -39,7 +39,7 @@ from real_wires import after_each
 from registry import threads
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow, Toward
 from virtual_lines import Stuck, VirtualLoop, run_virtual
 
@@ -65,7 +65,7 @@ class RandomGroup(Chain):
 
     @classmethod
     def of(
-        cls, wires: Mapping[str, Wire], rng: random.Random, **options: Any
+        cls, wires: Mapping[str, SimulatedWire], rng: random.Random, **options: Any
     ) -> AbstractAsyncContextManager[Self]:
         """A chain of amplifiers on wires, not open yet; options: as for `Chain.on`."""
         rig = make_rig([*wires], GuardLimits(20.0, 1000.0, 1.0))
@@ -202,13 +202,13 @@ class RandomGroup(Chain):
 
 
 _SHARED = ("a", "b")
-LINES: Mapping[str, Mapping[str, Wire]] = {
-    "serial": {"a": Wire("serial", 921_600)},
-    "serial, two lines": {name: Wire("serial", 921_600, line=name) for name in _SHARED},
-    "serial, shared": dict.fromkeys(_SHARED, Wire("serial", 921_600, shared=True)),
-    "modbus-rtu, shared": dict.fromkeys(_SHARED, Wire("modbus-rtu", 115_200)),
-    "modbus-tcp": {"a": Wire("modbus-tcp")},
-    "can, shared": dict.fromkeys(_SHARED, Wire("slcan", 500_000)),
+LINES: Mapping[str, Mapping[str, SimulatedWire]] = {
+    "serial": {"a": SimulatedWire("serial", 921_600)},
+    "serial, two lines": {name: SimulatedWire("serial", 921_600, line=name) for name in _SHARED},
+    "serial, shared": dict.fromkeys(_SHARED, SimulatedWire("serial", 921_600, shared=True)),
+    "modbus-rtu, shared": dict.fromkeys(_SHARED, SimulatedWire("modbus-rtu", 115_200)),
+    "modbus-tcp": {"a": SimulatedWire("modbus-tcp")},
+    "can, shared": dict.fromkeys(_SHARED, SimulatedWire("slcan", 500_000)),
 }
 """Wires of the amplifiers."""
 

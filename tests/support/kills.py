@@ -40,7 +40,7 @@ from daemons import (
 from model.rig.rig_file import load_rig
 from plates import TWO_AMPLIFIERS, write_rig
 from real_wires import WIRES, far_side
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 
 READY = "READY_TO_SWITCH_ON"
 LIMIT = WATCHDOG + REACTION  # s; on the amplifier's clock, from its last sign of life
@@ -49,9 +49,9 @@ EARLY = 0.1  # share of the daemons that are killed before they serve
 LONGEST_LIFE = 0.8  # s; from when it was armed first
 _AT_ONCE = 3  # wires side by side: also what loads the machine
 
-PLACES: Sequence[tuple[str, Wire, Sequence[tuple[str, str]]]] = (
+PLACES: Sequence[tuple[str, SimulatedWire, Sequence[tuple[str, str]]]] = (
     ("serial", WIRES["serial"], ()),
-    ("serial, two amplifiers", Wire("serial"), TWO_AMPLIFIERS),
+    ("serial, two amplifiers", SimulatedWire("serial"), TWO_AMPLIFIERS),
     *((name, wire, ()) for name, wire in WIRES.items() if name != "serial"),
 )
 """Wires by their names, and what is changed in the rig for them."""
@@ -83,7 +83,7 @@ class Kill:
 
 
 async def kill_daemons(
-    place: tuple[str, Wire, Sequence[tuple[str, str]]],
+    place: tuple[str, SimulatedWire, Sequence[tuple[str, str]]],
     kills: int,
     *,
     seed: int,

@@ -27,14 +27,14 @@ from model.rig.rig import Channel
 from model.vibration import Tone
 from registry.limits import GuardLimits
 from set_table import SetTable, make_rig
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultWindow
 from virtual_lines import run_virtual
 
-WIRES: Mapping[str, Wire] = {
-    "serial": Wire("serial", 921_600, shared=True),
-    "modbus": Wire("modbus-rtu", 115_200),
-    "can": Wire("slcan", 500_000),
+WIRES: Mapping[str, SimulatedWire] = {
+    "serial": SimulatedWire("serial", 921_600, shared=True),
+    "modbus": SimulatedWire("modbus-rtu", 115_200),
+    "can": SimulatedWire("slcan", 500_000),
 }
 AMPLIFIERS = (1, 3)
 LATEST = 0.016  # s

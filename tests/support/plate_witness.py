@@ -34,9 +34,9 @@ from era_haptics.lab.witness.capture import (
     AmplifierConfig,
     ChannelLimits,
     Direction,
-    Request,
     TimeLimits,
     WitnessConfig,
+    WitnessedRequest,
 )
 from era_haptics.lab.witness.host_rules import (
     CONFIRMED,
@@ -49,7 +49,7 @@ from era_haptics.lab.witness.witness import RECOVERY, Witness
 from era_haptics.lab.witness.witness_cli import parse_endpoint
 from real_wires import FarSide, after_each
 from registry import threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.faults import FaultWindow
 from virtual_lines import START, VirtualLoop
 
@@ -145,7 +145,9 @@ class PlateRules(HostRules):
             if session.amplifier.last_fault > self._last_command and self._is_arm_requested:
                 self._is_arm_requested = False  # a fault cancels earlier commands
 
-    def is_preempting(self, session: AmplifierSession, time: float, request: Request) -> bool:
+    def is_preempting(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> bool:
         """Also what reads a status soon after an operator's stop or disarm."""
         is_silencing = request.name == "GetStatus" and time < self._last_silencing + CONFIRMED
         return is_silencing or super().is_preempting(session, time, request)
@@ -153,20 +155,24 @@ class PlateRules(HostRules):
     def check_order(
         self,
         session: AmplifierSession,
-        request: Request,
-        pending: Collection[Request],
+        request: WitnessedRequest,
+        pending: Collection[WitnessedRequest],
         preempted_by: int,
     ) -> None:
         """A last lift preempts too, even if a finger has come since."""
         later = [each for each in pending if each.started_at > self._last_lift]
         super().check_order(session, request, later, preempted_by)
 
-    def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def check_request(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         """Check a request to one amplifier."""
         self._check_stop(session, time, request)
         super().check_request(session, time, request)
 
-    def _check_stop(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def _check_stop(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         requested_at = self.stops_requested.get(session.name)
         is_other = request.name != "Stop" and request.name not in _UNORDERED
         if requested_at is None or not is_other:
@@ -185,7 +191,9 @@ class PlateRules(HostRules):
         )
         del self.stops_requested[session.name]
 
-    def _check_feeding(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def _check_feeding(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         name, since = request.name, self.stalled_since
         if since is not None and time > since + self._times.slack and name != "Silence":
             session.report(
@@ -229,7 +237,7 @@ class PlateRules(HostRules):
         self,
         session: AmplifierSession,
         time: float,
-        request: Request,
+        request: WitnessedRequest,
         layers: Sequence[LayerSet] | None,
     ) -> None:
         is_silencing = request.name in SILENCING
@@ -493,7 +501,7 @@ def witness_config(
     )
 
 
-def sense(witness: PlateWitness, now: float, name: str, amplifier: Amplifier) -> None:
+def sense(witness: PlateWitness, now: float, name: str, amplifier: SimulatedAmplifier) -> None:
     """Show the levels and frequencies of an amplifier's channels at a time [s]."""
     channels = range(amplifier.playback.channels)
     levels = [min(amplifier.playback.level(channel, now), 1.0) for channel in channels]

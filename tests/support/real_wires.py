@@ -44,7 +44,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from set_table import make_rig
 from sim.amplifier.readings import AmplifierSummary
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.bench.bench import Bench
 from sim.far_ends.can_amplifiers import (
@@ -56,7 +56,7 @@ from sim.far_ends.can_amplifiers import (
 )
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
-from sim.far_ends.wire_assignment import Wire, open_wires
+from sim.far_ends.wire_assignment import SimulatedWire, open_wires
 from sim.faults import Faults
 from sim.plant.imperfections import Imperfections
 from sim.transport.far_end import TcpEnd, TerminalEnd
@@ -86,9 +86,9 @@ class FarSide:
         return next(iter(self.devices.values()))
 
     @property
-    def amplifier(self) -> Amplifier:
+    def amplifier(self) -> SimulatedAmplifier:
         """What stands behind it."""
-        return cast(Amplifier, self.bench.amplifiers[self.device.name])
+        return cast(SimulatedAmplifier, self.bench.amplifiers[self.device.name])
 
     def summary(self, name: str = "") -> AmplifierSummary:
         """State, token and levels of an amplifier now; of the first without a name."""
@@ -113,7 +113,7 @@ def after_each(
 
 @asynccontextmanager
 async def far_side(
-    wire: Wire | Mapping[str, Wire],
+    wire: SimulatedWire | Mapping[str, SimulatedWire],
     rig: Rig,
     *,
     seed: int = 0,
@@ -126,7 +126,7 @@ async def far_side(
     is_virtual = isinstance(asyncio.get_running_loop(), VirtualLoop)
     machine = live_in_memory() if is_virtual else None
     bench, devices = make_bench(rig, seed=seed, imperfections=imperfections)
-    wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, Wire) else wire
+    wires = dict.fromkeys(bench.amplifiers, wire) if isinstance(wire, SimulatedWire) else wire
     if machine is not None and len(bench.amplifiers) > 1:
         machine.be_prompt()  # the lines have delays of their kinds
     async with open_wires(wires, [*devices.values()]) as urls:
@@ -153,21 +153,21 @@ def make_bench(
     }
 
 
-WIRES: Mapping[str, Wire] = {
-    "serial": Wire("serial", unpluggable=True),
-    "modbus+tcp": Wire("modbus-tcp", unpluggable=True),
-    "modbus+rtu": Wire("modbus-rtu", unpluggable=True),
-    "can+socketcand": Wire("socketcand", unpluggable=True),
-    "can+slcan": Wire("slcan", unpluggable=True),
+WIRES: Mapping[str, SimulatedWire] = {
+    "serial": SimulatedWire("serial", unpluggable=True),
+    "modbus+tcp": SimulatedWire("modbus-tcp", unpluggable=True),
+    "modbus+rtu": SimulatedWire("modbus-rtu", unpluggable=True),
+    "can+socketcand": SimulatedWire("socketcand", unpluggable=True),
+    "can+slcan": SimulatedWire("slcan", unpluggable=True),
 }
 """Each is far end and host by one scheme; see `sim.far_ends.wire_assignment`."""
 
-SHARED_WIRES: Mapping[str, Wire] = {
-    "serial": Wire("serial", shared=True),
-    "modbus+tcp": Wire("modbus-tcp", shared=True),
-    "modbus+rtu": Wire("modbus-rtu", shared=True),
-    "can+socketcand": Wire("socketcand", shared=True),
-    "can+slcan": Wire("slcan", shared=True),
+SHARED_WIRES: Mapping[str, SimulatedWire] = {
+    "serial": SimulatedWire("serial", shared=True),
+    "modbus+tcp": SimulatedWire("modbus-tcp", shared=True),
+    "modbus+rtu": SimulatedWire("modbus-rtu", shared=True),
+    "can+socketcand": SimulatedWire("socketcand", shared=True),
+    "can+slcan": SimulatedWire("slcan", shared=True),
 }
 """Those on which several amplifiers hear one broadcast."""
 
@@ -227,7 +227,7 @@ class HostedRig(FarSide):
 
 @asynccontextmanager
 async def rig_on_wire(
-    rig: Rig, wire: Wire, *, watchdog: float = WATCHDOG
+    rig: Rig, wire: SimulatedWire, *, watchdog: float = WATCHDOG
 ) -> AsyncIterator[HostedRig]:
     """The amplifiers of a rig on a wire, identified and disarmed; watchdog [s]."""
     async with far_side(wire, rig) as far:
@@ -266,7 +266,7 @@ Numbered = Mapping[int, AmplifierDevice]
 class WordWiresFarSide:
     """Amplifiers by number on a wire; url: of one of them."""
 
-    amplifiers: Mapping[int, Amplifier]
+    amplifiers: Mapping[int, SimulatedAmplifier]
     devices: Numbered
     url: Callable[[int], str]
 
@@ -541,13 +541,13 @@ def make_of_age(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
         return
     for name, value in vars(later).items():
         monkeypatch.setattr(DEFINITION_STATUS, name, value)
-    status = Amplifier.status
+    status = SimulatedAmplifier.status
     if age == "same":
 
-        def stating(amplifier: Amplifier, now: float) -> Values:
+        def stating(amplifier: SimulatedAmplifier, now: float) -> Values:
             return {**status(amplifier, now), LATER.name: WORD}
 
-        monkeypatch.setattr(Amplifier, "status", stating)
+        monkeypatch.setattr(SimulatedAmplifier, "status", stating)
 
 
 @pytest.fixture(params=AGES)

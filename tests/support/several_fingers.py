@@ -50,7 +50,7 @@ from model.table.table_file import build_table
 from plates import smooth_rig
 from real_wires import after_each
 from registry import threads
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import run_virtual
 
 LEFT, RIGHT, ABOVE = (0.126, 0.081), (0.234, 0.049), (0.069, 0.208)
@@ -217,7 +217,7 @@ async def fingers_on(
     planted breaks.
     """
     async with Fingers.armed(
-        Wire("serial", speed=921_600, unpluggable=True),
+        SimulatedWire("serial", speed=921_600, unpluggable=True),
         smooth_rig(),
         table,
         intent_source=EffectPlayer(layout),
@@ -231,10 +231,10 @@ async def fingers_on(
 
 
 WIRES = {
-    "serial": Wire("serial", speed=921_600, unpluggable=True),
-    "modbus-rtu": Wire("modbus-rtu", speed=115_200, unpluggable=True),
-    "modbus-tcp": Wire("modbus-tcp"),
-    "socketcand": Wire("socketcand", speed=500_000),
+    "serial": SimulatedWire("serial", speed=921_600, unpluggable=True),
+    "modbus-rtu": SimulatedWire("modbus-rtu", speed=115_200, unpluggable=True),
+    "modbus-tcp": SimulatedWire("modbus-tcp"),
+    "socketcand": SimulatedWire("socketcand", speed=500_000),
 }
 """Wires at their default speeds."""
 

@@ -50,7 +50,7 @@ from plates import make_paper_rig, small_table
 from real_wires import after_each, on_amplifiers
 from registry import threads
 from set_table import BuzzNewestContact
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from sim.faults import FaultKind, FaultWindow
 from sim.plant.imperfections import Imperfections, draw_imperfections
 from sim.transport.simulated_line import LINE_KINDS, PROMPT
@@ -464,7 +464,7 @@ async def _run(
     """Run a plan from the start of the far ends to their end."""
     rig = soak_rig(plan.plate, NAMES[: plan.amplifiers] if plan.amplifiers > 1 else ())
     wires = {
-        name: Wire(
+        name: SimulatedWire(
             line.kind,
             speed=line.speed,
             shared=len(plan.lines) < len(rig.amplifiers),

@@ -46,7 +46,7 @@ from era_haptics.lab.conformance.contract import CHECKS, LEVEL, CheckResult, of_
 from era_haptics.lab.conformance.contract import CLIENTS as BY_PROTOCOL
 from registry import threads
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -544,7 +544,7 @@ class Kind:
     """
 
     wire: Callable[[], Wire]
-    far_end: Callable[[Mapping[int, Amplifier], Callable[[bytes], None]], FarEnd]
+    far_end: Callable[[Mapping[int, SimulatedAmplifier], Callable[[bytes], None]], FarEnd]
     request_of: Callable[[bytes], tuple[int, int] | None]
 
 
@@ -594,7 +594,7 @@ class MemoryLine:
 
     def __init__(self, kind: str, *names: str, channels: int = 2, wire: Wire | None = None) -> None:
         self.loop = asyncio.get_running_loop()
-        self.far = {each: Amplifier(each, channels=channels) for each in names}
+        self.far = {each: SimulatedAmplifier(each, channels=channels) for each in names}
         self.inward: Alter = unaltered
         self.outward: Alter = unaltered
         self.sent: list[tuple[float, str]] = []
@@ -735,7 +735,7 @@ DELAY = 0.0002  # s; of bytes on their way
 _JUDGED_LINE_MOMENT = 1e-9  # s; between what is sent at once
 _TURN = 0.0005  # s; between looks at what is due
 
-Judged: TypeAlias = Amplifier | Callable[[Callable[[bytes], None]], FarEnd]
+Judged: TypeAlias = SimulatedAmplifier | Callable[[Callable[[bytes], None]], FarEnd]
 """A simulated amplifier, or what makes the far end of a wire of the function that it sends by."""
 
 
@@ -743,14 +743,14 @@ class JudgedLine:
     """A line to an amplifier at address 1 and its neighbours; its client writes to it."""
 
     def __init__(
-        self, kind: str, far: Judged, neighbours: Mapping[int, Amplifier] | None = None
+        self, kind: str, far: Judged, neighbours: Mapping[int, SimulatedAmplifier] | None = None
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self.client = CLIENTS[kind](1)
         self.client.transmit = self.write
         self._due = self._arrival = 0.0
-        self._ticked: list[Amplifier | FarEnd] = []
-        if isinstance(far, Amplifier):
+        self._ticked: list[SimulatedAmplifier | FarEnd] = []
+        if isinstance(far, SimulatedAmplifier):
             known = {1: far, **(neighbours or {})}
             self._ticked += known.values()
             self._end = KINDS[kind].far_end(known, self._send)
@@ -786,14 +786,14 @@ class JudgedLine:
             await asyncio.sleep(_TURN)
 
 
-def plain() -> Amplifier:
+def plain() -> SimulatedAmplifier:
     """An amplifier with all that the table allows."""
-    return Amplifier("plain", channels=4)
+    return SimulatedAmplifier("plain", channels=4)
 
 
-def varied(channels: int = 4) -> Amplifier:
+def varied(channels: int = 4) -> SimulatedAmplifier:
     """An amplifier whose channels and ranges differ, from those of the table too."""
-    far = Amplifier("varied", channels=channels)
+    far = SimulatedAmplifier("varied", channels=channels)
     far.capabilities.update(ramp_max=800, watchdog_min=150, watchdog_max=1500, set_words=600)
     far.capabilities.update(envelope_step_min=20, envelope_step_max=800, knots=30, layers=6)
     far.capabilities["limits"][1].update(frequency_min=300, frequency_max=8000, level_max=9000)
@@ -808,7 +808,7 @@ async def results_of(
     *,
     level: float = LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
-    neighbours: Mapping[int, Amplifier] | None = None,
+    neighbours: Mapping[int, SimulatedAmplifier] | None = None,
 ) -> list[CheckResult]:
     """Results of checks by name, all without names, on an amplifier on a kind of wire."""
     line = JudgedLine(kind, far, neighbours)
@@ -826,7 +826,7 @@ def judged(
     level: float = LEVEL,
     far: Judged | None = None,
     on_result: Callable[[CheckResult], None] = lambda result: None,
-    neighbours: Mapping[int, Amplifier] | None = None,
+    neighbours: Mapping[int, SimulatedAmplifier] | None = None,
 ) -> list[CheckResult]:
     """Results on an amplifier, a `varied` one if none is given, in virtual time."""
     unknown = set(names) - {check.name for check in CHECKS}

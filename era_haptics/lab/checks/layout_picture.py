@@ -52,7 +52,7 @@ _Finger: TypeAlias = tuple[Contact, Target]
 
 
 @dataclass(frozen=True)
-class Together:
+class JointTouch:
     """Fingers in two or three regions at once, where the worst one has least contrast.
 
     at [m]: of each; contrasts [dB]: promised of each content above those of the others there, all
@@ -81,7 +81,7 @@ def check_together(
     table: LocalizationTable,
     *,
     progress: Progress = unseen,
-) -> list[Together]:
+) -> list[JointTouch]:
     """Answer fingers in every two and every three regions at their worst places.
 
     Worst, if all were steady, of four places of each of two regions; of three regions of those of
@@ -124,7 +124,7 @@ def check_together(
     return found
 
 
-def matrix_of(together: Sequence[Together]) -> tuple[list[str], FloatArray]:
+def matrix_of(together: Sequence[JointTouch]) -> tuple[list[str], FloatArray]:
     """Return the regions' names, and the promise of the worst finger in every two of them [dB].
 
     (n, n): below the diagonal two at once, above it three, with the worst third; NaN for none.
@@ -139,7 +139,7 @@ def matrix_of(together: Sequence[Together]) -> tuple[list[str], FloatArray]:
     return names, found
 
 
-def close_pairs(together: Sequence[Together]) -> str:
+def close_pairs(together: Sequence[JointTouch]) -> str:
     """Say which two regions are felt as one at the same time, hardest to tell apart first.
 
     Nothing where there are none.
@@ -194,7 +194,7 @@ def _worst(
     group: Sequence[Region],
     targets: Sequence[Target],
     spots: Sequence[Sequence[Position]],
-) -> Together | None:
+) -> JointTouch | None:
     """Answer at all combinations of places; None where no fingers fit there at once."""
     free = [replace(target, is_own=False) for target in targets]
     steady = [replace(target, modulation_hz=None) for target in free]
@@ -211,7 +211,7 @@ def _worst(
     )
     worst_db, felt = _felt(simulator, _placed(free, at), None)
     _, served = _felt(simulator, _placed(targets, at), protected)
-    return Together(
+    return JointTouch(
         tuple(each.name for each in group),
         at,
         tuple(contrast for contrast, _ in felt),
@@ -290,7 +290,7 @@ def check_figure(
     layout: SurfaceLayout,
     table: LocalizationTable,
     checked: Sequence[CheckedEffect],
-    together: Sequence[Together] = (),
+    together: Sequence[JointTouch] = (),
 ) -> Figure:
     """Draw three panels, with one mark for each touch; crosses where nothing is felt.
 
@@ -331,7 +331,7 @@ def _draw_together(
     panels: Sequence[Axes],
     layout: SurfaceLayout,
     table: LocalizationTable,
-    together: Sequence[Together],
+    together: Sequence[JointTouch],
 ) -> None:
     """Draw fingers at once at their worst places, joined by lines, the worst on top; the matrix."""
     colors, norm = colormaps["viridis"], Normalize(0.0, 2 * OWN_CONTRAST_DB)

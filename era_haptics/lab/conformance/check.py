@@ -15,16 +15,16 @@ from drivers.protocol.sets import FLAGS, Command, LayerSet, unpack_layers
 from era_haptics.lab.conformance.judge_client import (
     FULL,
     STATED,
-    Armed,
+    AlreadyArmed,
     Capabilities,
-    Client,
+    ContractViolation,
     Finding,
-    Late,
-    Optional,
+    JudgeClient,
+    NotApplicable,
     Rows,
-    Untimed,
-    Unusable,
-    Violation,
+    TooLate,
+    UntimedClock,
+    UnusableCapability,
     expect,
     read_as,
 )
@@ -35,7 +35,7 @@ _MAX_TIME = 180.0  # s; after which a run begins no other check
 _RETRIED = 2.0  # s; in which silence is tried again, or identification
 
 Steps: TypeAlias = Callable[[Any], Awaitable[None] | Rows]
-"""What a check does with a Subject, or its Client, or the rows that are carried out."""
+"""What a check does with a Subject, or its JudgeClient, or the rows that are carried out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,14 +69,14 @@ class Result(StrEnum):
 
 _RESULTS = {
     Finding: Result.PASSED,
-    Optional: Result.SKIPPED,
-    Late: Result.SKIPPED,
-    Unusable: Result.NOT_RUN,
+    NotApplicable: Result.SKIPPED,
+    TooLate: Result.SKIPPED,
+    UnusableCapability: Result.NOT_RUN,
 }
 """Of checks by what they found; all else has failed."""
 _BARS = {
-    Armed: "it is armed, perhaps by another host",
-    Untimed: "its clock does not go on with time, by which all that it does is judged",
+    AlreadyArmed: "it is armed, perhaps by another host",
+    UntimedClock: "its clock does not go on with time, by which all that it does is judged",
 }
 """Why nothing is driven once a check has found it."""
 
@@ -112,7 +112,7 @@ class CheckResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class ConformanceReport:
     """Results of checks on one amplifier; level: the highest at which channels may be driven.
 
     left: number of checks that were not chosen.
@@ -139,7 +139,9 @@ class Report:
         """The worst result: failed, incomplete or passed."""
         if any(each.result is Result.FAILED for each in self.results):
             return "failed"
-        is_incomplete = self.not_run or any(isinstance(each.finding, Late) for each in self.results)
+        is_incomplete = self.not_run or any(
+            isinstance(each.finding, TooLate) for each in self.results
+        )
         return "incomplete" if is_incomplete else "passed"
 
     @property
@@ -185,16 +187,16 @@ driving = partial(reading, drives=True)
 """Makes a check that arms the amplifier and drives its channels."""
 
 
-async def greeted(client: Client) -> Values:
-    """Read the identity of an amplifier of this version; raises Violation."""
+async def greeted(client: JudgeClient) -> Values:
+    """Read the identity of an amplifier of this version; raises ContractViolation."""
     identity = await client.hello()
     versions, client.reply_words = identity["versions"], {}
     expect(bool(versions >> VERSION & 1), "versions", expected=f"bit {VERSION} set", seen=versions)
     return identity
 
 
-async def identified(client: Client, level: float) -> Subject:
-    """Identify the amplifier at the far end of a client; raises Violation."""
+async def identified(client: JudgeClient, level: float) -> Subject:
+    """Identify the amplifier at the far end of a client; raises ContractViolation."""
     if client.known is None:
         identity = await greeted(client)
         answer = await client.exchange(MESSAGES["GetCaps"].number, ())
@@ -206,7 +208,7 @@ async def identified(client: Client, level: float) -> Subject:
 
 async def run_checks(
     checks: Sequence[tuple[int, Check]],
-    client: Client,
+    client: JudgeClient,
     *,
     level: float,
     on_result: Callable[[CheckResult], None] = lambda result: None,
@@ -235,13 +237,15 @@ async def run_checks(
     return results
 
 
-async def _run(number: int, check: Check, client: Client, level: float) -> tuple[CheckResult, str]:
+async def _run(
+    number: int, check: Check, client: JudgeClient, level: float
+) -> tuple[CheckResult, str]:
     began = threads.now()
     with client.watching():
         while True:
             since = threads.now()
             finding, why = await _attempt(check, client, level)
-            is_late = isinstance(finding, Late)
+            is_late = isinstance(finding, TooLate)
             if not is_late or why or not client.was_late(since):
                 break
     reason = str(finding)
@@ -265,7 +269,7 @@ async def _run(number: int, check: Check, client: Client, level: float) -> tuple
     return result, why and f"{check.name} failed"
 
 
-async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding, str]:
+async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[Finding, str]:
     """Run the steps once; return what they found, and why nothing more can be run, or ""."""
     finding = Finding()
     subject: Subject | None = None
@@ -286,12 +290,12 @@ async def _attempt(check: Check, client: Client, level: float) -> tuple[Finding,
         finding = found
     if subject:
         subject.is_at_rest = False  # whatever it was sent
-    if isinstance(finding, Violation):
+    if isinstance(finding, ContractViolation):
         finding.came = client.came.hex(" ")
         finding.sent = in_words(subject.sent_set) if subject else ""
     is_greeted = check.greets and type(finding) is Finding
     left = None if is_greeted else await _left(check, client, subject, level)
-    finding = left if left and not isinstance(finding, Violation) else finding
+    finding = left if left and not isinstance(finding, ContractViolation) else finding
     return finding, str(left or "")
 
 
@@ -311,19 +315,19 @@ async def _carry_out(check: Check, subject: Subject, level: float) -> None:
 
 
 async def _left(
-    check: Check, client: Client, subject: Subject | None, level: float
+    check: Check, client: JudgeClient, subject: Subject | None, level: float
 ) -> Finding | None:
     """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
     due = threads.now() + _RETRIED
     while subject is None or check.drives:
         try:
-            with suppress(Unusable):  # it is silent, but cannot be judged
+            with suppress(UnusableCapability):  # it is silent, but cannot be judged
                 if subject:
                     await subject.rest()
                 else:
                     await (greeted(client) if check.greets else identified(client, level))
             break
-        except (Violation, Late) as found:
+        except (ContractViolation, TooLate) as found:
             if threads.now() > due:
                 return found
     return None

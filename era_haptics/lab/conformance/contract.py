@@ -12,7 +12,13 @@ from functools import partial
 from drivers.errors import LinkError
 from drivers.protocol.definition import MAX_WORDS
 from drivers.wires.known import address_of
-from era_haptics.lab.conformance.check import Check, CheckResult, Report, Result, run_checks
+from era_haptics.lab.conformance.check import (
+    Check,
+    CheckResult,
+    ConformanceReport,
+    Result,
+    run_checks,
+)
 from era_haptics.lab.conformance.checks import (
     frame_checks,
     playing_checks,
@@ -20,7 +26,7 @@ from era_haptics.lab.conformance.checks import (
     set_checks,
     state_checks,
 )
-from era_haptics.lab.conformance.judge_client import Client, Late, Violation
+from era_haptics.lab.conformance.judge_client import ContractViolation, JudgeClient, TooLate
 from era_haptics.lab.conformance.subject import LEVEL
 from registry import threads
 
@@ -30,7 +36,7 @@ __all__ = [
     "LEVEL",
     "Check",
     "CheckResult",
-    "Report",
+    "ConformanceReport",
     "Result",
     "judge",
     "of_kind",
@@ -134,7 +140,7 @@ def of_kind(kind: str) -> list[tuple[int, Check]]:
     return [(number, check) for number, check in numbered if not check.kinds or kind in check.kinds]
 
 
-CLIENTS: Mapping[str, Callable[[int], Client]] = {
+CLIENTS: Mapping[str, Callable[[int], JudgeClient]] = {
     "serial": frame_checks.SerialClient,
     "CAN": frame_checks.CanClient,
     "Modbus RTU": partial(frame_checks.ModbusClient, is_rtu=True),
@@ -144,7 +150,7 @@ CLIENTS: Mapping[str, Callable[[int], Client]] = {
 
 
 @asynccontextmanager
-async def opened(url: str) -> AsyncIterator[Client]:
+async def opened(url: str) -> AsyncIterator[JudgeClient]:
     """The client of an amplifier by its URL while its line is open, and its board has started.
 
     Raises CommandError for text that is no URL, LinkError for a line that cannot be opened.
@@ -160,7 +166,7 @@ async def opened(url: str) -> AsyncIterator[Client]:
     try:
         boots_until = threads.now() + address.boot_time
         while threads.now() < boots_until:  # what a board says while it starts is no reply
-            with suppress(Violation, Late):
+            with suppress(ContractViolation, TooLate):
                 await client.hello()
                 break
         client.session = random.getrandbits(16)
@@ -178,8 +184,8 @@ async def judge(
     drives: bool,
     level: float = LEVEL,
     on_result: Callable[[CheckResult], None] = lambda result: None,
-    before: Report | None = None,
-) -> Report:
+    before: ConformanceReport | None = None,
+) -> ConformanceReport:
     """Check the amplifier at a URL, and leave it silent and disarmed.
 
     drives: also what arms it and drives its channels, at this level of full level at most.
@@ -197,4 +203,4 @@ async def judge(
         ]
         found = await run_checks(chosen, client, level=level, on_result=on_result, before=results)
     results = (*results, *found)
-    return Report(url, level, results, len(checks) - len(results))
+    return ConformanceReport(url, level, results, len(checks) - len(results))

@@ -65,7 +65,7 @@ def _is_empty(value: object) -> bool:
     return isinstance(value, Sized) and not value
 
 
-class Violation(Finding):
+class ContractViolation(Finding):
     """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
@@ -74,7 +74,7 @@ class Violation(Finding):
         super().__init__(f"{what} must be {must}, got {got}")
 
 
-class NoReply(Violation):
+class NoReply(ContractViolation):
     """It did not reply in time: to what, and what came instead."""
 
     def __init__(self, what: str, seen: str) -> None:
@@ -82,23 +82,23 @@ class NoReply(Violation):
         self.args = (self.seen,)
 
 
-class Armed(Violation):
+class AlreadyArmed(ContractViolation):
     """It is armed, perhaps by another host: nothing is driven."""
 
 
-class Untimed(Violation):
+class UntimedClock(ContractViolation):
     """Its clock does not go on with time: nothing that plays can be judged."""
 
 
-class Optional(Finding):
+class NotApplicable(Finding):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
 
 
-class Unusable(Finding):
+class UnusableCapability(Finding):
     """A capability that the check needs is not as it must be, which its own check reports."""
 
 
-class Late(Finding):
+class TooLate(Finding):
     """This machine was too late for what the check needs: it must be made again."""
 
 
@@ -109,35 +109,35 @@ def message_name(number: int) -> str:
 
 
 def require(is_possible: bool, why: str) -> None:
-    """Raise Optional, with the reason, unless the check can be made."""
+    """Raise NotApplicable, with the reason, unless the check can be made."""
     if not is_possible:
-        raise Optional(why)
+        raise NotApplicable(why)
 
 
 def require_in_time(is_in_time: bool, why: str) -> None:
-    """Raise Late, with the reason, unless this machine was in time."""
+    """Raise TooLate, with the reason, unless this machine was in time."""
     if not is_in_time:
-        raise Late(why)
+        raise TooLate(why)
 
 
 def expect(condition: bool, what: str, *, expected: object, seen: object) -> None:
-    """Raise Violation unless the condition holds."""
+    """Raise ContractViolation unless the condition holds."""
     if not condition:
-        raise Violation(what, expected=expected, seen=seen)
+        raise ContractViolation(what, expected=expected, seen=seen)
 
 
 def expect_equal(seen: object, expected: object, what: str) -> None:
-    """Raise Violation unless both are equal."""
+    """Raise ContractViolation unless both are equal."""
     expect(seen == expected, what, expected=expected, seen=seen)
 
 
 def expect_within(seen: float, low: float, high: float, what: str) -> None:
-    """Raise Violation unless a number is within limits."""
+    """Raise ContractViolation unless a number is within limits."""
     expect(low <= seen <= high, what, expected=f"{low:.6g} to {high:.6g}", seen=f"{seen:.6g}")
 
 
 def expect_one_of(seen: object, known: Collection[object], what: str) -> None:
-    """Raise Violation unless something is known."""
+    """Raise ContractViolation unless something is known."""
     expect(seen in known, what, expected=" or ".join(map(str, known)), seen=seen)
 
 
@@ -166,7 +166,7 @@ class When(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class HeardMessage:
     """A message of the amplifier: number of its request (0: an event), type, words.
 
     frame: that it came in, as its wire has it. Without a type these are bytes that are no frame.
@@ -180,7 +180,7 @@ class Heard:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class RequestOutcome:
     """What became of a request: code of a refusal, empty where it was carried out; its words.
 
     channel: that a refusal names; when: between sending and the reply [s]; values: of the words.
@@ -197,7 +197,7 @@ class Answer:
         return self.values[name]
 
 
-class Client(ABC):
+class JudgeClient(ABC):
     """One amplifier at an address of a line.
 
     heard: messages that no request was waiting for, but Events; order: all, as they came.
@@ -234,8 +234,8 @@ class Client(ABC):
 
     def __init__(self, address: int) -> None:
         self.address = address
-        self.heard: list[Heard] = []
-        self.order: list[Heard] = []
+        self.heard: list[HeardMessage] = []
+        self.order: list[HeardMessage] = []
         self.known: object = None
         self.reply_words: dict[int, int] = {}
         self.wire_time: Callable[[int, int], float] = lambda words, reply: 0.0
@@ -273,11 +273,11 @@ class Client(ABC):
 
     @abstractmethod
     async def hello(self) -> Values:
-        """Read the identity; raises Violation."""
+        """Read the identity; raises ContractViolation."""
 
     @abstractmethod
-    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
-        """Send a message and await its reply; raises Violation where none comes."""
+    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
+        """Send a message and await its reply; raises ContractViolation where none comes."""
 
     async def part(self, number: int, words: Sequence[int]) -> None:
         """Send a message that has no reply: a part of a set but the last."""
@@ -376,7 +376,7 @@ class Client(ABC):
         heard = await self.send(data, *before)
         expect(not heard, f"replies to {what}", expected="none", seen=heard)
 
-    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+    async def send(self, data: bytes, *before: bytes) -> list[HeardMessage]:
         """Send frames, data the last; return what is heard until a reply must have come."""
         self.heard.clear()
         self.came = b""
@@ -388,19 +388,21 @@ class Client(ABC):
         heard, self.heard = self.heard, []
         return heard
 
-    async def reply_to(self, data: bytes) -> Heard | None:
+    async def reply_to(self, data: bytes) -> HeardMessage | None:
         """Send frames, and return what is heard first, None if nothing is, however late."""
         self.write(data)
         return await self.next(lambda each: True, self.timeout)
 
-    def take(self, message: Heard, *, is_event: bool = False) -> None:
+    def take(self, message: HeardMessage, *, is_event: bool = False) -> None:
         """Keep a message that was heard."""
         if not is_event:
             self.heard.append(message)
         self.order.append(message)
         self._news.set()
 
-    async def next(self, is_meant: Callable[[Heard], bool], timeout: float) -> Heard | None:
+    async def next(
+        self, is_meant: Callable[[HeardMessage], bool], timeout: float
+    ) -> HeardMessage | None:
         """Return the first message that is meant, None if it does not come in time [s]."""
         self.came = b""
         loop, due = asyncio.get_running_loop(), threads.now() + timeout
@@ -420,10 +422,11 @@ class Client(ABC):
         finally:
             timer.cancel()
 
-    async def replied(self, is_meant: Callable[[Heard], bool], what: str) -> Heard:
-        """Return the reply to what was sent; Violation where none comes, Late where one is late.
+    async def replied(self, is_meant: Callable[[HeardMessage], bool], what: str) -> HeardMessage:
+        """Return the reply to what was sent.
 
-        An amplifier whose replies are late in a row, or time and again, is slow by itself.
+        Raises ContractViolation where none comes, TooLate where one is late. Replies that
+        are late in a row, or time and again, show that the amplifier is slow.
         """
         before, self.lag, began = self.lag, 0.0, threads.now()
         found = await self.next(is_meant, self.timeout)
@@ -447,11 +450,13 @@ class Client(ABC):
         """Return what is wrong with the bytes that came in place of a reply, if that is known."""
         return ""
 
-    def refusal(self, sent: float, came: float, number: int, words: Sequence[int]) -> Answer:
-        """Make the answer of a Nak; Violation where it names another request."""
+    def refusal(
+        self, sent: float, came: float, number: int, words: Sequence[int]
+    ) -> RequestOutcome:
+        """Make the answer of a Nak; ContractViolation where it names another request."""
         nak = read_as("Nak", read_nak, words, is_strict=True)
         expect_equal(words[NAK_RECORD.places["request"]], number, "request that a Nak names")
-        return Answer(nak.code, nak.channel, (), When(sent, came))
+        return RequestOutcome(nak.code, nak.channel, (), When(sent, came))
 
 
 def in_batches(rows: Sequence[_T], size: int) -> list[Sequence[_T]]:
@@ -467,11 +472,11 @@ def altered(data: bytes, at: int) -> bytes:
 
 
 def read_as(what: str, read: Callable[..., _T], *arguments: object, **options: object) -> _T:
-    """Return what is read; Violation where it cannot be read."""
+    """Return what is read; ContractViolation where it cannot be read."""
     try:
         return read(*arguments, **options)
     except Refusal as error:
-        raise Violation(what, expected="as in the table", seen=error) from None
+        raise ContractViolation(what, expected="as in the table", seen=error) from None
 
 
 _LONG = 5.0  # s; without a reading, after which it may have gone round
@@ -609,7 +614,7 @@ def _ranges(can: Values) -> Iterator[tuple[str, int, int, int]]:
 class Capabilities(dict[str, Any]):
     """Capabilities by name; wrong: what each must be that cannot be so, and what is stated.
 
-    Raises Unusable for one of those, so that what does not ask for it goes on.
+    Raises UnusableCapability for one of those, so that what does not ask for it goes on.
     """
 
     def __init__(self, stated: Values) -> None:
@@ -623,14 +628,14 @@ class Capabilities(dict[str, Any]):
         """Return a capability."""
         if name in self.wrong:
             must, seen = self.wrong[name]
-            raise Unusable(f"its {name} must be {must}, got {seen}")
+            raise UnusableCapability(f"its {name} must be {must}, got {seen}")
         return super().__getitem__(name)
 
 
 FULL = QUANTITIES["level"].per_unit
 
 
-class Material:
+class PlayableMaterial:
     """What an amplifier can play.
 
     A capability is looked at where it is needed.
@@ -648,7 +653,7 @@ class Material:
 
     @cached_property
     def level(self) -> float:
-        """Of driven channels, at most; Optional where it has none so low."""
+        """Of driven channels, at most; NotApplicable where it has none so low."""
         limits, step = [self.can, *self.can["limits"]], self.can["level_step"] / FULL
         level: float = min(self._level, *(one["level_max"] / FULL for one in limits))
         require(level >= step, f"its level_max of {level:g} is below its level_step of {step:g}")
@@ -656,7 +661,7 @@ class Material:
 
     @cached_property
     def lowest(self) -> int:
-        """The lowest frequency of every channel, in steps; Optional where they share none."""
+        """The lowest frequency of every channel, in steps; NotApplicable where they share none."""
         limits = [self.can, *self.can["limits"]]
         lowest = max(one["frequency_min"] for one in limits)
         require(lowest <= self.highest, "its channels have no frequency in common")
@@ -684,11 +689,11 @@ class Material:
         return not feature or has_feature(self.can, feature)
 
     def require(self, feature: str) -> None:
-        """Raise Optional where it does not state a feature."""
+        """Raise NotApplicable where it does not state a feature."""
         require(self.has(feature), f"it states no {feature}")
 
     def require_knots(self) -> None:
-        """Raise Optional where its envelopes have no knots."""
+        """Raise NotApplicable where its envelopes have no knots."""
         require(self.can["knots"] > 0, "it has no knots")
 
     def tone(
@@ -704,7 +709,7 @@ class Material:
     ) -> Command:
         """Make a command at a fraction of the test level; frequency in steps, 0 for the usual.
 
-        Raises Optional for a level that the amplifier may round to 0.
+        Raises NotApplicable for a level that the amplifier may round to 0.
         """
         level, step = round(fraction * self.level * FULL), self.can["level_step"]
         require(
@@ -788,7 +793,10 @@ def layer(
 
 
 class Judge(ExpectedAmplifier):
-    """An amplifier with these capabilities since a status at rest. Raises Violation and Late."""
+    """An amplifier with these capabilities since a status at rest.
+
+    Raises ContractViolation and TooLate.
+    """
 
     def __init__(self, can: Values, rest: Values, when: Interval) -> None:
         unclear = partial(require_in_time, False)
@@ -797,10 +805,13 @@ class Judge(ExpectedAmplifier):
         self.check(rest, when)
 
     def _wrong(self, rule: str, time: float, what: str, *, must: object, seen: object) -> None:
-        raise Violation(what, expected=must, seen=seen)
+        raise ContractViolation(what, expected=must, seen=seen)
 
     def achieved(self, one: LayerSet, shown: Values) -> LayerSet:
-        """Return a layer as it plays by a GetAchieved; raises Violation beyond half a step."""
+        """Return a layer as it plays by a GetAchieved.
+
+        Raises ContractViolation for a difference of more than half a step.
+        """
         driven = tuple(tone for tone in one.commands if tone.is_driven)
         one = replace(one, commands=driven)
         if problem := achieved_problem(one, shown, self.can, is_exact=False):

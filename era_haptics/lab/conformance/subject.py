@@ -27,15 +27,15 @@ from era_haptics.lab.conformance.judge_client import (
     QUIET,
     REPLY_TIMEOUT,
     STATED,
-    Answer,
     Capabilities,
-    Client,
     Dating,
     Judge,
-    Late,
-    Material,
+    JudgeClient,
+    PlayableMaterial,
+    RequestOutcome,
     Rows,
     Send,
+    TooLate,
     When,
     expect,
     expect_equal,
@@ -71,7 +71,7 @@ RATE = 1 / QUANTITIES["rate"].per_unit
 _MOVING = STATES["SWITCHED_ON"], STATES["FAULT_REACTION_ACTIVE"]
 
 
-class Subject(Material):
+class Subject(PlayableMaterial):
     """An identified amplifier at the far end of a client; level: of driven channels, at most.
 
     expected: what it must show, None until it was brought to rest. token: of the last set made.
@@ -79,7 +79,9 @@ class Subject(Material):
     is_at_rest: nothing was sent since it was brought to rest.
     """
 
-    def __init__(self, client: Client, identity: Values, can: Capabilities, level: float) -> None:
+    def __init__(
+        self, client: JudgeClient, identity: Values, can: Capabilities, level: float
+    ) -> None:
         super().__init__(can, level)
         self.client, self.identity = client, identity
         self.session, self.token = 1, 0
@@ -123,7 +125,9 @@ class Subject(Material):
                     continue
                 case _:
                     found = await row()
-            if at == len(rows) or not (isinstance(found, Answer) and "levels" in found.values):
+            if at == len(rows) or not (
+                isinstance(found, RequestOutcome) and "levels" in found.values
+            ):
                 await self.status()
 
     async def _course(self, rows: Rows) -> None:
@@ -131,7 +135,7 @@ class Subject(Material):
         await self.run(rows)
         await self.follow()
 
-    async def send(self, row: Send) -> Answer:
+    async def send(self, row: Send) -> RequestOutcome:
         """Send a request, whose answer must be one of its codes."""
         several = [row.values]
         if row.layers:
@@ -155,7 +159,9 @@ class Subject(Material):
             expect_one_of(answer.channel, row.channels, f"channel of the refusal of {what}")
         return answer
 
-    async def answer(self, name: str, raw: Sequence[int] | None = None, **values: Any) -> Answer:
+    async def answer(
+        self, name: str, raw: Sequence[int] | None = None, **values: Any
+    ) -> RequestOutcome:
         """Send a request by its values, or raw words, and return what became of it.
 
         A part of a set but the last has no reply, which what is heard with the next shows.
@@ -177,7 +183,7 @@ class Subject(Material):
         if not has_reply:
             self._parts.append((sent, values, len(raw)))
             await client.part(message.number, raw)
-            return Answer("", None, (), When(sent, threads.now()))
+            return RequestOutcome("", None, (), When(sent, threads.now()))
         answer = await client.exchange(message.number, raw)
         self._check_fed()  # or it may have been carried out after the watchdog
         took = threads.now() - sent
@@ -217,11 +223,13 @@ class Subject(Material):
             return 0.0
         return sum(self.client.wire_time(words, 0) for _, _, words in made)
 
-    async def request(self, name: str, **values: Any) -> Answer:
+    async def request(self, name: str, **values: Any) -> RequestOutcome:
         """Send a request that must be carried out; its reply must show what is expected."""
         return await self.send(send(name, **values))
 
-    async def _carried_out(self, name: str, values: Values, answer: Answer) -> Answer:
+    async def _carried_out(
+        self, name: str, values: Values, answer: RequestOutcome
+    ) -> RequestOutcome:
         """Read the reply to a request, and compare it with what must be shown."""
         record = STATED if name == "GetCaps" else MESSAGES[name].reply
         shown = read_as(f"reply to {name}", record.unpack, answer.words, is_strict=False)
@@ -286,17 +294,19 @@ class Subject(Material):
             played.append(judge.achieved(one, shown) if is_shown else one)
         judge.sets.replace(token, tuple(played))
 
-    async def status(self) -> Answer:
+    async def status(self) -> RequestOutcome:
         """Read the status; feeds the watchdog where that is due."""
         if self.is_hungry:
             return await self.ping()
         return await self.request("GetStatus")
 
-    async def ping(self) -> Answer:
+    async def ping(self) -> RequestOutcome:
         """Feed the watchdog."""
         return await self.request("Ping")
 
-    async def arm(self, watchdog: float = 2.0, *, is_fed: bool = True, shift: int = 0) -> Answer:
+    async def arm(
+        self, watchdog: float = 2.0, *, is_fed: bool = True, shift: int = 0
+    ) -> RequestOutcome:
         """Arm under a new session with a watchdog [s], or the nearest that is possible.
 
         is_fed: the nearest in which it can be fed, else it may expire from now on. shift: of its
@@ -313,7 +323,7 @@ class Subject(Material):
         """The session of the next Arm."""
         return self.client.session % 0xFFFF + 1
 
-    async def clear(self) -> Answer:
+    async def clear(self) -> RequestOutcome:
         """Acknowledge the last stop or fault."""
         return await self.request("Clear", latch=self.latch)
 
@@ -323,7 +333,7 @@ class Subject(Material):
         return self.shown.latch or 0
 
     def _check_fed(self) -> None:
-        """Raise Late where this machine may have starved the watchdog."""
+        """Raise TooLate where this machine may have starved the watchdog."""
         require_in_time(self._since_fed <= _MAX_WATCHDOG_USE, "the watchdog was not fed in time")
 
     @property
@@ -359,7 +369,7 @@ class Subject(Material):
         self.expected, self.is_at_rest = Judge(self.can, reply.values, reply.when), True
 
     def require_alone(self) -> None:
-        """Raise Optional where what is for all would reach other amplifiers."""
+        """Raise NotApplicable where what is for all would reach other amplifiers."""
         where = ", ".join(map(str, sorted(self.client.neighbours)))
         require(not where, f"left out, since it would reach others: what is for all ({where})")
 
@@ -397,7 +407,7 @@ class Subject(Material):
         self.shown.sets.sent(part)
         self.shown.carry_out("Set", part, {}, self.since(sent))
 
-    async def play(self, *layers: LayerSet) -> Answer:
+    async def play(self, *layers: LayerSet) -> RequestOutcome:
         """Play a set at once."""
         return await self.send(play(*layers))
 
@@ -416,7 +426,7 @@ class Subject(Material):
         """Play a set from a moment of its clock on, a time [s] apart from the last such moment.
 
         lead: how long before its moment its Commit is sent [s], where that is not apart from
-        another. Raises Late where its Commit may have come behind that.
+        another. Raises TooLate where its Commit may have come behind that.
         """
         await self.send(stage(*layers))
         await self.commit_in(self._until_moment + apart if apart else lead)
@@ -484,7 +494,7 @@ class Subject(Material):
         return int(min(required, self.can["ramp_max"]))
 
     def require_ramp(self, duration: float = 0.0) -> None:
-        """Raise Optional where no ramp lasts as long as a time [s], or as a few exchanges."""
+        """Raise NotApplicable where no ramp lasts as long as a time [s], or as a few exchanges."""
         duration = max(duration, 0.03 + 2 * min(self.exchange_time, 1.0))
         require(
             self.can["ramp_max"] >= 1000 * duration, f"its ramps are shorter than {duration:.2g} s"
@@ -516,7 +526,7 @@ class Subject(Material):
         self.heard_at = end
         require_in_time(threads.now() <= end + _OVERSLEPT, "a pause took too long")
 
-    async def settle(self, reply: Answer | None = None) -> Answer:
+    async def settle(self, reply: RequestOutcome | None = None) -> RequestOutcome:
         """Read statuses behind a reply until it is silent and in a state that lasts."""
         due, reply = threads.now() + _SETTLED, reply or await self.status()
         while any(reply["levels"]) or reply["state"] in (*_MOVING, ENABLED):
@@ -529,7 +539,7 @@ class Subject(Material):
     async def follow(self, duration: float | None = None) -> None:
         """Read statuses for a time [s] from the last change on, None until all is settled.
 
-        Raises Late where this machine was too slow to see what happens.
+        Raises TooLate where this machine was too slow to see what happens.
         """
         began = self.shown.outputs.began
         end = self.shown.outputs.settled_at(began[1]) + _SETTLING
@@ -556,12 +566,12 @@ class Subject(Material):
             try:
                 await case()
                 return
-            except Late:
+            except TooLate:
                 if not self.client.was_late(began):
                     raise
 
     async def require_interference(self) -> None:
-        """Raise Optional where levels do not show that tones of one frequency cancel."""
+        """Raise NotApplicable where levels do not show that tones of one frequency cancel."""
         halves = [self.tone(0, 0.5, phase) for phase in (0.0, 180.0)]
         await self.play(*(layer(at, each) for at, each in enumerate(halves)))
         level = (await self.request("GetStatus"))["levels"][0]

@@ -57,7 +57,7 @@ _SAME = 0.1  # relative, of Bl² by either run
 
 
 @dataclass(frozen=True)
-class Bench:
+class ImpedanceSetup:
     """What is known beside the impedance.
 
     weight, coil [kg]: of the whole exciter and of its coil, None if unknown; base [kg]: what it was
@@ -175,7 +175,7 @@ def _parts(values: ComplexArray) -> FloatArray:
 
 
 def exciter_values(
-    free: Circuit | None, glued: Circuit | None, bench: Bench
+    free: Circuit | None, glued: Circuit | None, bench: ImpedanceSetup
 ) -> dict[str, tuple[float, float]]:
     """The values of a rig's exciter that follow, each with half the interval of nine of ten.
 

@@ -31,7 +31,7 @@ import numpy as np
 from scipy import signal
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import PERIOD, Desk, Estimate, Multisine
+from era_haptics.lab.measuring.sound_card import PERIOD, Desk, Multisine, ResponseEstimate
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import (
     MeasuredValue,
@@ -160,7 +160,7 @@ def check_levels(recorded: FloatArray, named: Mapping[int, str]) -> None:
         raise LinkError(f"silent: {inputs}; check cables, amplifier and sensor supply (IEPE)")
 
 
-def check_wiring(found: Estimate, desk: Desk) -> None:
+def check_wiring(found: ResponseEstimate, desk: Desk) -> None:
     """Raise InputError unless the loop-back, and no sensor, has its output by a cable.
 
     A cable brings back one output alone. Sensors of a single source do so, too, and may.
@@ -210,7 +210,7 @@ def check_clocks(multisine: Multisine, recorded: Sequence[FloatArray], desk: Des
 
 
 def check_coherence(
-    found: Estimate,
+    found: ResponseEstimate,
     recorded: Sequence[FloatArray],
     desk: Desk,
     *,
@@ -264,7 +264,7 @@ _SETTLED = 0.05  # of a sensor's response between the two halves of what is kept
 
 
 @dataclass(frozen=True)
-class Tone:
+class SteppedTone:
     """A tone [Hz] that an ERA played; place: file and time, for errors.
 
     ratios: samples of each sensor by those of the reference; NaN where they had not settled.
@@ -276,7 +276,7 @@ class Tone:
     ratios: ComplexArray
 
 
-def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) -> list[Tone]:
+def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) -> list[SteppedTone]:
     """Tones of a recording of sensors, that ERAs played; raises InputError, with the time."""
     try:
         rate, samples = samples_of(read_bytes(path))
@@ -293,7 +293,7 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
     except (InputError, LinkError) as error:
         raise InputError(f"{path}: {error}") from error
     columns = [sensor.input - 1 for sensor in sensors]
-    found, number, before = list[Tone](), 0, 0.0
+    found, number, before = list[SteppedTone](), 0, 0.0
     for start, end in _held(path, references.sum(axis=1), rate):
         place = f"{path} at {start / rate:.1f} s"
         kept = slice((start + end) // 2, end)
@@ -316,7 +316,7 @@ def tones_of(path: Path, sensors: Sequence[WiredSensor], eras: Sequence[str]) ->
                 f"{place}: one reference must have ascending tones for each of {len(eras)} ERAs in "
                 "turn, got more; record a reference for each ERA, or a file SENSOR-OUTPUT.wav"
             )
-        found.append(Tone(eras[number], frequency, place, ratios))
+        found.append(SteppedTone(eras[number], frequency, place, ratios))
     played = {tone.era for tone in found}
     if played != set(eras):
         raise InputError(

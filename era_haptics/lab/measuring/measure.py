@@ -174,7 +174,7 @@ LEVEL = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredResponses:
     """Responses with what is known of them.
 
     coherence (f, sensors), std (f, sensors) relative to the root mean square of the sensor; latency
@@ -232,7 +232,7 @@ def measure(
     periods: int = 2,
     show: Show = lambda recorded: None,
     is_heard: bool = False,
-) -> Measured:
+) -> MeasuredResponses:
     """Play all runs of a multisine and estimate the responses.
 
     periods: of each run that are analysed. show: called with the runs recorded so far, after each.
@@ -262,7 +262,7 @@ def measure(
     looped, columns = found.values[:, desk.input - 1, desk.looped], desk.columns
     of_eras = found.values[:, columns, : len(desk.eras)]
     rms = np.sqrt((np.abs(of_eras) ** 2).mean(axis=(0, 2)))
-    return Measured(
+    return MeasuredResponses(
         desk.responses(multisine.frequencies, found.values, looped),
         found.coherence[:, columns],
         found.std[:, columns] / rms,
@@ -281,7 +281,7 @@ _LOUD = 0.05  # of the largest at a frequency; maxima sit in antiresonances
 def check_by_steps(
     desk: Desk,
     card: SoundCard,
-    measured: Measured,
+    measured: MeasuredResponses,
     *,
     level: float,
     progress: Progress,
@@ -362,7 +362,7 @@ def measure_at_once(
     }
 
 
-def _rows(found: Measured, check: dict[str, Any] | None, *, rate: float) -> Iterator[str]:
+def _rows(found: MeasuredResponses, check: dict[str, Any] | None, *, rate: float) -> Iterator[str]:
     """Yield how well responses were measured."""
     lines = found.responses.frequencies
     yield (
@@ -450,7 +450,7 @@ def measure_through(
     )
 
 
-def _measurement(desk: Desk, found: Measured) -> Measurement:
+def _measurement(desk: Desk, found: MeasuredResponses) -> Measurement:
     """Responses with the usual error of readings and the noise beside it."""
     responses = found.responses
     values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
@@ -465,7 +465,7 @@ def _measurement(desk: Desk, found: Measured) -> Measurement:
 
 
 def _repeats(
-    desk: Desk, found: Measured, multisine: Multisine, recorded: FloatArray
+    desk: Desk, found: MeasuredResponses, multisine: Multisine, recorded: FloatArray
 ) -> tuple[Repeat, ...]:
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
     full = [*desk.rig.full_levels.values()]

@@ -20,7 +20,7 @@ from model.commands.options import JsonOption, RigArgument, next_line, print_rep
 from model.errors import InputError
 
 if TYPE_CHECKING:
-    from era_haptics.lab.measuring.impedance import Bench, Circuit
+    from era_haptics.lab.measuring.impedance import Circuit, ImpedanceSetup
 
 
 def measure(
@@ -266,7 +266,7 @@ def impedance(
     from era_haptics.lab.measuring.impedance import (
         LINES,
         NAMES,
-        Bench,
+        ImpedanceSetup,
         exciter_values,
         fitted,
         measured_impedance,
@@ -285,7 +285,7 @@ def impedance(
         missing = "--device" if device is None else "--output"
         raise InputError(f"{missing} is missing; a measurement needs both, files neither")
     taken = _inputs(inputs)
-    bench = Bench(
+    bench = ImpedanceSetup(
         weight and 1e-3 * weight,
         coil and 1e-3 * coil,
         math.inf if base is None else 1e-3 * base,
@@ -368,7 +368,9 @@ _BY_BASE = ("resonance", "coil_mass", "stiffness", "force_factor")
 
 
 def _rows(
-    circuits: "Mapping[str, Circuit]", values: Mapping[str, tuple[float, float]], bench: "Bench"
+    circuits: "Mapping[str, Circuit]",
+    values: Mapping[str, tuple[float, float]],
+    bench: "ImpedanceSetup",
 ) -> Iterator[str]:
     for name, each in circuits.items():
         yield (

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.measure import Measured, measure
+from era_haptics.lab.measuring.measure import MeasuredResponses, measure
 from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard
 from model.arrays import ComplexArray, FloatArray
 from model.calibration.responses import (
@@ -72,7 +72,7 @@ class PositionsFile:
         for at, values in zip(found.points.tolist(), found.values.transpose(2, 0, 1), strict=True):
             self.values[self._place_at(at).name] = values
 
-    def keep(self, place: WiredSensor, found: Measured) -> None:
+    def keep(self, place: WiredSensor, found: MeasuredResponses) -> None:
         """Write the file with another place; raises OSError."""
         self.values[place.name] = found.responses.values[:, :, 0]
         places = [place for place in self.desk.sensors if place.name in self.values]
@@ -164,14 +164,14 @@ def measure_positions(
     periods: int,
     prompt: Callable[[str], str] = _prompt,
     tell: Callable[[str], None] = _tell,
-) -> dict[str, Measured]:
+) -> dict[str, MeasuredResponses]:
     """Guide a person through the missing places; returns what was measured now, by place.
 
     prompt: shows what to do and returns what was typed, "q" at the end; tell: shows a line. A place
     that fails a check is reported with its remedy, and asked for again. Raises DeviceLost, OSError;
     what was measured before is in the file then.
     """
-    found: dict[str, Measured] = {}
+    found: dict[str, MeasuredResponses] = {}
     todo = file.missing
     last: WiredSensor | None = None
     tell(
@@ -216,7 +216,7 @@ def measure_positions(
     return found
 
 
-def _check_moved(file: PositionsFile, place: WiredSensor, found: Measured) -> None:
+def _check_moved(file: PositionsFile, place: WiredSensor, found: MeasuredResponses) -> None:
     """Raise InputError for a response that is that of another place."""
     own = found.responses.values[:, :, 0]
     limit = max(_SAME, _OF_NOISE * float(np.median(found.std)))
@@ -233,7 +233,7 @@ def _check_moved(file: PositionsFile, place: WiredSensor, found: Measured) -> No
             )
 
 
-def _line(place: WiredSensor, found: Measured) -> str:
+def _line(place: WiredSensor, found: MeasuredResponses) -> str:
     noise = float(np.median(found.std))
     text = (
         f"{place.name}: coherence {np.median(found.coherence):.4f}, noise {100 * noise:.2f} % of "

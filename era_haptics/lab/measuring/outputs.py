@@ -24,8 +24,8 @@ from scipy.optimize import linear_sum_assignment
 from era_haptics.lab.measuring.loopback import check_levels
 from era_haptics.lab.measuring.sound_card import (
     Desk,
-    Estimate,
     Multisine,
+    ResponseEstimate,
     SoundCard,
     estimate,
     open_card,
@@ -83,7 +83,7 @@ def tone(
 
 
 @dataclass(frozen=True)
-class Heard:
+class OutputFinding:
     """What is known of an output, counted from 1; era: that it drives, None for none.
 
     polarity, 1 or -1, and relative_level, to the median and to the model: None where nothing
@@ -105,7 +105,7 @@ def listen(
     outputs: int,
     level: float,
     move: Callable[[str], None],
-) -> list[Heard]:
+) -> list[OutputFinding]:
     """Play on each output for a few seconds at each place, and tell what it drives.
 
     beside: input, counted from 1, of the accelerometer that is put beside each actuator; move:
@@ -117,7 +117,7 @@ def listen(
     lines = np.arange(1.0, high + 1e-6, _STEP)
     sines = Multisine(lines[lines >= low], 1, card.rate, level)
     desk.check_times(seconds=run_time(_PERIODS), slew=sines.slew)
-    found: list[list[Estimate]] = []
+    found: list[list[ResponseEstimate]] = []
     for era in desk.rig.eras:
         move(era.name)
         runs = [
@@ -129,7 +129,9 @@ def listen(
     return judged(desk.rig, sines.frequencies, found)
 
 
-def judged(rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[Estimate]]) -> list[Heard]:
+def judged(
+    rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[ResponseEstimate]]
+) -> list[OutputFinding]:
     """What each output drives, by the responses beside each actuator at frequencies (f,) [Hz].
 
     found: by actuator and output. Raises InputError where outputs are not told apart.
@@ -147,15 +149,15 @@ def judged(rig: Rig, frequencies: FloatArray, found: Sequence[Sequence[Estimate]
     rows, eras, signs = matched(values, model, frequencies)
     levels = _size(values[rows]) / _size(model[eras])
     dead = "dead: moves nothing; check its cable and amplifier"
-    heard = [Heard(n + 1, relative_level=0.0, verdict=dead) for n in range(len(moved))]
+    heard = [OutputFinding(n + 1, relative_level=0.0, verdict=dead) for n in range(len(moved))]
     for row, era, sign, level in zip(rows, eras, signs, levels / np.median(levels), strict=True):
         n = int(audible[row])
         verdict = _verdict(found[era][n], sign=sign, level=level)
-        heard[n] = Heard(n + 1, rig.eras[era].name, int(sign), float(level), verdict)
+        heard[n] = OutputFinding(n + 1, rig.eras[era].name, int(sign), float(level), verdict)
     return heard
 
 
-def _verdict(beside: Estimate, *, sign: int, level: float) -> str:
+def _verdict(beside: ResponseEstimate, *, sign: int, level: float) -> str:
     """What is wrong with an output that moves the plate."""
     if beside.even[0] > _RATTLE or np.median(beside.coherence) < _COHERENT:
         return "loose: it rattles; fasten it"
@@ -269,9 +271,9 @@ def _moved(name: str) -> None:
 
 def _requested(
     desk: Desk, card: SoundCard, count: int, *, level: float, frequency: float | None
-) -> list[Heard]:
+) -> list[OutputFinding]:
     """What each output drives, as is said on the terminal."""
-    names, found = {name.lower(): name for name, _ in desk.eras}, list[Heard]()
+    names, found = {name.lower(): name for name, _ in desk.eras}, list[OutputFinding]()
     for number in range(1, count + 1):
         played = tone(desk, number, outputs=count, rate=card.rate, level=level, frequency=frequency)
         left = ", ".join(names.values())
@@ -284,7 +286,7 @@ def _requested(
             }:  # fmt: skip
                 typer.echo(f"{said!r} is none of {left}; {did_you_mean(said, names)}", err=True)
         era = names.pop(said, None)
-        found.append(Heard(number, era, verdict="ok" if era else "moves nothing"))
+        found.append(OutputFinding(number, era, verdict="ok" if era else "moves nothing"))
     return found
 
 
@@ -301,7 +303,7 @@ def _write(rig_file: Path, output: Path, channels: Mapping[str, int]) -> None:
 
 
 def _rows(
-    heard: Sequence[Heard],
+    heard: Sequence[OutputFinding],
     own: Mapping[str, int],
     channels: Mapping[str, int],
     missing: Sequence[str],

@@ -152,7 +152,7 @@ _AROUND = 4  # lines of a period on either side, from which noise is taken
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ResponseEstimate:
     """Responses (f, inputs, sources) of samples to samples, H1 over all runs.
 
     std (f, inputs): standard deviation of each response's modulus; coherence (f, inputs): share of
@@ -166,7 +166,7 @@ class Estimate:
     even: FloatArray
 
 
-def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> Estimate:
+def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEstimate:
     """Estimate responses from whole periods of each run, (periods x samples, inputs).
 
     Two periods or more: between the lines of a period the spectrum of several has nothing but
@@ -183,7 +183,7 @@ def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> Estimate:
     noise = _noise(spectra, lines, periods)
     power = (np.abs(heard) ** 2).mean(axis=0)
     size = np.abs(multisine.played(0)[:, :1])
-    return Estimate(
+    return ResponseEstimate(
         values.transpose(0, 2, 1),
         np.sqrt(noise / len(recorded)) / size,
         np.clip(1 - noise / np.maximum(power, 1e-300), 0.0, 1.0),

@@ -54,7 +54,7 @@ _MAX_LINE = 1 << 20  # characters
 _ARROWS: dict[Direction, str] = {"amplifier": ">", "host": "<"}
 
 
-class Piece(NamedTuple):
+class CapturePiece(NamedTuple):
     """Bytes on a wire at a time [s]."""
 
     time: float
@@ -68,7 +68,7 @@ def capture_line(time: float, wire: str, direction: Direction, data: bytes) -> s
     return f"{time:.6f} {wire} {_ARROWS[direction]} {data.hex(' ').upper()}"
 
 
-def read_capture(path: Path, *, wires: Collection[str]) -> Iterator[Piece]:
+def read_capture(path: Path, *, wires: Collection[str]) -> Iterator[CapturePiece]:
     """Read the pieces of a capture in order; wires: the names that are allowed.
 
     Raises CommandError with file and line.
@@ -89,12 +89,12 @@ def read_capture(path: Path, *, wires: Collection[str]) -> Iterator[Piece]:
         raise CommandError(f"{path}: cannot be read: {problem.strerror}") from problem
 
 
-def _piece(text: str, where: str, wires: Collection[str], last: float) -> Piece:
+def _piece(text: str, where: str, wires: Collection[str], last: float) -> CapturePiece:
     """Read a line behind one of a time [s]."""
     directions = {arrow: direction for direction, arrow in _ARROWS.items()}
     try:
         time, wire, arrow, digits = text.split(maxsplit=3)
-        piece = Piece(float(time), wire, directions[arrow], bytes.fromhex(digits))
+        piece = CapturePiece(float(time), wire, directions[arrow], bytes.fromhex(digits))
     except (ValueError, KeyError):
         raise CommandError(
             f"{where}: must be TIME WIRE > HEX (or <), as in 0.0125 wire1 > 00 02 01, got "
@@ -121,7 +121,7 @@ _MAX_VIOLATIONS = 200
 
 
 @dataclass
-class Violation:
+class RuleViolation:
     """A broken rule: its name, wire, time [s], a sentence, and the frames around it."""
 
     invariant: str
@@ -136,13 +136,13 @@ class Violation:
         return "\n".join((head, *(f"    {frame}" for frame in self.frames)))
 
 
-class Report:
+class WitnessReport:
     """Collects violations, at most 200: those `found`."""
 
     def __init__(self) -> None:
-        self.found: list[Violation] = []
+        self.found: list[RuleViolation] = []
         self._frames: dict[str, deque[str]] = {}  # by wire, the last
-        self._followed: list[tuple[Violation, int]] = []  # and how many frames they will have
+        self._followed: list[tuple[RuleViolation, int]] = []  # and how many frames they will have
 
     def frame(self, wire: str, time: float, direction: Direction, raw: bytes) -> None:
         """Note a frame, and add it to the violations just before it."""
@@ -157,7 +157,7 @@ class Report:
         """Add a violation of a rule on a wire."""
         if len(self.found) < _MAX_VIOLATIONS:
             frames = [*self._frames.get(wire, ())]
-            self.found.append(Violation(invariant, wire, time, sentence, frames))
+            self.found.append(RuleViolation(invariant, wire, time, sentence, frames))
             self._followed.append((self.found[-1], len(frames) + _FRAMES_AFTER))
 
 
@@ -216,7 +216,7 @@ _WITH_STATE = (STATUS, EVENT_RECORD)
 
 
 @dataclass(eq=False, slots=True)
-class Request:
+class WitnessedRequest:
     """A request. address: 0 for broadcast; key: of its reply, None where there is none.
 
     values: of its record; problem: what is wrong with it, or ""; started_at: when its first byte
@@ -247,7 +247,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class WitnessedReply:
     """A reply. key: of its request, None where it matches none; values: None where it has none.
 
     refusal: code, 0 if granted; problem: what is wrong with it, or "".
@@ -289,7 +289,7 @@ class Decoder(ABC):
         """Decode bytes; returns the complete frames."""
 
 
-Message: TypeAlias = Request | Reply | Notice
+Message: TypeAlias = WitnessedRequest | WitnessedReply | Notice
 DecodedFrame: TypeAlias = tuple[bytes, Message | None]
 """A frame and its message; None for part of a message, or none that concerns the rules."""
 
@@ -305,7 +305,7 @@ def request_of(
     address: int,
     key: Hashable,
     started_at: float = math.inf,
-) -> Request:
+) -> WitnessedRequest:
     """Read a request by the number of its message."""
     name, values = NAMES.get(number, f"type {number}"), Values()
     problem = "" if address or name in BROADCAST else "must not be a broadcast"
@@ -314,25 +314,27 @@ def request_of(
             _, values = read_request(number, words)
     except Refusal as refusal:
         problem = str(refusal)
-    return Request(name, address, key, values, problem, started_at)
+    return WitnessedRequest(name, address, key, values, problem, started_at)
 
 
-def reply_of(record: Record, words: Sequence[int], address: int, key: Hashable) -> Reply:
+def reply_of(record: Record, words: Sequence[int], address: int, key: Hashable) -> WitnessedReply:
     """Read what an amplifier sends: the record of a reply, a refusal or an Event."""
     try:
         values = record.unpack(words, is_strict=False)
     except Refusal as refusal:
-        return Reply(address, key, problem=str(refusal))
+        return WitnessedReply(address, key, problem=str(refusal))
     problem = ""
     for name, known in (("state", STATES), ("fault", FAULTS)) if record in _WITH_STATE else ():
         if values[name] not in known.values():
             problem = f"{name} must be 0 to {max(known.values())}, got {values[name]}"
-    return Reply(address, key, values, values["code"] if record is NAK_RECORD else 0, problem)
+    return WitnessedReply(
+        address, key, values, values["code"] if record is NAK_RECORD else 0, problem
+    )
 
 
 def sent_by_amplifier(
     number: int, words: Sequence[int], address: int, sequence: int
-) -> Reply | Notice:
+) -> WitnessedReply | Notice:
     """Read a message that an amplifier sends by its number; sequence: 0 for an Event on CAN."""
     if number == EVENT:
         event = reply_of(EVENT_RECORD, words, address, None)
@@ -364,7 +366,7 @@ CHANGING = frozenset(_CARRIED_OUT)
 """Requests that change what the amplifier does."""
 
 
-def is_carried_out(request: Request, status: Values) -> bool:
+def is_carried_out(request: WitnessedRequest, status: Values) -> bool:
     """Whether a later status shows that a request was carried out."""
     return bool(_CARRIED_OUT[request.name](request.values, status))
 
@@ -401,13 +403,13 @@ def _decode(direction: Direction, piece: bytes) -> Message:
             wrong = f"version must be {version}, got {frame.version}" if is_other else ""
             return replace(request, problem=wrong or request.problem)
         if is_hello:
-            message: Message = Reply(frame.address, key, unpack_identity(frame.payload))
+            message: Message = WitnessedReply(frame.address, key, unpack_identity(frame.payload))
         else:
             message = sent_by_amplifier(frame.type, words, frame.address, frame.sequence)
     except Refusal as refusal:
         if direction == "amplifier":
-            return Request(f"type {frame.type}", frame.address, key, problem=str(refusal))
-        return Reply(frame.address, key, problem=str(refusal))
+            return WitnessedRequest(f"type {frame.type}", frame.address, key, problem=str(refusal))
+        return WitnessedReply(frame.address, key, problem=str(refusal))
     if is_other and getattr(message, "refusal", 0) != REFUSALS["UNSUPPORTED_VERSION"]:
         return damaged(f"protocol version {frame.version}")
     return message

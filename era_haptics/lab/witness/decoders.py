@@ -57,8 +57,8 @@ from era_haptics.lab.witness.capture import (
     Direction,
     Message,
     Notice,
-    Reply,
-    Request,
+    WitnessedReply,
+    WitnessedRequest,
     damaged,
     reply_of,
     request_of,
@@ -212,23 +212,23 @@ class ModbusDecoder(Decoder):
         if request is None:
             self._remember(_Transaction(adu, key))
             problem = f"function {adu.pdu[0]} is malformed or none"
-            return Request(A_READ, adu.unit, key, problem=problem)
+            return WitnessedRequest(A_READ, adu.unit, key, problem=problem)
         if adu.pdu[0] in READS:
             return self._read(adu, key, request)
         return self._write(adu, key, request)
 
-    def _write(self, adu: Adu, key: Hashable, request: Pdu) -> Request:
+    def _write(self, adu: Adu, key: Hashable, request: Pdu) -> WitnessedRequest:
         self._remember(_Transaction(adu, key, request))
         words = request.registers
         number, offset = divmod(request.address, BOX)
         if offset or number not in BY_NUMBER or len(words) > MAX_WORDS + 1 or not words[0]:
             problem = f"write of {len(words)} registers to {request.address}, tag {words[0]}"
-            return Request(A_READ, adu.unit, key, problem=problem)
+            return WitnessedRequest(A_READ, adu.unit, key, problem=problem)
         if adu.unit:
             self._written[adu.unit, number] = _Written(words[0], key)
         return request_of(number, words[1:], adu.unit, key)
 
-    def _read(self, adu: Adu, key: Hashable, request: Pdu) -> Request | Notice:
+    def _read(self, adu: Adu, key: Hashable, request: Pdu) -> WitnessedRequest | Notice:
         number, offset = divmod(request.address, BOX)
         written = self._written.get((adu.unit, number))
         is_reply = number in BY_NUMBER and offset == MODBUS_FRAMES_REPLY
@@ -237,9 +237,9 @@ class ModbusDecoder(Decoder):
             return Notice("read on", key=written.key)
         self._remember(_Transaction(adu, key, request, written.tag if written is not None else 0))
         if request.address == IDENTITY:
-            return Request(HELLO, adu.unit, key)
+            return WitnessedRequest(HELLO, adu.unit, key)
         is_present = is_reply and BY_NUMBER[number].name in PRESENT
-        return Request(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
+        return WitnessedRequest(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
 
     def _remember(self, transaction: _Transaction) -> None:
         if transaction.key is not None:
@@ -248,39 +248,41 @@ class ModbusDecoder(Decoder):
     def _response(self, adu: Adu) -> Message | None:
         transaction = self._open.get(adu.transaction)
         if transaction is None or transaction.adu.unit != adu.unit:
-            return Reply(adu.unit)
+            return WitnessedReply(adu.unit)
         del self._open[adu.transaction]
         key, request, function = transaction.key, transaction.request, transaction.adu.pdu[0]
         if adu.pdu[0] == function | EXCEPTION and len(adu.pdu) == 2:
             name = EXCEPTIONS.get(adu.pdu[1])  # what gateways refuse is no response
-            return None if name is None else Reply(adu.unit, key, refusal=REFUSALS[name])
+            return None if name is None else WitnessedReply(adu.unit, key, refusal=REFUSALS[name])
         response = response_to(request, adu)
         if request is None or response is None:
             problem = f"function must be {function}, got {adu.pdu[0]}"
             if adu.pdu[0] == function:
                 problem = f"response must fit {transaction.adu.pdu[:5].hex()}, got {adu.pdu.hex()}"
-            return Reply(adu.unit, problem=problem)
+            return WitnessedReply(adu.unit, problem=problem)
         if request.function_code == WRITE:
             return Notice("carried out", key=key)
         return self._reply(transaction, request.address, response.registers)
 
-    def _reply(self, transaction: _Transaction, address: int, words: Sequence[int]) -> Reply:
+    def _reply(
+        self, transaction: _Transaction, address: int, words: Sequence[int]
+    ) -> WitnessedReply:
         unit, key, tag = transaction.adu.unit, transaction.key, transaction.tag
         number, offset = divmod(address, BOX)
         if address == IDENTITY and len(words) == IDENTITY_COUNT:
             try:
-                return Reply(unit, key, unpack_identity(words))
+                return WitnessedReply(unit, key, unpack_identity(words))
             except Refusal as refusal:
-                return Reply(unit, key, problem=str(refusal))
+                return WitnessedReply(unit, key, problem=str(refusal))
         if offset != MODBUS_FRAMES_REPLY or number not in BY_NUMBER or len(words) < HEAD:
-            return Reply(unit, key)
+            return WitnessedReply(unit, key)
         written = self._written.get((unit, number))
         if words[0] != tag:
-            return Reply(unit, problem=f"tag must be {tag}, got {words[0]}")
+            return WitnessedReply(unit, problem=f"tag must be {tag}, got {words[0]}")
         if written is not None and written.key == key:
             written.is_read = True
         if words[1]:
-            return Reply(unit, key, refusal=words[1] >> 8)
+            return WitnessedReply(unit, key, refusal=words[1] >> 8)
         reply = reply_of(BY_NUMBER[number].reply, words[HEAD:], unit, key)
         is_part = len(words) < AREA and reply.values is None
-        return Reply(unit, key) if is_part else reply
+        return WitnessedReply(unit, key) if is_part else reply

@@ -31,8 +31,8 @@ from era_haptics.lab.witness.capture import (
     REPLIES,
     AmplifierConfig,
     ReportViolation,
-    Request,
     TimeLimits,
+    WitnessedRequest,
     is_carried_out,
 )
 
@@ -83,7 +83,7 @@ class WatchedAmplifier(ExpectedAmplifier):
     def forget(self, cause: str = "what was not heard") -> None:
         """Treat all as unknown until the next status."""
         super().forget(cause)
-        self.unanswered: list[Request] = []
+        self.unanswered: list[WitnessedRequest] = []
 
     def restarted(self, time: float) -> None:
         """Note a restart: disarmed and silent."""
@@ -102,7 +102,7 @@ class WatchedAmplifier(ExpectedAmplifier):
 
     # requests
 
-    def set_sent(self, request: Request) -> str:
+    def set_sent(self, request: WitnessedRequest) -> str:
         """Note a part of a set that is sent; returns what is wrong with it, or ""."""
         part = request.values
         if part["index"] >= part["parts"]:
@@ -118,7 +118,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         super().part_came(part, when)
         self.fed = fed
 
-    def sent(self, request: Request) -> None:
+    def sent(self, request: WitnessedRequest) -> None:
         """Note a request without a reply, or none yet, that may be carried out soon."""
         if request.name in FEEDING:
             self._fed_before = self.fed[1]
@@ -129,7 +129,7 @@ class WatchedAmplifier(ExpectedAmplifier):
         if request.name in CHANGING and request.has_reply:
             self.unanswered.append(request)
 
-    def replied(self, request: Request, values: Values, end: float) -> None:
+    def replied(self, request: WitnessedRequest, values: Values, end: float) -> None:
         """Apply a request carried out until a time [s], and compare its reply.
 
         A reply that the wire delayed beyond that of a newer request says nothing of now.
@@ -148,7 +148,7 @@ class WatchedAmplifier(ExpectedAmplifier):
             return
         self.granted(name, request.values, values, (request.earliest, end))
 
-    def refused(self, request: Request, code: int, time: float) -> None:
+    def refused(self, request: WitnessedRequest, code: int, time: float) -> None:
         """Note a refusal; what silences must not be refused, nor a commit of what is staged."""
         if request.problem:  # which must be refused
             return
@@ -283,7 +283,7 @@ Expected = tuple[str, AmplifierSession, Callable[[], bool]]
 """A rule, of which amplifier, and whether it is kept at a time."""
 
 
-class Deadlines:
+class RuleDeadlines:
     """Rules for a host, each to be kept by a time [s]; delays of this program defer it."""
 
     def __init__(self) -> None:
@@ -409,7 +409,11 @@ class HostRules:
     """The rules for hosts by what passes on the wires, over all amplifiers by name."""
 
     def __init__(
-        self, sessions: Mapping[str, AmplifierSession], *, times: TimeLimits, deadlines: Deadlines
+        self,
+        sessions: Mapping[str, AmplifierSession],
+        *,
+        times: TimeLimits,
+        deadlines: RuleDeadlines,
     ) -> None:
         self._sessions = sessions
         self._deadlines = deadlines
@@ -423,7 +427,9 @@ class HostRules:
 
     # frames
 
-    def is_preempting(self, session: AmplifierSession, time: float, request: Request) -> bool:
+    def is_preempting(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> bool:
         """Whether a request may come before a reply that is pending on its wire.
 
         It silences, or reads whether a stop has, also one that a disarm's reading has confirmed.
@@ -437,8 +443,8 @@ class HostRules:
     def check_order(
         self,
         session: AmplifierSession,
-        request: Request,
-        pending: Collection[Request],
+        request: WitnessedRequest,
+        pending: Collection[WitnessedRequest],
         preempted_by: int,
     ) -> None:
         """Check that no reply is pending that a request must wait for.
@@ -462,7 +468,9 @@ class HostRules:
                     f"{each.name}, whose reply is pending",
                 )
 
-    def check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def check_request(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         """Check a request to one amplifier; a broadcast is checked for each."""
         layers: Sequence[LayerSet] | None = None
         match request.name:
@@ -481,7 +489,9 @@ class HostRules:
                 self._check_vibrating(session, time, layers)
         self._remember(session, time, request, layers)
 
-    def request_granted(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def request_granted(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         """Note that a request was not refused."""
         match request.name:
             case "Hello":
@@ -512,7 +522,9 @@ class HostRules:
 
     # rules
 
-    def _check_feeding(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def _check_feeding(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         """Nothing feeds after a stop, or beside another host's session."""
         name = request.name
         if name == "Arm" and session.is_disturbed(time):
@@ -575,7 +587,7 @@ class HostRules:
         self,
         session: AmplifierSession,
         time: float,
-        request: Request,
+        request: WitnessedRequest,
         layers: Sequence[LayerSet] | None,
     ) -> None:
         name, values = request.name, request.values

@@ -18,20 +18,20 @@ from era_haptics.lab.witness.capture import (
     Direction,
     Message,
     Notice,
-    Reply,
-    Report,
-    Request,
+    RuleViolation,
     SerialDecoder,
     TimeLimits,
-    Violation,
     WitnessConfig,
+    WitnessedReply,
+    WitnessedRequest,
+    WitnessReport,
     capture_line,
 )
 from era_haptics.lab.witness.decoders import CanDecoder, ModbusDecoder
 from era_haptics.lab.witness.host_rules import (
     AmplifierSession,
-    Deadlines,
     HostRules,
+    RuleDeadlines,
     WatchedAmplifier,
     check_sums,
 )
@@ -65,8 +65,8 @@ class WatchedWire:
         *,
         host: HostRules,
         times: TimeLimits,
-        deadlines: Deadlines,
-        report: Report,
+        deadlines: RuleDeadlines,
+        report: WitnessReport,
     ) -> None:
         self.name = name
         self.sessions = dict(sessions)
@@ -75,7 +75,7 @@ class WatchedWire:
         self._host, self._times, self._deadlines, self._report = host, times, deadlines, report
         self.started_at: dict[Direction, float] = {}
         """When [s] partial frames began."""
-        self._pending: dict[Hashable, Request] = {}  # by key of the reply
+        self._pending: dict[Hashable, WitnessedRequest] = {}  # by key of the reply
         self._recent: deque[tuple[float, bytes]] = deque(maxlen=_COPIES)  # of the host, and when
         self._replied: deque[Hashable] = deque(maxlen=_COPIES)
         self._number = self._preempted_by = 0  # of the last request, and of one that preempts
@@ -178,7 +178,7 @@ class WatchedWire:
         self._recent.append((time, raw))
         if isinstance(message, Notice):
             self._noticed(time, message)
-        if not isinstance(message, Request):
+        if not isinstance(message, WitnessedRequest):
             return
         self._number += 1
         started_at = min(started_at, message.started_at)
@@ -204,7 +204,9 @@ class WatchedWire:
             if message.key is None:
                 self._move(session, message)
 
-    def _check_request(self, session: AmplifierSession, time: float, request: Request) -> None:
+    def _check_request(
+        self, session: AmplifierSession, time: float, request: WitnessedRequest
+    ) -> None:
         problem = request.problem
         if request.name == "Set" and not problem:
             problem = session.amplifier.set_sent(request)
@@ -248,7 +250,7 @@ class WatchedWire:
         """Process a frame of an amplifier."""
         session = self.sessions.get(message.address)
         match message:
-            case Reply() if session is not None:
+            case WitnessedReply() if session is not None:
                 self._process_reply(session, time, message)
             case Notice(what="boot") if session is not None:
                 if session.amplifier.is_enabled:
@@ -259,7 +261,7 @@ class WatchedWire:
             case Notice():
                 self._noticed(time, message)
 
-    def _process_reply(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+    def _process_reply(self, session: AmplifierSession, time: float, reply: WitnessedReply) -> None:
         request = self._pending.pop(reply.key, None)
         if request is None:
             self._check_unexpected(session, time, reply)
@@ -281,7 +283,11 @@ class WatchedWire:
             self._granted(session, time, request, reply)
 
     def _granted(
-        self, session: AmplifierSession, time: float, request: Request, reply: Reply
+        self,
+        session: AmplifierSession,
+        time: float,
+        request: WitnessedRequest,
+        reply: WitnessedReply,
     ) -> None:
         amplifier, values = session.amplifier, reply.values or {}
         if request.name in _CONSTANT:
@@ -300,14 +306,16 @@ class WatchedWire:
             check_sums(session, request.earliest)
         self._move(session, request)
 
-    def _move(self, session: AmplifierSession, request: Request) -> None:
+    def _move(self, session: AmplifierSession, request: WitnessedRequest) -> None:
         """Follow an amplifier to the address that it is set to, by its serial number."""
         known = session.constants.get(HELLO, {}).get("serial_number")
         if request.name == "SetAddress" and request.values["serial_number"] == known:
             others = {at: one for at, one in self.sessions.items() if one is not session}
             self.sessions = {**others, request.values["address"]: session}
 
-    def _check_unexpected(self, session: AmplifierSession, time: float, reply: Reply) -> None:
+    def _check_unexpected(
+        self, session: AmplifierSession, time: float, reply: WitnessedReply
+    ) -> None:
         is_new = reply.key not in self._replied
         if reply.key is None:
             is_new = not self.is_disturbed(time)
@@ -333,13 +341,13 @@ class Witness:
         rules: type[HostRules] = HostRules,
     ) -> None:
         self._config = config
-        self._report = Report()
+        self._report = WitnessReport()
         self._record = record
         self._now = -math.inf
         self.frames = 0
         self._sessions = {name: self._session(name) for name in self._config.amplifiers}
         times = self._config.times
-        self._deadlines = Deadlines()
+        self._deadlines = RuleDeadlines()
         self._host = rules(self._sessions, times=times, deadlines=self._deadlines)
         self._wires = {
             wire: WatchedWire(
@@ -398,7 +406,7 @@ class Witness:
         self._advance(time)
         self._wires[link].closed(time)
 
-    def finish(self, time: float | None = None) -> list[Violation]:
+    def finish(self, time: float | None = None) -> list[RuleViolation]:
         """The violations in order; time [s]: end of the observation."""
         if time is not None:
             self._advance(time)

@@ -59,7 +59,7 @@ from several_fingers import (
     playable,
     table,
 )
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time
 
 COURSES = courses(Path(__file__).with_name("courses.yaml"))
@@ -620,7 +620,7 @@ async def test_controller_refuses_amplifiers_that_do_not_fit_the_rig() -> None:
 @in_virtual_time
 async def test_open_refuses_a_table_without_playable_frequencies() -> None:
     """With the bands of amplifier and table; nothing stays open."""
-    table, wire = small_table(), Wire("serial")
+    table, wire = small_table(), SimulatedWire("serial")
     given: dict[str, Any] = {"capabilities": {"frequency_min": 8000}, "timing": Timing(table)}
     async with Chain.on(wire, small_problem().rig, table, **given) as chain:
         with pytest.raises(InputError, match=r"60 to 250 Hz.*400-500"):

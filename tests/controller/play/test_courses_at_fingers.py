@@ -38,7 +38,7 @@ from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
 from several_fingers import table as several_fingers_table
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time, run_virtual
 
 SWELL = Pattern(1.5, ((0.0, 0.3), (0.7, 1.0), (1.5, 0.2)), ((0.0, 0.4),))
@@ -117,7 +117,7 @@ async def test_three_fingers_feel_three_files_apart() -> None:
         elsewhere=None,
     )
     async with Fingers.armed(
-        Wire("serial", speed=921_600, unpluggable=True),
+        SimulatedWire("serial", speed=921_600, unpluggable=True),
         load_rig(Path(__file__).parents[3] / "examples" / "eight_eras.yaml"),
         eight(),
         intent_source=EffectPlayer(layout),
@@ -213,7 +213,7 @@ class Program:
             {f"e{n}": each.for_table(chosen.frequencies) for n, each in enumerate(self.effects)},
             elsewhere=None,
         )
-        wire = Wire("serial", speed=921_600, unpluggable=True)
+        wire = SimulatedWire("serial", speed=921_600, unpluggable=True)
         source, timing = EffectPlayer(layout), Timing(chosen)
         async with Chain.armed(
             wire, plate, chosen, intent_source=source, timing=timing, capabilities={"layers": 8}

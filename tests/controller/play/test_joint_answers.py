@@ -54,11 +54,11 @@ from real_wires import on_two_amplifiers
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, chosen_for, fingers_on, playable
 from several_fingers import table as paper_table
 from several_fingers import table as several_fingers_table
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time, run_virtual
 
-BUS = Wire("serial", speed=921_600, shared=True, line_kind="prompt")
-LINES = Wire("serial", speed=921_600, unpluggable=True)
+BUS = SimulatedWire("serial", speed=921_600, shared=True, line_kind="prompt")
+LINES = SimulatedWire("serial", speed=921_600, unpluggable=True)
 
 
 @dataclass

@@ -69,7 +69,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers
 from sim.amplifier.readings import Crystal, capabilities
-from sim.far_ends.wire_assignment import Wire as WireAssignmentWire
+from sim.far_ends.wire_assignment import SimulatedWire as WireAssignmentWire
 from sim.plant.imperfections import draw_imperfections
 from virtual_lines import in_virtual_time
 

@@ -41,7 +41,7 @@ from drivers.wires.wire import Reply
 from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual
 from virtual_lines import LIMITS as VIRTUAL_LINES_LIMITS
 from virtual_lines import unaltered as virtual_lines_unaltered
@@ -231,7 +231,7 @@ async def test_reply_that_comes_twice_is_not_of_two_amplifiers(wire: str) -> Non
 
 def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
     """Of a request that came twice, and late: each of its replies is of its own moment."""
-    line, far = SerialWire(921_600, sequence=1), Amplifier("a", channels=2)
+    line, far = SerialWire(921_600, sequence=1), SimulatedAmplifier("a", channels=2)
     (asked,) = FrameReader().feed(line.request(1, "GetStatus", {}))
     arrivals = []
     for temperature in (250, 251):
@@ -305,7 +305,7 @@ async def test_ping_that_a_network_delivers_late_is_accounted_for() -> None:
 class Twins:
     """Two amplifiers at each address, which hear and reply at the same time."""
 
-    def __init__(self, line: MemoryLine, others: Mapping[int, Amplifier]) -> None:
+    def __init__(self, line: MemoryLine, others: Mapping[int, SimulatedAmplifier]) -> None:
         self._first = line._end
         self._second = line.kind.far_end(others, line._send)
         line._end = self
@@ -321,7 +321,7 @@ class Twins:
 async def test_second_amplifier_at_an_address_is_told(kind: str) -> None:
     """Both reply to Hello, with their serial numbers; it names the remedy."""
     line = MemoryLine(kind, "a", "b")
-    Twins(line, {2: Amplifier("c", channels=2)})
+    Twins(line, {2: SimulatedAmplifier("c", channels=2)})
     with pytest.raises(LinkError, match="several amplifiers reply at address 2"):
         await line.hosts["b"].open()
     await line.hosts["a"].open()

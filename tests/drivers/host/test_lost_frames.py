@@ -32,7 +32,7 @@ from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words
-from sim.amplifier.simulated_amplifier import Amplifier as FarEnd
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import (
     KINDS,
     Alter,

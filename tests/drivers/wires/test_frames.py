@@ -29,7 +29,7 @@ from drivers.wires.modbus_frames import HEAD
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Arrival, Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
 from real_wires import damage
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual, unaltered
 
@@ -127,7 +127,7 @@ def is_in_range(name: str, arrival: Arrival) -> bool:
     return True
 
 
-class Recorded(Amplifier):
+class Recorded(SimulatedAmplifier):
     """An amplifier whose requests are kept."""
 
     def __init__(self) -> None:
@@ -377,7 +377,7 @@ class Peer:
 
     def __init__(self, *, is_rtu: bool) -> None:
         self.sent: list[bytes] = []
-        self.amplifier = Amplifier("a", channels=4)
+        self.amplifier = SimulatedAmplifier("a", channels=4)
         self.end = ModbusAmplifiers({1: self.amplifier}, self.sent.append, is_rtu=is_rtu)
 
     def reply(self, data: bytes, now: float = 0.0) -> bytes:

@@ -14,7 +14,7 @@ from drivers.protocol.definition import FAULTS, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
 from sim.amplifier.readings import AmplifierClock, Crystal
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 
 PER_SECOND = 214_748_364.8
 
@@ -105,9 +105,9 @@ OFF, *_, ENABLED = list(STATES)[1:5]
 _, REACTION, FAULT = list(STATES)[5:]
 
 
-def armed(*, channels: int = 2) -> Amplifier:
+def armed(*, channels: int = 2) -> SimulatedAmplifier:
     """An amplifier armed by session 7 at time 0, watchdog 0.25 s."""
-    amplifier = Amplifier("a", channels=channels)
+    amplifier = SimulatedAmplifier("a", channels=channels)
     amplifier.handle("Arm", ARM, 0.0)
     return amplifier
 
@@ -123,14 +123,16 @@ def part_of(token: int, *layers: LayerSet, now: bool = True) -> Values:
     return part
 
 
-def play(amplifier: Amplifier, token: int, at: float, *commands: Command, **layer: int) -> Values:
+def play(
+    amplifier: SimulatedAmplifier, token: int, at: float, *commands: Command, **layer: int
+) -> Values:
     """Play commands in a layer at once, with a ramp of 20 ms."""
     number = layer.pop("layer", 0)
     one = LayerSet(number, layer.pop("ramp", 20), layer.pop("valid_for", 0), commands)
     return amplifier.handle("Set", part_of(token, one), at)
 
 
-def levels(amplifier: Amplifier, at: float) -> list[int]:
+def levels(amplifier: SimulatedAmplifier, at: float) -> list[int]:
     """Levels of the status at a time, in 1e-4."""
     return list(amplifier.handle("GetStatus", {}, at)["levels"])
 
@@ -152,7 +154,7 @@ def test_heat_derates_and_then_trips() -> None:
 
 def test_temperature_follows_the_mean_square_level() -> None:
     """Half level on both channels: a quarter of 30 K, 1 - 1/e of it after 120 s."""
-    amplifier = Amplifier("a", channels=2)
+    amplifier = SimulatedAmplifier("a", channels=2)
     amplifier.handle("Arm", {"session": 7, "watchdog": 2000, "shift": 0}, 0.0)
     play(amplifier, 1, 0.0, tone(0), tone(1), ramp=0)
     for second in range(1, 121):
@@ -201,12 +203,12 @@ def test_high_voltage_is_on_while_armed_and_discharges() -> None:
     assert measured["channel_current"] == pytest.approx(math.pi * 100 * voltage * 1e-3, abs=1)
     amplifier.handle("Disarm", {"ramp": 0}, 0.1)
     assert amplifier.handle("GetStatus", {}, 0.12)["high_voltage"] == round(1800 / math.e)
-    assert Amplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["high_voltage"] == 0
+    assert SimulatedAmplifier("b", channels=1).handle("Stop", {"ramp": 5}, 0.0)["high_voltage"] == 0
 
 
 def test_rate_is_of_an_armed_session() -> None:
     """100 ppm for a second are 21 475 steps of 2^32 in 20 s; disarmed there is no rate."""
-    amplifier = Amplifier("a", channels=2)
+    amplifier = SimulatedAmplifier("a", channels=2)
     ping, shown = {"session": 7, "rate": 1000}, []
     amplifier.handle("Ping", ping, 0.0)
     amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 1.0)
@@ -231,7 +233,7 @@ def test_watchdog_ends_the_rate_and_counts_real_time() -> None:
 
 def test_shift_is_of_a_new_session() -> None:
     """3 steps of the high word, once, though Arm is repeated; a restart shows 0."""
-    amplifier = Amplifier("a", channels=2)
+    amplifier = SimulatedAmplifier("a", channels=2)
     for now in (0.0, 0.1):
         status = amplifier.handle("Arm", {**ARM, "shift": 3}, now)
     assert status["clock"] == 3 * 65536 + round(0.1 * 2**32 / 20)
@@ -239,7 +241,9 @@ def test_shift_is_of_a_new_session() -> None:
     assert amplifier.handle("GetStatus", {}, 5.0)["clock"] == 0
 
 
-def play_from(amplifier: Amplifier, token: int, level: int, at: float, moment: int) -> None:
+def play_from(
+    amplifier: SimulatedAmplifier, token: int, level: int, at: float, moment: int
+) -> None:
     """Stage a set of channel 0 at a time [s], and commit it for a high word of the clock."""
     one = LayerSet(0, 0, 0, (tone(level=level),))
     amplifier.handle("Set", part_of(token, one, now=False), at)
@@ -258,7 +262,7 @@ def test_moments_beyond_half_a_second_are_now(moment: int, waits: bool) -> None:
 
 def test_ping_in_the_very_moment_does_not_put_it_off_by_a_turn() -> None:
     """In the last floating-point number before each of 50 moments, by a rate for each."""
-    amplifier = Amplifier("a", channels=2)
+    amplifier = SimulatedAmplifier("a", channels=2)
     amplifier.handle("Arm", {**ARM, "watchdog": 2000}, 0.0)
     amplifier.clock = AmplifierClock(Crystal(error=4e-5, warm_up=1e-6))
     for number in range(1, 51):

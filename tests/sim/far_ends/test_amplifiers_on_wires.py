@@ -23,11 +23,11 @@ from real_wires import (
     rig_on_wire,
 )
 from registry import threads
-from sim.far_ends.wire_assignment import Wire, assign_wires, choose_lines, links_of
+from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
 from sim.faults import FaultKind, FaultWindow
 from virtual_lines import VirtualLoop, in_virtual_time
 
-DEFAULTS = Wire("serial")
+DEFAULTS = SimulatedWire("serial")
 URLS = {
     "a": "serial:///dev/ttyUSB0?baud=115200&address=3",
     "b": "serial:///dev/ttyUSB0?address=4",
@@ -67,14 +67,14 @@ def test_terminals_are_placed_where_urls_outside_dev_have_them() -> None:
 
 def test_assign_wires_prefers_own_option_to_common_to_url() -> None:
     """The result is in the order of the rig."""
-    modbus = Wire("modbus-tcp", port=1502)
+    modbus = SimulatedWire("modbus-tcp", port=1502)
     assigned = assign_wires(
         URLS, common=modbus, options=["c=slcan", "a=socketcand:7"], defaults=DEFAULTS
     )
     assert list(assigned) == list(URLS)
-    assert assigned["a"] == Wire("socketcand", port=7)
+    assert assigned["a"] == SimulatedWire("socketcand", port=7)
     assert assigned["b"] == modbus
-    assert assigned["c"] == Wire("slcan")
+    assert assigned["c"] == SimulatedWire("slcan")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ SPEEDS = {"serial": 921_600, "modbus-rtu": 115_200, "slcan": 500_000, "socketcan
 
 
 @pytest.fixture(params=WIRES)
-def wire(request: pytest.FixtureRequest) -> Wire:
+def wire(request: pytest.FixtureRequest) -> SimulatedWire:
     """Each wire, in its own time where it has one."""
     found = WIRES[request.param]
     return replace(found, speed=SPEEDS.get(found.kind))
@@ -173,7 +173,7 @@ def wire(request: pytest.FixtureRequest) -> Wire:
 
 @in_virtual_time
 async def test_broadcast_commit_starts_all_at_one_moment(
-    coarse_rig: Rig, wire: Wire, monkeypatch: pytest.MonkeyPatch
+    coarse_rig: Rig, wire: SimulatedWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On one line by their own clocks, however long the simulation of each takes; not over TCP.
 
@@ -232,7 +232,7 @@ async def test_node_that_has_restarted_is_mute_until_it_is_identified(
     ],
 )
 def test_fault_silences_and_its_amplifier_is_found_again(
-    coarse_rig: Rig, wire: Wire, kind: FaultKind, fault: str
+    coarse_rig: Rig, wire: SimulatedWire, kind: FaultKind, fault: str
 ) -> None:
     """A second of it: silent in time; the host stops, and finds what has happened afterwards."""
 
@@ -295,7 +295,7 @@ async def test_frames_take_their_time_on_a_slow_line(coarse_rig: Rig, kind: str,
 
     Request and reply have 19 words and 8 to 9 bytes more each way on a serial line.
     """
-    async with rig_on_wire(coarse_rig, Wire(kind, speed=9600), watchdog=2.0) as rig:
+    async with rig_on_wire(coarse_rig, SimulatedWire(kind, speed=9600), watchdog=2.0) as rig:
         main = rig.group.amplifiers["main"]
         begin = threads.now()
         await main.read_status()

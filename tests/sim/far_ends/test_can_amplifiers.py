@@ -29,7 +29,7 @@ from drivers.wires.serial_frames import Frame, FrameReader, encode_frame
 from model.rig.rig import Rig
 from real_wires import MASTERS, drive, make_bench
 from registry import threads
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers, CanBus, SlcanAdapter, SocketcandClient
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
@@ -40,7 +40,7 @@ from sim.transport.far_end import FarEnd, TcpEnd, TerminalEnd, make_terminal
 @asynccontextmanager
 async def served(line: str) -> AsyncIterator[str]:
     """An amplifier of four channels as unit 1 on a pseudo-terminal or a TCP port; its URL."""
-    amplifiers = {1: Amplifier("a", channels=4)}
+    amplifiers = {1: SimulatedAmplifier("a", channels=4)}
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         end = ModbusAmplifiers(amplifiers, writer.write, is_rtu=False)
@@ -197,7 +197,7 @@ class OnALine:
     """An amplifier on a serial line; state by the word of its status."""
 
     def __init__(self) -> None:
-        self.amplifier = Amplifier("a", channels=2)
+        self.amplifier = SimulatedAmplifier("a", channels=2)
         self.replies: list[Frame] = []
         reader = FrameReader()
         self.end = SerialAmplifiers(
@@ -260,7 +260,7 @@ class Bus:
     """Amplifiers of one channel from node 1 on, and the frames that they have sent."""
 
     def __init__(self, *names: str) -> None:
-        self.far = [Amplifier(name, channels=1) for name in names]
+        self.far = [SimulatedAmplifier(name, channels=1) for name in names]
         self.sent: list[tuple[int, str]] = []
         self.end = CanAmplifiers(dict(enumerate(self.far, 1)), self._note)
         self.end.start(0.0)

@@ -40,10 +40,10 @@ from plates import FINGERTIP, lock_in
 from plates import motion_of as sampled
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
-from sim.plant.excited_plate import Playback as ExcitedPlatePlayback
+from sim.plant.excited_plate import PlatePlayback as ExcitedPlatePlayback
 from sim.plant.excited_plate import Vibration
 from sim.plant.excited_plate import play as excited_plate_play
-from sim.plant.fingers import Fingers, Record, measure_vibration
+from sim.plant.fingers import FingerRecord, Fingers, measure_vibration
 from sim.plant.imperfections import (
     ChannelErrors,
     Imperfections,
@@ -357,12 +357,13 @@ def test_feel_separates_driven_frequencies() -> None:
         + ringing[:, None]
     )
     felt = measure_vibration(
-        Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples), [110.0, 170.0]
+        FingerRecord(np.zeros((2, 2)), np.full(2, 0.5), times, samples), [110.0, 170.0]
     )
     np.testing.assert_allclose(felt.amplitude, [first, second], atol=0.03)
     np.testing.assert_allclose(felt.peak, np.abs(samples).max(axis=0), rtol=0.005)
     clean = measure_vibration(
-        Record(np.zeros((2, 2)), np.full(2, 0.5), times, samples - ringing[:, None]), [110.0, 170.0]
+        FingerRecord(np.zeros((2, 2)), np.full(2, 0.5), times, samples - ringing[:, None]),
+        [110.0, 170.0],
     )
     np.testing.assert_allclose(clean.amplitude, [first, second], atol=1e-7)
 
@@ -464,10 +465,10 @@ def test_playback_measures_of_several_targets() -> None:
     times = np.arange(1, 10_001) / 10_000
     points = np.zeros((2, 2))
 
-    def record(*amplitudes: float) -> Record:
+    def record(*amplitudes: float) -> FingerRecord:
         wave = np.sin(2 * np.pi * 100 * times)
         early = np.where(times <= 0.1, 0.5, 1.0)  # half as strong while it starts
-        return Record(
+        return FingerRecord(
             points, np.full(2, 0.5), times, (wave * early)[:, None] * np.array(amplitudes)
         )
 
@@ -531,7 +532,7 @@ def test_playback_reads_steady_measures_at_the_end() -> None:
     """Ten times as much until a quarter of a second before the end does not count."""
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
-    record = Record(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
+    record = FingerRecord(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
     playback = ExcitedPlatePlayback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
     expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
     assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

@@ -37,9 +37,9 @@ from sim.soft_amp.engine import (
     Counters,
     JackCalls,
     Law,
-    Place,
     Protocol,
-    Settings,
+    SoftAmplifierLine,
+    SoftAmplifierSettings,
     compile_engine,
     library,
     start_engine,
@@ -182,7 +182,7 @@ def play(results: Connection) -> None:
     jack, counters = MadeUpJack(), Counters()
     host, terminal = socket.socketpair()
     terminal.setblocking(False)
-    settings = Settings("jack", 2, Protocol.SERIAL, "S")
+    settings = SoftAmplifierSettings("jack", 2, Protocol.SERIAL, "S")
     start_engine(
         settings, rate=SOFT_AMP_CLOCK_RATE, counters=counters, is_recovering=False,
         terminal=terminal.fileno(), listening=-1, parent=-1,
@@ -239,7 +239,7 @@ def test_clock_is_that_at_the_output() -> None:
         assert behind == pytest.approx(384 / SOFT_AMP_CLOCK_RATE - 70e-6, abs=TOLERANCE)
 
 
-def settings(**changed: object) -> Settings:
+def settings(**changed: object) -> SoftAmplifierSettings:
     """Settings of four channels, changed."""
     values: dict[str, object] = {
         "device": "jack",
@@ -247,7 +247,7 @@ def settings(**changed: object) -> Settings:
         "protocol": Protocol.SERIAL,
         "serial_number": "S",
     }
-    return Settings(**(values | changed))  # type: ignore[arg-type]
+    return SoftAmplifierSettings(**(values | changed))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -270,12 +270,12 @@ def test_settings_out_of_range_are_refused(changed: dict[str, object], key: str)
 def test_more_than_16_channels_are_two_amplifiers() -> None:
     """At addresses 1 and 2 of a serial line, units 1 and 2 of Modbus; settings pass as text."""
     given = settings(channels=18, law=Law.SQUARE, limit=0.9)
-    assert Settings(**json.loads(json.dumps(asdict(given)))) == given
-    assert Place("serial:///x").urls(given.amplifiers, protocol=Protocol.SERIAL) == [
+    assert SoftAmplifierSettings(**json.loads(json.dumps(asdict(given)))) == given
+    assert SoftAmplifierLine("serial:///x").urls(given.amplifiers, protocol=Protocol.SERIAL) == [
         "serial:///x",
         "serial:///x?address=2",
     ]
-    urls = Place("modbus+tcp://h:1").urls(given.amplifiers, protocol=Protocol.MODBUS)
+    urls = SoftAmplifierLine("modbus+tcp://h:1").urls(given.amplifiers, protocol=Protocol.MODBUS)
     assert urls == ["modbus+tcp://h:1/1", "modbus+tcp://h:1/2"]
 
 
@@ -383,7 +383,9 @@ def test_stream_that_does_not_start_is_closed(monkeypatch: pytest.MonkeyPatch) -
 
 
 SOFT_AMP_SOUND_CHANNELS = 3
-SETTINGS = Settings(device="jack:card", channels=2, protocol=Protocol.SERIAL, serial_number="S")
+SETTINGS = SoftAmplifierSettings(
+    device="jack:card", channels=2, protocol=Protocol.SERIAL, serial_number="S"
+)
 SILENCE = 0.05  # s of samples; what the command promises once it is killed
 
 

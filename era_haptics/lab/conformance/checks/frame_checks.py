@@ -79,9 +79,9 @@ from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
     GATEWAY_TIMEOUT,
     QUIET,
-    Answer,
-    Client,
-    Heard,
+    HeardMessage,
+    JudgeClient,
+    RequestOutcome,
     When,
     altered,
     expect,
@@ -105,7 +105,7 @@ _DEVICE_TYPE = 0x1000
 _SETTLING = 0.005  # s; after a command of network management
 
 
-class CanClient(Client):
+class CanClient(JudgeClient):
     """A bus; number: of the last request. frames: all of the node."""
 
     kind = "can"
@@ -135,9 +135,9 @@ class CanClient(Client):
             before = self._counters.unexpected_frames
             message = (self._events if is_event else self._replies).add(frame.data, now)
             if message is not None:
-                self.take(Heard(now, *message), is_event=is_event)
+                self.take(HeardMessage(now, *message), is_event=is_event)
             elif self._counters.unexpected_frames > before:  # again, or an older one
-                self.take(Heard(now, frame.data[0], frame.data[2], ()))
+                self.take(HeardMessage(now, frame.data[0], frame.data[2], ()))
         return own
 
     def question(self, address: int) -> bytes:
@@ -166,7 +166,7 @@ class CanClient(Client):
         answer = await self.exchange(HELLO, ())
         return read_as("identity", IDENTITY.unpack, answer.words, is_strict=False)
 
-    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
         """Send a message and await its reply."""
         sequence, sent = self.next_number(), threads.now()
         self.put(REQUEST + self.address, *segments(sequence, number, words))
@@ -174,7 +174,7 @@ class CanClient(Client):
         if heard.type == NAK:
             return self.refusal(sent, heard.at, number, heard.words)
         expect_equal(heard.type, number, "type of a reply")
-        return Answer("", None, heard.words, When(sent, heard.at))
+        return RequestOutcome("", None, heard.words, When(sent, heard.at))
 
     def request(self, number: int, words: Sequence[int], *, to: int | None = None) -> bytes:
         """Return the frames of a request."""
@@ -284,7 +284,7 @@ READ_HOLDING = 3
 _PRESENT = tuple(MESSAGES[name].number for name in PRESENT)
 
 
-class ModbusClient(Client):
+class ModbusClient(JudgeClient):
     """A line or a connection; number: of the last transaction and tag."""
 
     has_events = False
@@ -308,7 +308,7 @@ class ModbusClient(Client):
                 self.has_gateway, self.timeout = True, GATEWAY_TIMEOUT
                 continue
             kind, frame = (adu.pdu or b"\0")[0], (adu.unit, adu.pdu or adu.raw)
-            self.take(Heard(threads.now(), adu.transaction, kind, (), frame))
+            self.take(HeardMessage(threads.now(), adu.transaction, kind, (), frame))
             self._others |= set() if is_own else {adu.unit}
         return data
 
@@ -345,7 +345,7 @@ class ModbusClient(Client):
         return response, When(sent, heard.at)
 
     async def read(self, first: int, count: int, *, function: int = READ) -> tuple[int, ...]:
-        """Read registers; Violation for an exception."""
+        """Read registers; ContractViolation for an exception."""
         pdu = read_pdu(first, count, function=function)
         response, _ = await self.transact(pdu)
         what = f"function of the response to a read of {count} registers from {first}"
@@ -358,7 +358,7 @@ class ModbusClient(Client):
         expect_equal(registers[0], 0, "tag of the identity")
         return read_as("identity", unpack_identity, registers)
 
-    async def exchange(self, number: int, words: Sequence[int]) -> Answer:
+    async def exchange(self, number: int, words: Sequence[int]) -> RequestOutcome:
         """Write a message, then read its reply; one that shows the present is read alone."""
         tag, when = None, None
         if number not in _PRESENT or words:
@@ -366,7 +366,7 @@ class ModbusClient(Client):
             response, when = await self.transact(self.write_of(number, words))
             if response[0] & EXCEPTION:
                 code = EXCEPTIONS.get(response[1], f"exception {response[1]}")
-                return Answer(code, None, (), when)
+                return RequestOutcome(code, None, (), when)
         sent = threads.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
         shown, result, *reply = await self.read(BOX * number + MODBUS_FRAMES_REPLY, count)
@@ -375,7 +375,7 @@ class ModbusClient(Client):
             expect_equal(shown, tag, f"tag of the reply to {message_name(number)}")
         if result:
             return self.refusal(*when, number, (number, *divmod(result, 256)))
-        return Answer("", None, tuple(reply), when)
+        return RequestOutcome("", None, tuple(reply), when)
 
     async def part(self, number: int, words: Sequence[int]) -> None:
         """Write a message, whose reply area is not read."""
@@ -401,7 +401,7 @@ class ModbusClient(Client):
             for at in (-2, -1, -4):
                 yield f"a wrong byte {at}", altered(frame, at)
 
-    async def send(self, data: bytes, *before: bytes) -> list[Heard]:
+    async def send(self, data: bytes, *before: bytes) -> list[HeardMessage]:
         """Send frames, data the last; return what is heard until a reply must have come."""
         self._reader.end()
         heard = await super().send(data, *before)
@@ -600,7 +600,7 @@ _SEQUENCES = 1 << 16
 _SEQUENCE_AT, _CRC_SIZE = 3, 4
 
 
-class SerialClient(Client):
+class SerialClient(JudgeClient):
     """A serial line; sequence: number of the last request."""
 
     kind = "serial"
@@ -619,7 +619,7 @@ class SerialClient(Client):
                 self.invalid.append(frame.payload)
                 continue
             words = () if is_text else unpack_words(frame.payload)
-            heard = Heard(threads.now(), frame.sequence, frame.kind, words, frame)
+            heard = HeardMessage(threads.now(), frame.sequence, frame.kind, words, frame)
             self.take(heard, is_event=frame.kind == EVENT)
             self._others |= {frame.address} - {self.address}
         return data
@@ -649,11 +649,11 @@ class SerialClient(Client):
 
     async def exchange(
         self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION
-    ) -> Answer:
+    ) -> RequestOutcome:
         """Send a message, with bytes behind its words, under a version; await its reply."""
         sent = threads.now()
         heard = await self._replied(number, pack_words(words) + behind, version)
-        answer = Answer("", None, heard.words, When(sent, heard.at))
+        answer = RequestOutcome("", None, heard.words, When(sent, heard.at))
         if heard.type == NAK | SERIAL_FRAMES_REPLY:
             answer = self.refusal(sent, heard.at, number, heard.words)
         is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
@@ -665,7 +665,7 @@ class SerialClient(Client):
         expect_equal(seen, required, f"type, version of the reply to {message_name(number)}")
         return answer
 
-    async def _replied(self, number: int, payload: bytes, version: int) -> Heard:
+    async def _replied(self, number: int, payload: bytes, version: int) -> HeardMessage:
         self.write(self.frame(number, payload, version=version))
         sequence = self.sequence
         heard = await self.replied(

@@ -28,11 +28,11 @@ from drivers.protocol.records import Record, Values
 from drivers.protocol.sets import Command, Envelope
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
-    Answer,
+    ContractViolation,
+    RequestOutcome,
     Row,
     Rows,
-    Untimed,
-    Violation,
+    UntimedClock,
     expect,
     expect_equal,
     expect_one_of,
@@ -457,7 +457,9 @@ def _require_known(subject: Subject) -> None:
     require(subject.can["clock_error"] != CLOCK_UNKNOWN, "it states no clock_error")
 
 
-async def _expect_steady(subject: Subject, otherwise: type[Violation] = Violation) -> None:
+async def _expect_steady(
+    subject: Subject, otherwise: type[ContractViolation] = ContractViolation
+) -> None:
     """Require that its clock was where it must be by all that was read of it."""
     await subject.request("GetStatus")
     if (wrong := f"{1e3 * subject.dating.error:.3g} ms") != "0 ms":
@@ -465,7 +467,7 @@ async def _expect_steady(subject: Subject, otherwise: type[Violation] = Violatio
         raise otherwise(what, expected="0 ms", seen=wrong)
 
 
-async def _read(subject: Subject, otherwise: type[Violation] = Violation) -> None:
+async def _read(subject: Subject, otherwise: type[ContractViolation] = ContractViolation) -> None:
     low = set()
     for at in range(_READINGS):
         low.add((await subject.status())["clock"] % HIGH_STEPS)
@@ -479,7 +481,7 @@ async def _read(subject: Subject, otherwise: type[Violation] = Violation) -> Non
 async def clock_goes_on(subject: Subject) -> None:
     """It shows a clock that goes on by the time between two statuses: all else rests on that."""
     _require_known(subject)
-    await _read(subject, Untimed)
+    await _read(subject, UntimedClock)
 
 
 @driving(_CLOCKS_PLACE)
@@ -600,7 +602,7 @@ def _request(number: int, *frequencies: int) -> Values:
     return {"reading": number, "window": _WINDOW, **tones}
 
 
-async def _start(subject: Subject, request: Values) -> Answer:
+async def _start(subject: Subject, request: Values) -> RequestOutcome:
     """Begin a reading, which says of which set and when."""
     fed = await subject.ping()
     began = await subject.request("Measure", **request)
@@ -614,7 +616,9 @@ async def _start(subject: Subject, request: Values) -> Answer:
     return began
 
 
-async def _complete(subject: Subject, began: Answer, state: str = "COMPLETE") -> list[Values]:
+async def _complete(
+    subject: Subject, began: RequestOutcome, state: str = "COMPLETE"
+) -> list[Values]:
     """Await the end of a reading at its time; return the values of every sensor."""
     window, is_running = _WINDOW / 1000, True
     while is_running:

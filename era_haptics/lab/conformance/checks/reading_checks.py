@@ -39,11 +39,11 @@ from era_haptics.lab.conformance.checks.frame_checks import (
     can_client,
 )
 from era_haptics.lab.conformance.judge_client import (
-    Armed,
-    Client,
-    Late,
+    AlreadyArmed,
+    ContractViolation,
+    JudgeClient,
     Rows,
-    Violation,
+    TooLate,
     When,
     expect,
     expect_equal,
@@ -68,7 +68,7 @@ _FEATURE_OF = {
 
 
 @reading("protocol.md#messages", greets=True)
-async def identity(client: Client) -> None:
+async def identity(client: JudgeClient) -> None:
     """It says who it is, always the same, and that it speaks version 4."""
     first = await greeted(client)
     for name in ("vendor", "product", "serial_number", "firmware"):
@@ -91,7 +91,7 @@ async def starts_disarmed(subject: Subject) -> None:
     """It is disarmed and silent unless it was armed, and shows what it has only."""
     status = (await subject.request("GetStatus")).values
     if status["state"] == ENABLED:
-        raise Armed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
+        raise AlreadyArmed("state before Arm", expected="disarmed", seen="OPERATION_ENABLED")
     disarmed = [number for number in STATES.values() if number != ENABLED]
     expect_one_of(status["state"], disarmed, "state before Arm")
     is_open = has_flag(status, "interlock_open") and not subject.has("interlock")
@@ -386,11 +386,11 @@ async def addresses(subject: Subject) -> None:
     expect_equal(is_back, True, "whether it replies at its first address again")
 
 
-async def _is_at(client: Client, address: int, *, tries: int = _SURE) -> bool:
+async def _is_at(client: JudgeClient, address: int, *, tries: int = _SURE) -> bool:
     """Whether a Hello to an address has a reply, in a few tries lest this machine is late."""
     client.address = address
     for _ in range(tries):
-        with suppress(Violation, Late):
+        with suppress(ContractViolation, TooLate):
             await client.hello()
             return True
     return False
@@ -415,7 +415,7 @@ async def _exchange(client: CanClient, data: bytes) -> bytes:
         await asyncio.sleep(_POLL)
         if replies := client.data_of("sdo_answer"):
             return replies[0]
-    raise Violation("reply to an SDO", expected="one within 0.5 s", seen="none")
+    raise ContractViolation("reply to an SDO", expected="one within 0.5 s", seen="none")
 
 
 async def _object(

@@ -31,7 +31,7 @@ from drivers.protocol.sets import Command, Envelope, LayerSet, pack_layers
 from era_haptics.lab.conformance.check import driving
 from era_haptics.lab.conformance.judge_client import (
     FULL,
-    Material,
+    PlayableMaterial,
     Rows,
     Send,
     expect_equal,
@@ -279,7 +279,7 @@ _SLOW = 0.03  # s; of a line, for an exchange of the longest messages
 _OLD = "BAD_TOKEN"
 
 
-def set_of(material: Material, room: int) -> list[LayerSet]:
+def set_of(material: PlayableMaterial, room: int) -> list[LayerSet]:
     """Make a set of this many words, or of as many as there can be."""
     channels, max_knots = len(material.channels), material.can["knots"]
     # All but the heads of layers has an even number of words.

@@ -29,7 +29,7 @@ from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks import layout_picture
 from era_haptics.lab.checks.content_check import check_content, kept_shares
 from era_haptics.lab.checks.layout_check import loaded_plate
-from era_haptics.lab.checks.layout_picture import Together, check_together, close_pairs, matrix_of
+from era_haptics.lab.checks.layout_picture import JointTouch, check_together, close_pairs, matrix_of
 from era_haptics.lab.cli import app
 from model.config.fields import Rectangle
 from model.errors import InputError
@@ -119,7 +119,7 @@ def test_places_are_the_worst_of_their_regions() -> None:
 def test_pairs_that_are_felt_as_one_are_named() -> None:
     """Those below 6 dB, the rule's bound of what is mixed, the worst first; none of three."""
     at, worst = (0.0, 0.0), {"ab": 3.2, "ac": 6.0, "bc": -1.0, "abc": -5.0}
-    found = [Together((*names,), (at, at), (db, db), db, ()) for names, db in worst.items()]
+    found = [JointTouch((*names,), (at, at), (db, db), db, ()) for names, db in worst.items()]
     said = close_pairs(found)
     assert "2 of 3 pairs" in said
     assert said.index("b with c -1.0 dB") < said.index("a with b 3.2 dB")

@@ -26,16 +26,22 @@ from drivers.wires.can_frames import pack_frames, unpack_frames
 from drivers.wires.modbus_frames import framed
 from drivers.wires.serial_frames import FrameReader, encode_frame
 from era_haptics.lab.conformance import judge_client
-from era_haptics.lab.conformance.check import Check, CheckResult, Report, in_words, run_checks
+from era_haptics.lab.conformance.check import (
+    Check,
+    CheckResult,
+    ConformanceReport,
+    in_words,
+    run_checks,
+)
 from era_haptics.lab.conformance.checks import state_checks
 from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
-from era_haptics.lab.conformance.judge_client import Judge, Late, Violation, When, layer
+from era_haptics.lab.conformance.judge_client import ContractViolation, Judge, TooLate, When, layer
 from era_haptics.lab.conformance.subject import Subject
 from long_form import shortly
 from model.rig.rig import Rig
 from registry import threads
 from sim.amplifier.readings import capabilities
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.bench.bench import Bench, keep_time
 from sim.far_ends.serial_amplifiers import SerialAmplifiers
 from virtual_lines import (
@@ -94,14 +100,14 @@ async def test_sensors_on_a_plate_pass(coarse_rig: Rig) -> None:
     """Those at the feet of a rig's actuators, which read what plays."""
     bench = Bench(coarse_rig, now=threads.now())
     (far,) = bench.amplifiers.values()
-    assert isinstance(far, Amplifier)
+    assert isinstance(far, SimulatedAmplifier)
     running = asyncio.ensure_future(keep_time(bench))
     results = await results_of("serial", far, ["sensors", "readings"])
     running.cancel()
     expect_passed(results, set())
 
 
-class _Coarse(Amplifier):
+class _Coarse(SimulatedAmplifier):
     """An amplifier that keeps its own steps, of frequency from its lowest one on, and says so."""
 
     def _play(self, layers: Sequence[LayerSet], token: int, now: float) -> None:
@@ -148,7 +154,7 @@ def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> Non
 @pytest.mark.parametrize("knots", [0, 1])
 def test_amplifier_with_the_least_of_all_passes(knots: int) -> None:
     """One channel and watchdog time, short ramps, and what of its sets such an amplifier has."""
-    far = Amplifier("least", channels=1)
+    far = SimulatedAmplifier("least", channels=1)
     least = {"knots": knots, "ramp_max": 1, "set_words": 512, "layers": 4, "voices": 8}
     times = {"watchdog_min": 500, "watchdog_max": 500, "envelope_step_min": 1000}
     far.capabilities.update(least | times)
@@ -168,7 +174,7 @@ def test_level_below_a_step_is_refused() -> None:
         judged("serial", ["stop"], far=far)
 
 
-class _PlaysOn(Amplifier):
+class _PlaysOn(SimulatedAmplifier):
     """An amplifier that plays on after Stop."""
 
     def _silence(self, moment: float, *, ramp: float) -> None:
@@ -223,7 +229,9 @@ def test_amplifier_that_is_not_identified_fails_once(
     assert re.fullmatch(reason, failed.reason), failed.reason
     after = {(each.result, each.reason) for each in others}
     assert after == {(Result.NOT_RUN, f"{failed.check.name} failed")}
-    assert Report("x", 0.2, tuple(found), 0).to_json()["level"] == 0  # nothing was driven
+    assert (
+        ConformanceReport("x", 0.2, tuple(found), 0).to_json()["level"] == 0
+    )  # nothing was driven
 
 
 def _stall(duration: float) -> None:
@@ -263,8 +271,8 @@ async def test_machine_that_is_always_late_has_no_verdict() -> None:
     )
     line.close()
     assert (late.result, good.result) == ("skipped", "passed")
-    assert isinstance(late.finding, Late)
-    assert Report("x", 0.2, (late, good), 0).overall == "incomplete"
+    assert isinstance(late.finding, TooLate)
+    assert ConformanceReport("x", 0.2, (late, good), 0).overall == "incomplete"
 
 
 @in_virtual_time
@@ -274,7 +282,7 @@ async def test_check_says_that_the_time_of_the_run_is_used_up() -> None:
     line.client.wasted = 20.0
     (late,) = await run_checks([(1, _tried([0.11]))], line.client, level=0.2)
     line.close()
-    assert isinstance(late.finding, Late)
+    assert isinstance(late.finding, TooLate)
     assert late.reason.startswith("no verdict since the time of the run is used up: "), late.reason
 
 
@@ -327,7 +335,7 @@ def obey_late(monkeypatch: pytest.MonkeyPatch, delay: float) -> None:
     monkeypatch.setattr(JudgedLine, "_send", late)
 
 
-class _LongWatchdog(Amplifier):
+class _LongWatchdog(SimulatedAmplifier):
     """An amplifier that takes a watchdog shorter than 120 ms as one of 1.5 s."""
 
     def handle(self, name: str, values: Values, now: float) -> Values:
@@ -342,7 +350,7 @@ def test_shortest_watchdog_is_tried_though_it_cannot_be_fed(
     """One of 100 ms beside replies that take 12 ms: as stated it passes, else it fails."""
     obey_late(monkeypatch, 0.012)
     found = []
-    for kind in (Amplifier, _LongWatchdog):
+    for kind in (SimulatedAmplifier, _LongWatchdog):
         far = kind("short", channels=2)
         far.capabilities.update(watchdog_min=100)
         found += judged("serial", ["watchdog_ranges"], far=far)
@@ -439,7 +447,7 @@ def test_reply_that_is_delivered_late_is_no_violation(
         assert ", but later" in found[0].reason
 
 
-class _Unsteered(Amplifier):
+class _Unsteered(SimulatedAmplifier):
     """An amplifier whose clock ignores the rate of a Ping."""
 
     def handle(self, name: str, values: Values, now: float) -> Values:
@@ -454,7 +462,7 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     monkeypatch.setattr("virtual_lines.DELAY", 0.004)
     found = [
         judged(kind, ["clock_rate"], far=each("steered", channels=4))
-        for each in (Amplifier, _Unsteered)
+        for each in (SimulatedAmplifier, _Unsteered)
     ]
     assert [each.result for (each,) in found] == ["passed", "failed"], found
 
@@ -511,15 +519,17 @@ def _written(far: int, data: bytes) -> None:
 
 def test_report_says_the_worst() -> None:
     """One that failed makes all fail; a violation says what must be, and what was seen."""
-    found = Violation("latch", expected=3, seen=4)
+    found = ContractViolation("latch", expected=3, seen=4)
     assert (str(found), found.seen) == ("latch must be 3, got 4", "latch: 4")
     for empty in ("", set[int](), b""):
-        assert str(Violation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
+        assert (
+            str(ContractViolation("reply", expected=empty, seen=0)) == "reply must be none, got 0"
+        )
     bad = CheckResult(CHECKS[0], 1, Result.FAILED, str(found), found)
     good = CheckResult(state_checks.stop, 2, Result.PASSED)
-    assert Report("x", 0.2, (bad, good), 0).overall == "failed"
-    assert Report("x", 0.2, (good,), 1).overall == "incomplete"
-    report = Report("x", 0.2, (good,), 0)
+    assert ConformanceReport("x", 0.2, (bad, good), 0).overall == "failed"
+    assert ConformanceReport("x", 0.2, (good,), 1).overall == "incomplete"
+    report = ConformanceReport("x", 0.2, (good,), 0)
     assert (report.overall, report.to_json()["passed"]) == ("passed", 1)
     assert "driven at up to 20%" in report.summary
 
@@ -567,7 +577,7 @@ def test_fault_may_come_while_a_status_is_on_its_way(age: int) -> None:
     judge.check({**ARMED, "watchdog_left": 5}, When(0.09, 0.105))
     judge.check({**OFF, "state": 7, "fault": 1, "latch": 8}, When(0.105, 0.106))
     faults = {"faults": [{"fault": 1, "channel": 255, "age": age}]}
-    with nullcontext() if age == 70 else pytest.raises(Violation, match="listed faults"):
+    with nullcontext() if age == 70 else pytest.raises(ContractViolation, match="listed faults"):
         judge.granted("GetFaults", {}, faults, When(0.17, 0.17))
 
 
@@ -598,7 +608,7 @@ def test_levels_are_those_of_the_page(moment: float, level: float) -> None:
     late = 0.25 * (1 - math.cos(math.pi * (moment - 0.0018) / 0.1)) if moment < 0.1 else level
     expected_by(moment, late)
     for wrong in (0.02, -0.03):
-        with pytest.raises(Violation, match="level of channel 0"):
+        with pytest.raises(ContractViolation, match="level of channel 0"):
             expected_by(moment, level + wrong)
 
 
@@ -670,7 +680,7 @@ def test_one_bad_capability_is_one_failure() -> None:
     assert all("envelope_step_max" in results[name].reason for name in not_run)
 
 
-class _OtherClock(Amplifier):
+class _OtherClock(SimulatedAmplifier):
     """An amplifier that shows another clock than its own."""
 
     def __init__(self, other: Callable[[int], int]) -> None:
@@ -736,7 +746,7 @@ def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.Monk
     monkeypatch.setattr(JudgedLine, "_send", sent)
     results = judged(kind)
     assert [each.number for each in results] == [number for number, _ in of_kind(kind)]
-    assert Report("x", 0.2, tuple(results), 0).overall == "failed"
+    assert ConformanceReport("x", 0.2, tuple(results), 0).overall == "failed"
     assert sum(each.seconds for each in results) < 2 * MINUTE
     if share < 0.1:
         assert [each.result for each in results].count(Result.PASSED) > 10
@@ -761,5 +771,5 @@ async def test_busy_machine_has_its_verdicts(
     stalling.cancel()
     bad = [(each.check.name, each.reason) for each in results if each.result == "failed"]
     assert not bad
-    assert [each.check.name for each in results if isinstance(each.finding, Late)] == []
+    assert [each.check.name for each in results if isinstance(each.finding, TooLate)] == []
     assert sum(each.seconds for each in results) < 2 * MINUTE

@@ -8,7 +8,7 @@ import pytest
 from drivers.protocol.records import Values
 from drivers.wires.can_frames import unpack_frames
 from long_form import shortly
-from sim.amplifier.simulated_amplifier import Amplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
 from virtual_lines import JUDGED_LINE_KINDS, JudgedLine, judged, varied
 
@@ -24,7 +24,7 @@ NEXT, HIGHEST, PRE_OPERATIONAL = 2, {"can": 127}, 127
 GATEWAY_WAITS = 1.0  # s; for a unit that is not there
 
 
-class Neighbour(Amplifier):
+class Neighbour(SimulatedAmplifier):
     """An amplifier that notes what it is asked to do; identities and objects are read without."""
 
     def __init__(self, name: str) -> None:
@@ -84,7 +84,9 @@ def test_conforming_amplifier_passes_on_a_shared_line(
 class Gateway:
     """Units behind a gateway: it asks one after the other, and replies for those that do not."""
 
-    def __init__(self, units: Mapping[int, Amplifier], send: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, units: Mapping[int, SimulatedAmplifier], send: Callable[[bytes], None]
+    ) -> None:
         self._units, self._send = units, send
         self._end = ModbusAmplifiers(units, self._replied, is_rtu=False)
         self._waiting: list[bytes] = []
@@ -122,7 +124,7 @@ class Gateway:
 def test_units_behind_one_gateway() -> None:
     """The gateway replies for absent units after a second, and lets what comes behind wait."""
     others = {each: Neighbour(f"at {each}") for each in (NEXT, 247)}
-    units: dict[int, Amplifier] = {1: varied(), **others}
+    units: dict[int, SimulatedAmplifier] = {1: varied(), **others}
 
     def far(send: Callable[[bytes], None]) -> Any:
         return Gateway(units, send)

@@ -16,7 +16,12 @@ from typer.testing import CliRunner
 
 from benchmarks.desk.capture import open_client
 from benchmarks.desk_plate.jack_plate import JackPlate
-from era_haptics.lab.measuring.impedance import Bench, exciter_values, fitted, read_impedance
+from era_haptics.lab.measuring.impedance import (
+    ImpedanceSetup,
+    exciter_values,
+    fitted,
+    read_impedance,
+)
 from era_haptics.lab.measuring.measure_cli import app
 from era_haptics.lab.measuring.sound_card import SoundCard
 from exciters import ExciterCircuit
@@ -107,7 +112,7 @@ def test_parts_are_within_their_intervals_in_nine_of_ten_draws(
             noisy = each + 1e-3 * np.abs(each) * (drawn[0] + 1j * drawn[1])
             runs.append(fitted(F, SERIES * (gain * (noisy / resistor + 1) - 1), what="run"))
         weight, base = np.array([WEIGHT, BASE]) + SCALE * rng.normal(size=2)
-        bench = Bench(weight, None, base, SCALE, SERIES, series_error, input_error)
+        bench = ImpedanceSetup(weight, None, base, SCALE, SERIES, series_error, input_error)
         for name, (value, width) in exciter_values(*runs, bench).items():
             inside[name] += abs(value - TRUE[name]) <= width
     assert all(172 <= count <= most for count in inside.values()), inside
@@ -124,12 +129,12 @@ def test_parts_are_those_of_the_circuit() -> None:
         for is_glued, base in ((False, np.inf), (True, np.inf), (True, BASE))
     )
     for circuit, base in ((glued, np.inf), (light, BASE)):
-        both = exciter_values(free, circuit, Bench(WEIGHT, base=base))
+        both = exciter_values(free, circuit, ImpedanceSetup(WEIGHT, base=base))
         assert {name: value for name, (value, _) in both.items()} == pytest.approx(TRUE, rel=1e-4)
-    alone = exciter_values(None, glued, Bench(MAGNET))
+    alone = exciter_values(None, glued, ImpedanceSetup(MAGNET))
     assert alone["force_factor"][0] == pytest.approx(FORCE_FACTOR, rel=1e-4)
     assert "coil_mass" not in alone
-    hanging = exciter_values(free, None, Bench(WEIGHT, COIL))
+    hanging = exciter_values(free, None, ImpedanceSetup(WEIGHT, COIL))
     of_coil = {
         "resonance": np.sqrt(STIFFNESS / COIL) / (2 * np.pi),
         "q": np.sqrt(STIFFNESS * COIL) / DAMPING,
@@ -138,14 +143,14 @@ def test_parts_are_those_of_the_circuit() -> None:
     assert {name: value for name, (value, _) in hanging.items()} == pytest.approx(
         TRUE | of_coil, rel=1e-4
     )
-    assert "weight" not in exciter_values(free, None, Bench())
+    assert "weight" not in exciter_values(free, None, ImpedanceSetup())
 
 
 def test_eddy_currents_are_no_error_of_the_parts() -> None:
     """A semi-inductance of 0.01 ohm s^0.5, 0.8 ohm at 1 kHz: what moves is found as without it."""
     rng = np.random.default_rng(1)
     glued = fitted(F, run(rng, is_glued=True, noise=1e-4, semi=0.01), what="run")
-    found = exciter_values(None, glued, Bench(MAGNET))
+    found = exciter_values(None, glued, ImpedanceSetup(MAGNET))
     assert glued["semi_inductance"] == pytest.approx(0.01, rel=0.01)
     for name in ("resonance", "q", "resistance", "force_factor"):
         assert found[name][0] == pytest.approx(TRUE[name], rel=2e-3)
@@ -167,18 +172,18 @@ def test_what_is_no_exciter_is_refused() -> None:
         fitted(F, run(rng, is_glued=is_glued, noise=1e-4), what="run") for is_glued in (False, True)
     )
     with pytest.raises(InputError, match="exchanged"):
-        exciter_values(glued, free, Bench(WEIGHT))
+        exciter_values(glued, free, ImpedanceSetup(WEIGHT))
     other = fitted(
         F, RESISTANCE + 2 * (run(rng, is_glued=True, noise=1e-4) - RESISTANCE), what="run"
     )
     with pytest.raises(InputError, match="one exciter"):
-        exciter_values(free, other, Bench(WEIGHT))
+        exciter_values(free, other, ImpedanceSetup(WEIGHT))
     with pytest.raises(InputError, match="--coil-mass follows"):
-        exciter_values(free, glued, Bench(WEIGHT, COIL))
+        exciter_values(free, glued, ImpedanceSetup(WEIGHT, COIL))
     with pytest.raises(InputError, match="--weight is missing"):
-        Bench(base=BASE)
+        ImpedanceSetup(base=BASE)
     with pytest.raises(InputError, match="must be below --weight"):
-        Bench(COIL, WEIGHT)
+        ImpedanceSetup(COIL, WEIGHT)
 
 
 RATE = 48_000

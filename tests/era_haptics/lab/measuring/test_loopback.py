@@ -18,7 +18,7 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth
 from era_haptics.lab.cli import app
 from era_haptics.lab.measuring.loopback import read_stepped
-from era_haptics.lab.measuring.outputs import Heard, listen, matched, tone
+from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.calibration.responses import Responses, WiredSensor, responses_of
@@ -75,7 +75,7 @@ def cabled(
     return card
 
 
-def heard(rig: Rig, card: Cabled) -> list[Heard]:
+def heard(rig: Rig, card: Cabled) -> list[OutputFinding]:
     """What an accelerometer beside each ERA tells."""
     return listen(Desk(rig, ()), card, 1, outputs=4, level=0.1, move=card.move)
 

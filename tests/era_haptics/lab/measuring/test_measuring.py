@@ -19,12 +19,12 @@ from controller.cli.main import run
 from drivers.errors import LinkError
 from era_haptics.lab.measuring import measure
 from era_haptics.lab.measuring.loopback import check_wiring, latency
-from era_haptics.lab.measuring.measure import STEPS, Measured, check_by_steps, plot
+from era_haptics.lab.measuring.measure import STEPS, MeasuredResponses, check_by_steps, plot
 from era_haptics.lab.measuring.measure import measure as measure_measure
 from era_haptics.lab.measuring.sound_card import (
     Desk,
-    Estimate,
     Multisine,
+    ResponseEstimate,
     SoundCard,
     default_frequencies,
 )
@@ -113,7 +113,7 @@ def sines(desk: Desk, frequencies: np.ndarray = MEASURING_FREQUENCIES) -> Multis
 
 
 @pytest.fixture(scope="module")
-def undisturbed(rig: Rig, truth: Truth) -> Measured:
+def undisturbed(rig: Rig, truth: Truth) -> MeasuredResponses:
     """The plate measured with nothing wrong."""
     desk = Desk(rig, SENSORS)
     return measure_measure(desk, card(truth), sines(desk))
@@ -155,7 +155,7 @@ def test_multisine_has_its_level_and_orthogonal_runs() -> None:
 
 
 def test_measured_responses_are_those_of_the_plate(
-    rig: Rig, truth: Truth, undisturbed: Measured
+    rig: Rig, truth: Truth, undisturbed: MeasuredResponses
 ) -> None:
     """Against its own closed form: hidden delay and filter are taken out, and the delay is told.
 
@@ -174,7 +174,7 @@ def test_measured_responses_are_those_of_the_plate(
 
 
 def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
-    rig: Rig, truth: Truth, undisturbed: Measured
+    rig: Rig, truth: Truth, undisturbed: MeasuredResponses
 ) -> None:
     """The last ERA's output is the loop-back's, too: four runs, the same responses and delay.
 
@@ -213,7 +213,7 @@ def test_stepped_tones_agree(rig: Rig, truth: Truth) -> None:
     ids=["1", "2", "none"],
 )
 def test_run_that_lost_a_block_is_played_again(
-    rig: Rig, truth: Truth, undisturbed: Measured, wires: dict[str, object], repeated: int
+    rig: Rig, truth: Truth, undisturbed: MeasuredResponses, wires: dict[str, object], repeated: int
 ) -> None:
     """128 samples are missing in a run, or before it, which nothing reports.
 
@@ -283,7 +283,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
     came = WIRED.copy()
     came[at - 1] = gains
     each = np.broadcast_to(came, (len(MEASURING_FREQUENCIES), *came.shape)).astype(complex)
-    found = Estimate(each, abs(each), abs(each), np.zeros(4))
+    found = ResponseEstimate(each, abs(each), abs(each), np.zeros(4))
     with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
         check_wiring(found, Desk(rig, SENSORS))
 
@@ -292,10 +292,10 @@ def test_sensors_of_a_single_source_are_no_cables(rig: Rig) -> None:
     """One ERA with the loop-back beside it: all inputs have that output alone."""
     alone = Desk(replace(rig, eras=rig.eras[:1]), SENSORS, is_shared=True)
     each = np.full((len(MEASURING_FREQUENCIES), 4, 1), 0.4 + 0j)
-    check_wiring(Estimate(each, abs(each), abs(each), np.zeros(4)), alone)
+    check_wiring(ResponseEstimate(each, abs(each), abs(each), np.zeros(4)), alone)
     each[:, 3] = 1e-5
     with pytest.raises(InputError, match="connect them by a cable"):
-        check_wiring(Estimate(each, abs(each), abs(each), np.zeros(4)), alone)
+        check_wiring(ResponseEstimate(each, abs(each), abs(each), np.zeros(4)), alone)
 
 
 def test_amplifier_that_is_off_is_named(rig: Rig, truth: Truth) -> None:

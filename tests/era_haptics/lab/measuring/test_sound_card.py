@@ -46,7 +46,7 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad, fingertip_loads
-from sim.soft_amp.engine import Protocol, Settings
+from sim.soft_amp.engine import Protocol, SoftAmplifierSettings
 from sim.soft_amp.output import open_output
 from sound_cards import DeskCard, JackServer, capture_on, jack_server
 from typed_page import ERA
@@ -155,7 +155,7 @@ def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: P
 DESK = Path(__file__).parents[4] / "examples" / "desk"
 STALLED = 8.0  # s; without a message of the server it would be ten
 CHANNELS = 5  # of that desk: four ERAs and the loop-back
-SETTINGS = Settings(
+SETTINGS = SoftAmplifierSettings(
     device="jack:card", channels=CHANNELS, protocol=Protocol.SERIAL, serial_number="S"
 )
 

@@ -15,19 +15,19 @@ from ruamel.yaml import YAML
 
 from chain import SCENARIOS, WITNESSED, play
 from drivers.wires.modbus_frames import framed
-from era_haptics.lab.witness.capture import Direction, Message, Reply, Request
+from era_haptics.lab.witness.capture import Direction, Message, WitnessedReply, WitnessedRequest
 from era_haptics.lab.witness.witness import DECODERS
 from group_stops import RandomGroup
 from long_form import in_turn, shortly
 from plate_witness import RULES
-from sim.far_ends.wire_assignment import Wire
+from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import run_virtual
 
 KINDS = {
-    "can": Wire("slcan", 500_000),
-    "serial": Wire("serial", 921_600, shared=True),
-    "rtu": Wire("modbus-rtu", 460_800),  # a set is read back between two heartbeats
-    "tcp": Wire("modbus-tcp"),
+    "can": SimulatedWire("slcan", 500_000),
+    "serial": SimulatedWire("serial", 921_600, shared=True),
+    "rtu": SimulatedWire("modbus-rtu", 460_800),  # a set is read back between two heartbeats
+    "tcp": SimulatedWire("modbus-tcp"),
 }
 LINES = ("shared", "each its own")
 
@@ -113,9 +113,9 @@ def test_a_fault_is_planted_for_every_rule() -> None:
 
 def summary(message: Message) -> tuple[str, dict[str, Any]]:
     """Return what a message is, and its values; of one that is wrong what is said of it."""
-    if isinstance(message, Request):
+    if isinstance(message, WitnessedRequest):
         return message.name, {"problem": True} if message.problem else message.values
-    if isinstance(message, Reply):
+    if isinstance(message, WitnessedReply):
         if message.refusal or message.problem:
             return "refusal", {"code": message.refusal or message.problem}
         return "reply", message.values or {}

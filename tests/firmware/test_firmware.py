@@ -482,7 +482,7 @@ OF_WIRE = {"rtu": {"events", "clock_rate"}, "tcp": {"events"}}
 """Skipped too: on RTU two silent intervals of 1.75 ms make exchanges too long for two."""
 
 
-@pytest.mark.parametrize("kind", FIRMWARE_MACHINE_LINES)
+@pytest.mark.parametrize("kind", shortly(FIRMWARE_MACHINE_LINES, ["can", "rtu"]))
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind, far=partial(FirmwareEnd, kind, replaying))

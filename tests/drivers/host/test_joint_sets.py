@@ -414,7 +414,7 @@ async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> N
         assert not chain.controller.group.is_armed
 
 
-STOPS, FIRST = (int(os.environ.get(name, value)) for name, value in (("STOPS", 216), ("FIRST", 0)))
+STOPS, FIRST = (int(os.environ.get(name, value)) for name, value in (("STOPS", 108), ("FIRST", 0)))
 
 
 @pytest.fixture(autouse=True)

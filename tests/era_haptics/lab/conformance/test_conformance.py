@@ -133,17 +133,17 @@ class _Coarse(SimulatedAmplifier):
         return {**super()._take(part, now), "exact": 0}
 
 
-@pytest.mark.parametrize(
-    "steps",
-    [
-        {"frequency_step": 20, "level_step": 5},
-        {"level_step": 40},
-        {"frequency_step": 7},
-        {"frequency_step": 30, "phase_step": 300},
-        {"frequency_step": 60, "phase_step": 18_000},
-        {"frequency_step": 65_535, "phase_step": 77},
-    ],
-)
+OWN_STEPS = [
+    {"frequency_step": 20, "level_step": 5},
+    {"level_step": 40},
+    {"frequency_step": 7},
+    {"frequency_step": 30, "phase_step": 300},
+    {"frequency_step": 60, "phase_step": 18_000},
+    {"frequency_step": 65_535, "phase_step": 77},
+]
+
+
+@pytest.mark.parametrize("steps", shortly(OWN_STEPS, OWN_STEPS[:1]))
 def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> None:
     """Those that it states: 1 Hz, thousandths or even 0.4 % of full level, half a circle."""
     far = _Coarse("coarse", channels=2)
@@ -151,7 +151,7 @@ def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> Non
     expect_passed(judged("serial", far=far), SKIPPED["serial"] - {"steps_as_stated"})
 
 
-@pytest.mark.parametrize("knots", [0, 1])
+@pytest.mark.parametrize("knots", shortly([0, 1], [0]))
 def test_amplifier_with_the_least_of_all_passes(knots: int) -> None:
     """One channel and watchdog time, short ramps, and what of its sets such an amplifier has."""
     far = SimulatedAmplifier("least", channels=1)

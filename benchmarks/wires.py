@@ -12,7 +12,7 @@ from types import FrameType
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_line import SerialWire
 from registry import threads
 from registry.limits import GuardLimits
@@ -67,11 +67,11 @@ async def calls_of_a_set(amplifiers: int) -> Counter[str]:
             entered[code.co_filename.rpartition("/drivers/")[2]] += 1
 
     for frequency in (100.0, 120.0):
-        tones = tuple(Tone(channel, frequency, 0.3) for channel in range(CHANNELS))
+        tones = tuple(AmplifierTone(channel, frequency, 0.3) for channel in range(CHANNELS))
         await asyncio.sleep(_PAUSE)
         sys.setprofile(note)
         entered.clear()
-        await group.apply({name: [Layer(0, tones, 0.005)] for name in ports})
+        await group.apply({name: [AmplifierLayer(0, tones, 0.005)] for name in ports})
         sys.setprofile(None)
     await group.disarm(0.0)
     return entered

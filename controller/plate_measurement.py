@@ -31,8 +31,7 @@ from controller.play.routing import (
     tones_by_era,
 )
 from drivers.errors import CommandError, CommandRefused
-from drivers.host.amplifier import Amplifier, Reading, measure_tones, read_sensors
-from drivers.host.amplifier import Sensor as ReportedSensor
+from drivers.host.amplifier import Amplifier, AmplifierSensor, Reading, measure_tones, read_sensors
 from drivers.host.clock import CLOCK_SETTLING
 from drivers.host.group import Group
 from drivers.opening import Lines
@@ -189,7 +188,7 @@ def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
 
 
 def _of_amplifier(
-    rig: Rig, amplifier: str, reported: Sequence[ReportedSensor]
+    rig: Rig, amplifier: str, reported: Sequence[AmplifierSensor]
 ) -> tuple[list[PlateSensor], list[str]]:
     eras = {channel: era for era, channel in rig.wiring.items()}
     used: list[PlateSensor] = []

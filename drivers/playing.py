@@ -33,24 +33,6 @@ from drivers.protocol.definition import QUANTITIES, SHORTENED_FADE
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
 
-__all__ = [
-    "LAYERS_MAX",
-    "SAME",
-    "Layer",
-    "Playback",
-    "Tone",
-    "Transition",
-    "Voice",
-    "along",
-    "amplitude_of",
-    "amplitudes_of",
-    "cut_to",
-    "peak_of",
-    "playback_of",
-    "steepest",
-    "voices_after",
-]
-
 _PER_STEP = QUANTITIES["envelope_step"].per_unit
 _PER_FULL, _PER_DEGREE = QUANTITIES["level"].per_unit, QUANTITIES["phase"].per_unit
 _PER_HERTZ = QUANTITIES["frequency"].per_unit
@@ -84,7 +66,7 @@ def peak_of(envelope: Envelope | None) -> float:
 
 
 @dataclass(slots=True)  # frozen, each takes three times as long to make, and every set makes many
-class Transition:
+class VoiceTransition:
     """From one complex amplitude to another, from start [s] on until end.
 
     Along straight lines through knots a step [s] apart, or without knots along a raised cosine that
@@ -148,13 +130,13 @@ class Transition:
 
 def along(
     envelope: Envelope | None, time: float, ramp: float, first: complex, last: complex
-) -> Transition:
+) -> VoiceTransition:
     """Return a transition from a time [s] on: along an envelope, or a ramp [s] without one."""
     if envelope is None:
-        return Transition(time, ramp, first, last, time + ramp)
+        return VoiceTransition(time, ramp, first, last, time + ramp)
     step = envelope.step / _PER_STEP
     end = time + step * (len(envelope.knots) + 1)
-    return Transition(time, step, first, last, end, amplitudes_of(envelope))
+    return VoiceTransition(time, step, first, last, end, amplitudes_of(envelope))
 
 
 def steepest(
@@ -188,7 +170,7 @@ class Voice:
     layer: int
     frequency: float
     began: float
-    transition: Transition
+    transition: VoiceTransition
     has_ended: bool = False
     ending: Envelope | None = None
 
@@ -211,10 +193,10 @@ class Voice:
         if transition.last or transition.end > end + uncertainty + SAME:
             is_over = time - uncertainty >= transition.end
             first = transition.last if is_over else transition.reached(time, uncertainty)
-            transition = Transition(time, ramp, first, 0j, end)
+            transition = VoiceTransition(time, ramp, first, 0j, end)
         elif uncertainty and transition.end > end - uncertainty:
             largest, over = transition.peak(time - uncertainty), max(transition.end, end)
-            transition = Transition(over, 0.0, complex(largest), 0j, over)
+            transition = VoiceTransition(over, 0.0, complex(largest), 0j, over)
         return Voice(self.layer, self.frequency, self.began, transition, True, self.ending)
 
     def ended(self, time: float, ramp: float, uncertainty: float = 0.0) -> "Voice":
@@ -228,7 +210,7 @@ class Voice:
         """Return it led to a factor of its level along a ramp [s], its ending scaled too."""
         transition = self.transition
         last = transition.last * factor
-        led = Transition(time, ramp, transition.at(time), last, time + ramp)
+        led = VoiceTransition(time, ramp, transition.at(time), last, time + ramp)
         ending = None if self.ending is None else self.ending.scaled(factor)
         return replace(self, transition=led, ending=ending)
 
@@ -270,7 +252,7 @@ def voices_after(
             else:
                 after.append(voice.ended(time, ramp, uncertainty))
         if is_new:
-            transition = Transition(time, ramp, 0j, last, time + ramp)
+            transition = VoiceTransition(time, ramp, 0j, last, time + ramp)
             if command.onset is not None:  # seldom: without a call
                 transition = along(command.onset, time, ramp, 0j, last)
             after.append(Voice(layer, frequency, time, transition, False, command.ending))
@@ -298,7 +280,7 @@ def _cut_short(voice: Voice, time: float, slew: float) -> Voice:
 
 
 @dataclass(frozen=True, slots=True)
-class Tone:
+class AmplifierTone:
     """What a channel plays in a layer: frequency [Hz], level 0..1 of full level, phase [degrees].
 
     keep_phase: continue the phase of the same frequency in this layer; skip_ending: fall silent
@@ -316,7 +298,7 @@ class Tone:
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class AmplifierLayer:
     """What one layer is to play; without tones it falls silent, or with renew is prolonged.
 
     Channels without a tone are silent in this layer. ramp [s] of all changes; valid_for [s]: the
@@ -325,7 +307,7 @@ class Layer:
     """
 
     number: int
-    tones: tuple[Tone, ...] = ()
+    tones: tuple[AmplifierTone, ...] = ()
     ramp: float = 0.02
     valid_for: float = 0.0
     after: bool = False

@@ -34,7 +34,7 @@ from typing import ClassVar, Protocol, TypeAlias, cast, final
 import serial
 
 from drivers.errors import LinkError, LinkTimeout, system_message
-from drivers.urls import Place
+from drivers.urls import Endpoint
 from registry.threads import close_in_thread, in_thread
 
 
@@ -317,7 +317,7 @@ _REMEDIES = {
 
 
 async def open_port(
-    place: Place, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
+    place: Endpoint, on_data: Callable[[bytes], None], on_loss: Callable[[str], None]
 ) -> Port:
     """Open a device, exclusively if the system can, or connect; raises LinkError.
 
@@ -343,7 +343,7 @@ async def open_port(
     return SerialPort(port, name, on_data, on_loss)
 
 
-def _open_device(place: Place) -> serial.Serial:
+def _open_device(place: Endpoint) -> serial.Serial:
     import termios
 
     # A pseudo-terminal has no parity and may refuse all settings if one is given.

@@ -78,7 +78,7 @@ _DIGITS_MAX = 9  # more are out of every range, and int() refuses thousands of t
 
 
 @dataclass(frozen=True)
-class Place:
+class Endpoint:
     """What carries bytes: a serial device of this machine, or a port of the network.
 
     baud, parity (as named by pyserial) and stop bits are those of the device, or of the line behind
@@ -159,21 +159,21 @@ class AmplifierUrl:
         """Parse an option that is an integer of a range."""
         return self.whole(self.options.get(name, str(default)), name, high, low=low)
 
-    def device(self, baud: int) -> Place:
+    def device(self, baud: int) -> Endpoint:
         """Return the serial device that the path names; baud: where no option names it."""
         self.require(
             not self.place, f"path of the port must follow three slashes, got {self.place!r}"
         )
         self.require(bool(self.path.strip("/")), "path of the port must be given")
-        return Place(self.path, baud=self._baud(baud))
+        return Endpoint(self.path, baud=self._baud(baud))
 
-    def server(self, *, port: int = 0, number: str = "") -> Place:
+    def server(self, *, port: int = 0, number: str = "") -> Endpoint:
         """Return the port of the network; port: the default; number: see `check_path`."""
         if number:
             self.check_path(self.path, number)
         for name, value in (("host", self.host), ("port", self.port or port)):
             self.require(bool(value), f"{name} must be given, got {self.place!r}")
-        return Place(host=self.host, port=self.port or port, baud=self._baud(0))
+        return Endpoint(host=self.host, port=self.port or port, baud=self._baud(0))
 
     def check_path(self, rest: str, number: str) -> None:
         """Refuse the rest of a path; number: of an amplifier, as it must be given in its place."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from controller.play.routing import route
 from drivers.by_hand.actions import BlockingAmplifier
-from drivers.playing import Layer as AmplifierLayer
+from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, layers_of
 from model.calibration.calibrate import Calibration
 from model.calibration.calibrate import calibrate as fit

@@ -17,7 +17,7 @@ import pytest
 
 from drivers.errors import DriverError, LinkDegraded
 from drivers.host.amplifier import Amplifier
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import HEARTBEAT, loss_detection_time
 from long_form import shortly
 from model.rig.rig import Rig
@@ -66,8 +66,8 @@ def fault(hosted: HostedRig, kind: FaultKind, **options: object) -> None:
 
 async def play(hosted: HostedRig, *levels: float) -> None:
     """Play these levels, from channel 0 on, without a ramp."""
-    tones = tuple(Tone(channel, 110.0, level) for channel, level in enumerate(levels))
-    await hosted.group.apply({"main": [Layer(0, tones, 0.0)]})
+    tones = tuple(AmplifierTone(channel, 110.0, level) for channel, level in enumerate(levels))
+    await hosted.group.apply({"main": [AmplifierLayer(0, tones, 0.0)]})
 
 
 async def beat_on(hosted: HostedRig) -> None:

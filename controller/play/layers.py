@@ -32,7 +32,7 @@ from controller.play.routing import (
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
@@ -138,7 +138,7 @@ _SURELY_SETTLED = 0.005  # s; by which a set starts later than its last reply, a
 _MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch would wait for it
 _VALID_FOR = QUANTITIES["valid_for"]
 
-Check = Callable[[Mapping[str, Sequence[Layer]]], CommandRefused | None]
+Check = Callable[[Mapping[str, Sequence[AmplifierLayer]]], CommandRefused | None]
 """Why the ledgers would not admit layers, by amplifier, now; None if they would."""
 
 _logger = logging.getLogger(__name__)
@@ -166,9 +166,9 @@ class Sets:
     preempted_until: float = math.inf
 
     @cached_property
-    def by_amplifier(self) -> dict[str, list[Layer]]:
+    def by_amplifier(self) -> dict[str, list[AmplifierLayer]]:
         """The layers of each amplifier, by name."""
-        of_each: dict[str, list[Layer]] = {}
+        of_each: dict[str, list[AmplifierLayer]] = {}
         for layers in self.layers.values():
             for name, layer in layers.items():
                 of_each.setdefault(name, []).append(layer)
@@ -608,7 +608,7 @@ class Layers:
 
         Wire and amplifier round these.
         """
-        drive: dict[str, Tone] = {}
+        drive: dict[str, AmplifierTone] = {}
         if (one := self.contents.get(number)) is None:
             return drive
         for name, tone in one.drive.items():

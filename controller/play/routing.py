@@ -37,8 +37,7 @@ import numpy as np
 from controller.play.intent import Pulse
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
-from drivers.playing import Layer as ContentsLayer
-from drivers.playing import Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
 from model import vibration as physics
@@ -386,10 +385,10 @@ def _knots_in(words: int, channels: list[int]) -> int:
     return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))
 
 
-Drive = Mapping[str, Tone]
+Drive = Mapping[str, AmplifierTone]
 """What ERAs play, by name, without silent ones."""
 
-PlateLayer = Mapping[str, ContentsLayer]
+PlateLayer = Mapping[str, AmplifierLayer]
 """What one layer plays on every amplifier, by name."""
 
 BESIDE_CLICK = 0.100
@@ -546,7 +545,7 @@ class SetBuilder:
 
     def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
         """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
-        layer = ContentsLayer(number, ramp=ramp, valid_for=valid_for, renew=True)
+        layer = AmplifierLayer(number, ramp=ramp, valid_for=valid_for, renew=True)
         return dict.fromkeys(self.rig.amplifiers, layer)
 
     def build_fall(
@@ -576,7 +575,7 @@ class SetBuilder:
     def build_end(self, number: int, ramp: float, *, has_endings: bool) -> PlateLayer:
         """Build the set that ends a layer along its endings, or along a ramp [s]."""
         if has_endings:
-            return dict.fromkeys(self.rig.amplifiers, ContentsLayer(number, ramp=ramp))
+            return dict.fromkeys(self.rig.amplifiers, AmplifierLayer(number, ramp=ramp))
         return route({}, self.rig, ramp=ramp, number=number)
 
 
@@ -591,7 +590,7 @@ def route(
     valid_for: float = 0.0,
     onset: Envelopes | None = None,
     ending: Envelopes | None = None,
-) -> dict[str, ContentsLayer]:
+) -> dict[str, AmplifierLayer]:
     """Return the layer of a number for every amplifier of the rig, by name.
 
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
@@ -612,18 +611,20 @@ def route(
     restarted = restarted_by(excitation, before) if restarted is None else restarted
     strokes = rig.full_levels
     onsets, endings = on_wire(strokes, onset, ending)
-    wired: dict[str, list[Tone]] = {name: [] for name in rig.amplifiers}
+    wired: dict[str, list[AmplifierTone]] = {name: [] for name in rig.amplifiers}
     for name, channel in rig.wiring.items():
         driven, was, shape = excitation.get(name), before.get(name), onsets.get(name)
         if driven is None:
             # Falling silent while others play, it skips its ending, which belongs to all together.
             frequency = onset[name].frequency if onset and shape else rig.limits.frequency_min
-            tone = Tone(channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name))
+            tone = AmplifierTone(
+                channel.number, frequency, 0.0, 0.0, False, True, shape, endings.get(name)
+            )
         else:
             phase = driven.phase  # not finite it stays so, and the ledger refuses it
             if math.isfinite(phase):
                 phase = math.degrees(math.remainder(phase, math.tau))
-            tone = Tone(
+            tone = AmplifierTone(
                 channel.number,
                 driven.frequency,
                 level=driven.amplitude / strokes[name],
@@ -639,13 +640,13 @@ def route(
         least = rise / rig.limits.slew
         ramp = least if least > ramp else ramp  # ledgers refuse NaN
     return {
-        name: ContentsLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
+        name: AmplifierLayer(number, tuple(tones), ramp, valid_for) for name, tones in wired.items()
     }
 
 
 def tones_by_era(
     played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
-) -> dict[str, Tone]:
+) -> dict[str, AmplifierTone]:
     """Return what each ERA plays in the layer of a number, by name; without silent ones."""
     playing = {
         (amplifier, command.channel): command
@@ -655,7 +656,7 @@ def tones_by_era(
         if one.layer == number and command.level > 0
     }
     return {
-        name: Tone(
+        name: AmplifierTone(
             channel.number,
             command.frequency / _ROUTING_FREQUENCY.per_unit,
             command.level / _ROUTING_LEVEL.per_unit,
@@ -666,7 +667,7 @@ def tones_by_era(
     }
 
 
-def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, Tone]:
+def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, AmplifierTone]:
     """Return what each ERA plays of an excitation at the share 1 of its course, by name."""
     layers = route(excitation, rig, ramp=0.0)
     return {

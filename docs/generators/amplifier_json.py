@@ -39,8 +39,15 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import TEXT_MAX, Bits, Number, Numbers, Real, Record, Rest, Rows, Text
 from drivers.protocol.sets import MAX_PARTS, PART_WORDS
-from drivers.wires.modbus_frames import AREA, BOX, IDENTITY_COUNT, READ, REPLY, WRITE
-from drivers.wires.modbus_frames import IDENTITY as IDENTITY_REGISTER
+from drivers.wires.modbus_frames import (
+    AREA,
+    BOX,
+    IDENTITY_COUNT,
+    IDENTITY_REGISTER,
+    READ,
+    REPLY_OFFSET,
+    WRITE,
+)
 from drivers.wires.serial_frames import PAYLOAD_MAX
 from sim.amplifier.simulated_amplifier import TRANSITIONS
 
@@ -124,7 +131,10 @@ def _modbus() -> dict[str, Any]:
         **{"reply_area_registers": AREA, "registers_of_a_message": BOX},
         "identity": {"register": IDENTITY_REGISTER, "count": IDENTITY_COUNT},
         "registers": {
-            name: {"written_from": BOX * each.number, "reply_from": BOX * each.number + REPLY}
+            name: {
+                "written_from": BOX * each.number,
+                "reply_from": BOX * each.number + REPLY_OFFSET,
+            }
             for name, each in MESSAGES.items()
         },
     }

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, clock_at, high_word
 from drivers.protocol.records import Bits, Number, Numbers, Record, Rest, Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, is_last, pack_layers, parts
@@ -42,10 +42,10 @@ def _integer(name: str, value: float) -> int:
     return QUANTITIES[name].to_wire(value)
 
 
-def _wire_set(layers: Sequence[Layer]) -> list[LayerSet]:
+def _wire_set(layers: Sequence[AmplifierLayer]) -> list[LayerSet]:
     """Return layers in units of the wire."""
 
-    def command(tone: Tone) -> Command:
+    def command(tone: AmplifierTone) -> Command:
         level, phase = _integer("level", tone.level), _integer("phase", tone.phase)
         frequency = _integer("frequency", tone.frequency)
         return Command(tone.channel, frequency, level, phase, keep_phase=tone.keep_phase)
@@ -63,10 +63,10 @@ def _joined() -> list[LayerSet]:
     """Return the set: layer 0 changes, 1 begins with an onset, 2 is silenced, 3 prolonged."""
     changed, begun = _wire_set(
         [
-            Layer(
+            AmplifierLayer(
                 number,
                 tuple(
-                    Tone(channel, frequency, level, phase, keep_phase=number == 0)
+                    AmplifierTone(channel, frequency, level, phase, keep_phase=number == 0)
                     for channel, (level, phase) in enumerate(tones)
                 ),
                 *(0.02, 0.5),
@@ -157,7 +157,11 @@ def _vibrating(kind: str, number: int, *before: str) -> _Exchange:
     exchange = _Exchange(kind, number)
     exchange.amplifier.handle("Arm", _ARM, _NOW)
     layers = [
-        Layer(number, tuple(Tone(at, frequency, level) for at, level in enumerate(levels)), 0.0)
+        AmplifierLayer(
+            number,
+            tuple(AmplifierTone(at, frequency, level) for at, level in enumerate(levels)),
+            0.0,
+        )
         for number, frequency, levels in _BEFORE
     ]
     (part,) = parts(pack_layers(_wire_set(layers)), session=SESSION, token=TOKEN - 1, now=True)

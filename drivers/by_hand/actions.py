@@ -4,7 +4,7 @@ A synchronous amplifier for scripts.
 
     with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
         amplifier.arm()
-        tone = Tone(channel=0, frequency=110, level=0.2)
+        tone = AmplifierTone(channel=0, frequency=110, level=0.2)
         amplifier.play([AmplifierLayer(0, (tone,))], duration=0.5)
 
 Only `play` and `measure`, while they wait, and `heartbeat` feed the watchdog: a script that hangs
@@ -36,8 +36,8 @@ from drivers.errors import CommandError, CommandRefused, DriverError, LinkError
 from drivers.host.amplifier import (
     WATCHDOG,
     Amplifier,
+    AmplifierSensor,
     Reading,
-    Sensor,
     check_tones,
     measure_tones,
     read_measured,
@@ -45,8 +45,7 @@ from drivers.host.amplifier import (
 )
 from drivers.host.dialogue import Staged, Stopped
 from drivers.host.line import Priority
-from drivers.playing import Layer, Tone
-from drivers.playing import Layer as AmplifierLayer
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
     BOOT_TIME,
     COMMAND,
@@ -266,7 +265,7 @@ async def drive(
     async with reached(url) as amplifier:
         await amplifier.open()
         ramp = min(_RAMP, QUANTITIES["ramp"].from_wire(amplifier.capabilities["ramp_max"]))
-        layer = Layer(0, (Tone(channel, frequency, level),), ramp, duration)
+        layer = AmplifierLayer(0, (AmplifierTone(channel, frequency, level),), ramp, duration)
         try:
             amplifier.ledger.admit([layer], threads.now(), delay=0.0)
         except CommandRefused as refused:
@@ -373,7 +372,7 @@ class BlockingAmplifier:
         values = {"session": self._amplifier.session, "rate": 0}
         return status_rows(self._wait(self._amplifier.request("Ping", values, Priority.HEARTBEAT)))
 
-    def sensors(self) -> tuple[Sensor, ...]:
+    def sensors(self) -> tuple[AmplifierSensor, ...]:
         """Read what its sensors measure, and where; empty if it has none."""
         return self._wait(read_sensors(self._amplifier))
 

@@ -419,7 +419,7 @@ _VIOLATION = "the amplifier does not keep the protocol"
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class AmplifierSensor:
     """A sensor: its unit (a name of SENSOR_UNITS), and its range in it; frequency_max [Hz].
 
     channel: whose actuator it sits at, or None; x, y [m]: None where unknown.
@@ -458,11 +458,11 @@ class Reading:
     sensors: tuple[SensorReading, ...]
 
 
-async def read_sensors(amplifier: Amplifier) -> tuple[Sensor, ...]:
+async def read_sensors(amplifier: Amplifier) -> tuple[AmplifierSensor, ...]:
     """Read what its sensors measure, and where; empty if it has none."""
     if not has_feature(amplifier.ledger.capabilities, "sensors"):
         return ()
-    found: list[Sensor] = []
+    found: list[AmplifierSensor] = []
     while True:
         listed = await amplifier.request("GetSensors", {"first": len(found)}, Priority.READING)
         found += [_sensor(each) for each in listed["sensors"]]
@@ -561,9 +561,9 @@ async def _same_reading(amplifier: Amplifier, started: Reading, first: int) -> R
     return _reading(found, number=started.number, tones=started.tones)
 
 
-def _sensor(values: Values) -> Sensor:
+def _sensor(values: Values) -> AmplifierSensor:
     channel = values["channel"]
-    return Sensor(
+    return AmplifierSensor(
         name_of(SENSOR_UNITS, values["unit"]),
         None if channel == NO_CHANNEL else channel,
         _place(values["x"]),

@@ -24,11 +24,11 @@ from typing import NamedTuple, TypeAlias
 from drivers.errors import CommandError, CommandRefused
 from drivers.playing import (
     SAME,
-    Layer,
+    AmplifierLayer,
+    AmplifierTone,
     Playback,
-    Tone,
-    Transition,
     Voice,
+    VoiceTransition,
     along,
     peak_of,
     steepest,
@@ -185,7 +185,7 @@ class Bounds:
         return max(rises), max(changes)
 
 
-def _magnitudes(course: _Course) -> Transition:
+def _magnitudes(course: _Course) -> VoiceTransition:
     """Return the way of a voice in magnitudes; its ending follows, or may begin amid it."""
     voice, way = course.voice, course.voice.transition
     ending = 0.0 if voice.has_ended else peak_of(voice.ending)
@@ -194,10 +194,10 @@ def _magnitudes(course: _Course) -> Transition:
     duration = (way.end - way.start) * _PER_VALID_FOR
     if any(0 < one.valid_for < duration for one in course.sets):
         first, knots = max(first, ending), [max(each, ending) for each in knots]
-    return Transition(way.start, way.step, first, last, way.end, tuple(knots))
+    return VoiceTransition(way.start, way.step, first, last, way.end, tuple(knots))
 
 
-def _of_several_ways(ways: Sequence[Transition], times: Sequence[float]) -> list[int]:
+def _of_several_ways(ways: Sequence[VoiceTransition], times: Sequence[float]) -> list[int]:
     """Return the intervals between times in which not all go the same way, by index."""
     kinds = {(way.end, None if way.knots else way.step) for way in ways}
     if len(kinds) < 2:
@@ -206,7 +206,7 @@ def _of_several_ways(ways: Sequence[Transition], times: Sequence[float]) -> list
     return [at for at, time in since if len({kind for end, kind in kinds if time < end}) > 1]
 
 
-def _steepest_of(starts: Sequence[complex], way: Transition) -> tuple[float, float]:
+def _steepest_of(starts: Sequence[complex], way: VoiceTransition) -> tuple[float, float]:
     """Return the steepest rise and the fastest change along a way from any of some amplitudes."""
     course = (*way.knots, way.last)
     ways = (*product(starts, course[:1]), *pairwise(course))
@@ -305,7 +305,7 @@ class Rounding:
         self.achieved: dict[tuple[int, int], int] = {}
         """Frequencies that the amplifier plays in place of others, by channel and frequency."""
 
-    def layers(self, layers: Sequence[Layer]) -> tuple[LayerSet, ...]:
+    def layers(self, layers: Sequence[AmplifierLayer]) -> tuple[LayerSet, ...]:
         """Return layers in integers of the wire; raises CommandRefused with channel and reason."""
         rounded: list[LayerSet] = []
         numbers: list[int] = []
@@ -339,9 +339,9 @@ class Rounding:
             raise CommandRefused(f"a set must have each layer once, got {numbers}")
         return tuple(rounded)
 
-    def _commands(self, tones: Sequence[Tone]) -> dict[int, Command]:
+    def _commands(self, tones: Sequence[AmplifierTone]) -> dict[int, Command]:
         """Return the commands of tones by channel; few calls, since every set has some."""
-        limits, commands, shaped = self._limits, dict[int, Command](), list[Tone]()
+        limits, commands, shaped = self._limits, dict[int, Command](), list[AmplifierTone]()
         for tone in tones:
             channel, level, onset = index(tone.channel), tone.level, tone.onset
             if not 0 <= channel < self._channels:
@@ -386,7 +386,7 @@ class Rounding:
         highest = self._limits.level / _LEVEL.per_unit
         return refused(channel, f"{name} must be 0 to {highest:g}, got {level!r}")
 
-    def _check_envelopes(self, tones: Sequence[Tone]) -> None:
+    def _check_envelopes(self, tones: Sequence[AmplifierTone]) -> None:
         """Raise CommandRefused for an envelope of a tone that is not allowed."""
         low, high = self._can["envelope_step_min"], self._can["envelope_step_max"]
         limit = self._can["knots"]

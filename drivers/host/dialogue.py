@@ -43,7 +43,7 @@ from drivers.host.line import (
     disarmed,
     driven_by_another,
 )
-from drivers.playing import Layer
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     AHEAD_MAX,
     ATTEMPTS,
@@ -188,7 +188,12 @@ _CHECKED_FOR = 0.005  # s; for which what was checked holds, unless anything is 
 IsPreempted: TypeAlias = Callable[[], bool]
 """Whether what waits preempts a set, as long as no amplifier is to play it."""
 _Checked: TypeAlias = tuple[tuple[LayerSet, ...], list[int]]
-_UNCHECKED: tuple[Sequence[Layer] | None, float, float, _Checked] = (None, -math.inf, 0.0, ((), []))
+_UNCHECKED: tuple[Sequence[AmplifierLayer] | None, float, float, _Checked] = (
+    None,
+    -math.inf,
+    0.0,
+    ((), []),
+)
 _logger = logging.getLogger(__name__)
 
 
@@ -280,7 +285,7 @@ class Dialogue:
     async def stage(
         self,
         token: int,
-        layers: Sequence[Layer],
+        layers: Sequence[AmplifierLayer],
         *,
         now: bool = False,
         priority: Priority = Priority.SET,
@@ -318,7 +323,7 @@ class Dialogue:
             raise Preempted(f"amplifier {self.name}: set {token} was not staged")
         return staged if taken["exact"] else replace(staged, is_exact=False)
 
-    def refusal_of(self, layers: Sequence[Layer]) -> CommandRefused | None:
+    def refusal_of(self, layers: Sequence[AmplifierLayer]) -> CommandRefused | None:
         """Return why the ledger would not admit layers now; None if it would.
 
         They are not checked again if they are staged within 5 ms, nothing sent or received since.
@@ -332,7 +337,7 @@ class Dialogue:
         return None
 
     def _check(
-        self, layers: Sequence[Layer], moment: float, *, longer: float = 0.0
+        self, layers: Sequence[AmplifierLayer], moment: float, *, longer: float = 0.0
     ) -> tuple[float, _Checked]:
         """Return layers as the ledger admits them, and their words; raises CommandRefused.
 

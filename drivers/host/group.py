@@ -30,7 +30,7 @@ from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Ampli
 from drivers.host.dialogue import IsPreempted, Stopped, word_passed_by_all
 from drivers.host.joint_sets import Clocks, JointSets, Members, Played, is_lost, outcomes
 from drivers.host.line import GRACE, Line, Make, Priority
-from drivers.playing import Layer
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, HEARTBEAT, QUANTITIES, STOP_RAMP, check_watchdog
 from drivers.protocol.records import Values
 from drivers.protocol.sets import is_newer_token, token_after
@@ -329,7 +329,9 @@ class Group:
         return self._exchange(self._heartbeats.beat)
 
     def apply(
-        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
+        self,
+        layers: Mapping[str, Sequence[AmplifierLayer]],
+        is_preempted: IsPreempted | None = None,
     ) -> Coroutine[Any, Any, Played]:
         """Play layers on the amplifiers of these names, all from one moment on.
 

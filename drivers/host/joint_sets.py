@@ -34,7 +34,7 @@ from drivers.host.clock import HeldClock
 from drivers.host.dialogue import IsPreempted, Staged, Stopped, word_passed_by_all, words_of
 from drivers.host.ledger import is_silence
 from drivers.host.line import GRACE, Line, Priority
-from drivers.playing import Layer
+from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import (
     HEARTBEAT,
     LATCHED,
@@ -248,7 +248,7 @@ class JointSets:
         every = self._members.amplifiers.values()
         return self.is_incomplete or any(map(attrgetter("is_in_doubt"), every))
 
-    def refusal_of(self, layers: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
+    def refusal_of(self, layers: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
         """Return why ledgers would not admit layers by amplifier now; None if all would.
 
         Not while a set is in doubt, which is silenced first.
@@ -264,7 +264,9 @@ class JointSets:
         return _merged(refusals) if refusals else None
 
     async def play(
-        self, layers: Mapping[str, Sequence[Layer]], is_preempted: IsPreempted | None = None
+        self,
+        layers: Mapping[str, Sequence[AmplifierLayer]],
+        is_preempted: IsPreempted | None = None,
     ) -> Played | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 

@@ -23,7 +23,7 @@ from drivers.host.bounds import (
     refused,
     wire_limits,
 )
-from drivers.playing import Layer, Playback
+from drivers.playing import AmplifierLayer, Playback
 from drivers.protocol.definition import QUANTITIES, has_feature
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, is_vibrating
@@ -85,7 +85,7 @@ class Ledger:
             self._budget = earlier._budget
 
     def admit(
-        self, layers: Sequence[Layer], now: float, *, delay: float = COMMIT_DELAY
+        self, layers: Sequence[AmplifierLayer], now: float, *, delay: float = COMMIT_DELAY
     ) -> tuple[LayerSet, ...]:
         """Return layers as the wire has them, `valid_for` shortened to what time is left.
 
@@ -382,7 +382,7 @@ def _lasts(one: LayerSet) -> float:
     return _fade(one) + (_VALID_FOR.from_wire(one.valid_for) or math.inf)
 
 
-def is_silence(layers: Sequence[Layer]) -> bool:
+def is_silence(layers: Sequence[AmplifierLayer]) -> bool:
     """Whether layers only fall silent."""
     for layer in layers:  # noqa: SIM110  a generator would be a call for each
         if layer.tones or layer.renew:

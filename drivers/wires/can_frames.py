@@ -92,7 +92,7 @@ _FIRST, _EACH = 2, 3  # words
 _PACKED = struct.Struct("<HB8s")
 
 
-class Message(NamedTuple):
+class CanMessage(NamedTuple):
     """A message: its sequence number, type and words."""
 
     number: int
@@ -148,7 +148,7 @@ class Assembler:
         self._heard = self.began = -math.inf
         self.given_up: tuple[int, float] | None = None
 
-    def add(self, data: bytes, now: float) -> Message | None:
+    def add(self, data: bytes, now: float) -> CanMessage | None:
         """Take the data of a frame at a time [s]; returns the message that it completes."""
         self._counters.frames_in += 1
         if not self._is_frame(data):
@@ -187,7 +187,7 @@ class Assembler:
             return True
         return 0 < (data[0] - self._number) % NUMBER_MAX <= NUMBER_MAX // 2
 
-    def _whole(self) -> Message | None:
+    def _whole(self) -> CanMessage | None:
         if 0 not in self._frames:
             return None
         head = self._frames[0]
@@ -196,7 +196,7 @@ class Assembler:
             return None
         self._is_ended = True
         body = head[4:] + b"".join(self._frames[index][2:] for index in range(1, count))
-        return Message(self._number, head[2], struct.unpack_from(f"<{head[3]}H", body))
+        return CanMessage(self._number, head[2], struct.unpack_from(f"<{head[3]}H", body))
 
 
 _MAX_LENGTH = 512  # characters without a terminator; ten times the longest frame

@@ -26,11 +26,11 @@ from drivers.wires.modbus_frames import (
     ECHO_SIZE,
     EXCEPTIONS,
     HEAD,
-    IDENTITY,
     IDENTITY_COUNT,
+    IDENTITY_REGISTER,
     PRESENT,
     READ_SIZE,
-    REPLY,
+    REPLY_OFFSET,
     RESPONSE_SIZE,
     RTU,
     RTU_MAX,
@@ -38,7 +38,7 @@ from drivers.wires.modbus_frames import (
     WRITE,
     WRITE_SIZE,
     AduReader,
-    Message,
+    Pdu,
     Read,
     Response,
     Write,
@@ -135,7 +135,7 @@ class _Request:
 
     name: str
     tag: int
-    message: Message
+    message: Pdu
     frame: bytes
     has_reply: bool = True
 
@@ -181,7 +181,7 @@ class ModbusWire(Wire):
             return b"".join(each.frame for each in sent)
         self._sizes.setdefault(address, WIDEST)
         if name == "Hello":
-            message = Read(dev_id=address, address=IDENTITY, count=IDENTITY_COUNT)
+            message = Read(dev_id=address, address=IDENTITY_REGISTER, count=IDENTITY_COUNT)
             self._request = self._sent(name, 0, message)
         else:
             self._request = self._written(address, name, values)
@@ -202,7 +202,7 @@ class ModbusWire(Wire):
     def _read_of(self, write: _Request) -> _Request:
         """Return the request that reads the reply to one that is written."""
         unit = write.message.dev_id
-        first = MESSAGES[write.name].number * BOX + REPLY
+        first = MESSAGES[write.name].number * BOX + REPLY_OFFSET
         count = HEAD + reply_words(write.name, *self._sizes[unit])
         return self._sent(write.name, write.tag, Read(dev_id=unit, address=first, count=count))
 
@@ -273,7 +273,7 @@ class ModbusWire(Wire):
     def _time(self, characters: int) -> float:
         return _BITS * characters / self._baud if self._baud else 0.0
 
-    def _sent(self, name: str, tag: int, message: Message) -> _Request:
+    def _sent(self, name: str, tag: int, message: Pdu) -> _Request:
         """Return a request with its frame, under the next transaction number."""
         self._number = self._number % 0xFFFF + 1
         self._unawaited.discard(self._number)

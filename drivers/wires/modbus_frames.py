@@ -37,11 +37,11 @@ EXCEPTION = 0x80
 WRITE_SIZE, ECHO_SIZE, READ_SIZE, RESPONSE_SIZE = 9, 8, 8, 5
 """Bytes on RTU of a write and its response, of a read and its response; registers not counted."""
 
-BOX, REPLY, HEAD = 256, 128, 2
+BOX, REPLY_OFFSET, HEAD = 256, 128, 2
 """Registers of a message, offset of its reply, registers of that before its words."""
 AREA = HEAD + MAX_WORDS
 """Registers of a reply, with zeros behind it."""
-IDENTITY, IDENTITY_COUNT = 1065, 2 + len(TEXTS) * TEXT_MAX // 2
+IDENTITY_REGISTER, IDENTITY_COUNT = 1065, 2 + len(TEXTS) * TEXT_MAX // 2
 """First register of the identity (tag 0, versions, texts padded with zeros), and their number."""
 PRESENT = ("GetCaps", "GetStatus", "GetFaults")
 """Messages whose replies are of the moment at which they are read, written before or not."""
@@ -73,7 +73,7 @@ _RESPONSE_KINDS: Mapping[int, type[ModbusPDU]] = {
 
 RTU, TCP = FramerRTU(_RESPONSES), FramerSocket(_RESPONSES)
 """pymodbus's framers, which make frames."""
-Message: TypeAlias = ModbusPDU
+Pdu: TypeAlias = ModbusPDU
 """A request or a response: function_code, dev_id, transaction_id, address, count, registers."""
 Read, Write = ReadInputRegistersRequest, WriteMultipleRegistersRequest
 """Requests of a host."""
@@ -103,7 +103,7 @@ def framed(unit: int, pdu: bytes, transaction: int = 0, *, is_rtu: bool) -> byte
     return (RTU if is_rtu else TCP).encode(pdu, unit, transaction)
 
 
-def pdu_of(message: Message) -> bytes:
+def pdu_of(message: Pdu) -> bytes:
     """Return the PDU of a message."""
     return bytes([message.function_code]) + message.encode()
 
@@ -118,7 +118,7 @@ def write_pdu(address: int, registers: Sequence[int]) -> bytes:
     return pdu_of(Write(address=address, registers=[*registers]))
 
 
-def answer(request: Message, registers: Sequence[int] = ()) -> bytes:
+def answer(request: Pdu, registers: Sequence[int] = ()) -> bytes:
     """Return the PDU of the response to a request; registers: that were read."""
     if request.function_code == WRITE:
         return pdu_of(WriteMultipleRegistersResponse(address=request.address, count=request.count))
@@ -130,7 +130,7 @@ def exception_to(function: int, code: int) -> bytes:
     return pdu_of(ExceptionResponse(function, code))
 
 
-def parse_request(adu: Adu) -> Message | None:
+def parse_request(adu: Adu) -> Pdu | None:
     """Return the request of an ADU that reads or writes registers; None for any other."""
     pdu = adu.pdu
     if pdu[0] not in _REQUEST_KINDS:
@@ -145,7 +145,7 @@ def parse_request(adu: Adu) -> Message | None:
     return request if is_whole and 1 <= request.count <= _COUNT_MAX[pdu[0]] else None
 
 
-def response_to(request: Message | None, adu: Adu) -> Response | None:
+def response_to(request: Pdu | None, adu: Adu) -> Response | None:
     """Read an ADU as the response to a request; None if it is not.
 
     It has the unit, the transaction and the function of the request, and as many registers, or
@@ -183,7 +183,7 @@ class AduReader:
         self._waits, self._is_host = waits, is_host
         self._is_lost = False  # behind damaged bytes
 
-    def feed(self, data: bytes, request: Message | None = None) -> list[Adu]:
+    def feed(self, data: bytes, request: Pdu | None = None) -> list[Adu]:
         """Return the ADUs that these bytes complete, in order; request: whose response is due."""
         data = self.rest + data
         if self._is_rtu:
@@ -211,7 +211,7 @@ class AduReader:
         self.rest, self._is_lost = b"", False
         return [*found, Adu(0, b"", raw=data)] if data else found
 
-    def _split_rtu(self, data: bytes, request: Message | None, *, waits: bool) -> list[Adu]:
+    def _split_rtu(self, data: bytes, request: Pdu | None, *, waits: bool) -> list[Adu]:
         found: list[Adu] = []
         start, rest = 0, -1  # where a frame is looked for, and where one may become whole
         tries = 0

@@ -20,7 +20,7 @@ from cobs import cobs
 from drivers.protocol.definition import MAX_WORDS, TEXTS
 from drivers.protocol.records import Refusal, Values
 
-REPLY = 0x80
+REPLY_BIT = 0x80
 NEUTRAL = 0
 """Version of what every version of the protocol has: Hello, its reply, and a refused version."""
 
@@ -54,7 +54,7 @@ class Frame(NamedTuple):
     @property
     def is_reply(self) -> bool:
         """Whether it is a reply."""
-        return bool(self.kind & REPLY)
+        return bool(self.kind & REPLY_BIT)
 
 
 def encode_frame(frame: Frame, words: Sequence[int] = ()) -> bytes:

@@ -15,7 +15,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.urls import ADDRESS, ADDRESS_MAX, BAUD, AmplifierUrl
 from drivers.wires.serial_frames import (
     NEUTRAL,
-    REPLY,
+    REPLY_BIT,
     Frame,
     FrameReader,
     encode_frame,
@@ -71,10 +71,10 @@ class SerialWire(Wire):
         arrivals: list[Arrival] = []
         for frame in self._reader.feed(data):
             self.counters.frames_in += 1
-            pending, kind = self._pending, frame.kind ^ REPLY
+            pending, kind = self._pending, frame.kind ^ REPLY_BIT
             if (
                 pending is None
-                or kind & REPLY
+                or kind & REPLY_BIT
                 or (frame.address, frame.sequence) != (pending.address, pending.sequence)
             ):
                 arrivals += self._unexpected(frame)
@@ -111,7 +111,7 @@ class SerialWire(Wire):
         )
         last = self._replied
         # Of another request that comes twice, late, each reply is of its own moment.
-        if last is None or frame == last or last.kind != HELLO | REPLY:
+        if last is None or frame == last or last.kind != HELLO | REPLY_BIT:
             return []
         is_same = (frame.address, frame.sequence) == (last.address, last.sequence)
         return [Several(frame.address)] if is_same else []

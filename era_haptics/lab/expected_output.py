@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from typing import Protocol, TypeAlias
 
-from drivers.playing import LAYERS_MAX, Playback, Transition, Voice, playback_of
+from drivers.playing import LAYERS_MAX, Playback, Voice, VoiceTransition, playback_of
 from drivers.protocol.definition import (
     HIGH_STEPS,
     MAX_AHEAD,
@@ -44,7 +44,7 @@ class UncertainPlayback:
         self.playback = playback
         self.half = [0.0] * LAYERS_MAX
         # Channels of transitions that are gone, and until when [s] they may still play.
-        self._ghosts: list[tuple[int, Transition, float]] = []
+        self._ghosts: list[tuple[int, VoiceTransition, float]] = []
 
     @property
     def lag(self) -> float:
@@ -188,7 +188,7 @@ class UncertainPlayback:
             tones = [each for each in one.commands if each.channel == channel]
             for tone in tones if one.layer in unsure else ():
                 extra += tone.peak / _PER_LEVEL
-        groups: dict[float, list[Transition]] = {}
+        groups: dict[float, list[VoiceTransition]] = {}
         for voice in self.playback.all_voices[channel]:
             if voice.layer in unsure and not voice.has_ended:
                 extra += voice.peak(began) + voice.transition.radius
@@ -206,7 +206,7 @@ class UncertainPlayback:
         return max(lowest - extra, 0.0), highest + extra
 
 
-def radius_of(way: Transition, start: float, end: float) -> float:
+def radius_of(way: VoiceTransition, start: float, end: float) -> float:
     """Return by how much an amplitude may differ from that in the middle of an interval.
 
     Its transition has begun by then.
@@ -217,11 +217,11 @@ def radius_of(way: Transition, start: float, end: float) -> float:
     if not way.radius:
         return reach
     # The first amplitude counts the less the farther its transition has led.
-    left = Transition(way.start, way.step, way.radius, 0, way.end, (0j,) * len(way.knots))
+    left = VoiceTransition(way.start, way.step, way.radius, 0, way.end, (0j,) * len(way.knots))
     return reach + abs(left.at(since))
 
 
-def _reached(way: Transition, time: float) -> complex:
+def _reached(way: VoiceTransition, time: float) -> complex:
     """Return the amplitude at a time, or at the start of a transition that has begun sooner."""
     return way.at(max(time, way.start))
 

@@ -31,7 +31,14 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from drivers.protocol.definition import BY_NUMBER, MAX_WORDS, Message, nak_of, read_request
 from drivers.protocol.records import Refusal
 from drivers.protocol.sets import is_earlier_part
-from drivers.wires.modbus_frames import AREA, BOX, IDENTITY, PRESENT, REPLY, pack_identity
+from drivers.wires.modbus_frames import (
+    AREA,
+    BOX,
+    IDENTITY_REGISTER,
+    PRESENT,
+    REPLY_OFFSET,
+    pack_identity,
+)
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 
@@ -71,9 +78,9 @@ class Unit:
     def read(self, address: int, count: int) -> list[int] | ExcCodes:
         """Return registers of a reply, or of the identity."""
         number, offset = divmod(address, BOX)
-        first, area = IDENTITY, [*pack_identity(self.amplifier.identity)]
-        if offset >= REPLY and number in BY_NUMBER:
-            first, area = number * BOX + REPLY, self._reply(BY_NUMBER[number])
+        first, area = IDENTITY_REGISTER, [*pack_identity(self.amplifier.identity)]
+        if offset >= REPLY_OFFSET and number in BY_NUMBER:
+            first, area = number * BOX + REPLY_OFFSET, self._reply(BY_NUMBER[number])
         if not first <= address <= address + count <= first + len(area):
             return ExcCodes.ILLEGAL_ADDRESS
         if first // BOX in BY_NUMBER and BY_NUMBER[first // BOX].name == "SetAddress":

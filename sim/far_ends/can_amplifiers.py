@@ -55,7 +55,7 @@ from drivers.wires.can_frames import (
     SOCKETCAND,
     Assembler,
     CanFrame,
-    Message,
+    CanMessage,
     cob_id,
     pack_frames,
     segments,
@@ -249,7 +249,7 @@ class CanAmplifiers(FarEnd):
         elif node is not None and kind == cob_id("sdo_request"):
             node.read(frame.data, now)
 
-    def _broadcast(self, message: Message, now: float) -> None:
+    def _broadcast(self, message: CanMessage, now: float) -> None:
         known = BY_NUMBER.get(message.type)
         if known is not None and known.is_broadcast:
             for node in self._nodes.values():
@@ -328,7 +328,7 @@ class _Node:
         if self.is_listening and (message := self._requests.add(data, now)) is not None:
             self.carry_out(message, now)
 
-    def carry_out(self, message: Message, now: float) -> None:
+    def carry_out(self, message: CanMessage, now: float) -> None:
         """Carry out a message; one without a number has no reply, nor a part of a set."""
         sender = self.number
         try:
@@ -341,7 +341,7 @@ class _Node:
         if self.number != sender:
             self.boot(now)
 
-    def _words(self, message: Message, now: float) -> list[int]:
+    def _words(self, message: CanMessage, now: float) -> list[int]:
         """Carry out a request; returns the words of its reply, if any. Raises Refusal."""
         if message.type == HELLO:
             return IDENTITY.pack(self._amplifier.identity)

@@ -14,20 +14,20 @@ from drivers.protocol.sets import is_earlier_part
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
-    IDENTITY,
+    IDENTITY_REGISTER,
     PRESENT,
     READS,
-    REPLY,
+    REPLY_OFFSET,
     WRITE,
     Adu,
     AduReader,
+    Pdu,
     answer,
     exception_to,
     framed,
     pack_identity,
     parse_request,
 )
-from drivers.wires.modbus_frames import Message as Pdu
 from sim.transport.far_end import AmplifierPort, FarEnd, Send
 
 FRAME_TIMEOUT = 0.02
@@ -162,11 +162,11 @@ class _Unit:
     def _read(self, address: int, count: int, now: float) -> Sequence[int]:
         """Return registers; none where some of them cannot be read."""
         number, offset = divmod(address, BOX)
-        if offset >= REPLY and number in BY_NUMBER:
-            first = number * BOX + REPLY
+        if offset >= REPLY_OFFSET and number in BY_NUMBER:
+            first = number * BOX + REPLY_OFFSET
             area = self._reply_area(BY_NUMBER[number], now)
         else:
-            first, area = IDENTITY, pack_identity(self.amplifier.identity)
+            first, area = IDENTITY_REGISTER, pack_identity(self.amplifier.identity)
         is_within = first <= address <= address + count <= first + len(area)
         return area[address - first :][:count] if is_within else ()
 

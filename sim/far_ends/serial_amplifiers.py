@@ -21,7 +21,7 @@ from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import is_earlier_part
 from drivers.wires.serial_frames import (
     NEUTRAL,
-    REPLY,
+    REPLY_BIT,
     Frame,
     FrameReader,
     encode_frame,
@@ -68,7 +68,7 @@ class SerialAmplifiers(FarEnd):
         try:
             if frame.type == HELLO:
                 payload = pack_identity(amplifier.identity)
-                return frame._replace(kind=HELLO | REPLY, payload=payload, version=NEUTRAL)
+                return frame._replace(kind=HELLO | REPLY_BIT, payload=payload, version=NEUTRAL)
             payload = self._payload(frame, amplifier, now)
         except Refusal as refusal:
             words = unpack_words(frame.payload[: len(frame.payload) & ~1])
@@ -76,8 +76,8 @@ class SerialAmplifiers(FarEnd):
                 return None
             payload = pack_words(nak_of(refusal, frame.type))
             version = NEUTRAL if refusal.code == "UNSUPPORTED_VERSION" else VERSION
-            return frame._replace(kind=NAK | REPLY, payload=payload, version=version)
-        return frame._replace(kind=frame.kind | REPLY, payload=payload) if payload else None
+            return frame._replace(kind=NAK | REPLY_BIT, payload=payload, version=version)
+        return frame._replace(kind=frame.kind | REPLY_BIT, payload=payload) if payload else None
 
     def _payload(self, frame: Frame, amplifier: AmplifierPort, now: float) -> bytes:
         """Carry out a request by an amplifier; returns the payload of its reply, if it has one.

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from drivers.errors import CommandError
-from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Place
+from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Endpoint
 from drivers.wires.can_frames import BITRATE
 from drivers.wires.known import address_of
 from model.errors import InputError
@@ -296,7 +296,7 @@ def _wire_of_option(text: str, option: str, defaults: SimulatedWire) -> Simulate
 
 def _wire_of_url(name: str, url: str, defaults: SimulatedWire) -> SimulatedWire:
     """The wire that a URL names; amplifiers whose URLs name one line share it."""
-    kind, place = _KIND_OF_SCHEME.get(url.partition("://")[0].lower()), Place()
+    kind, place = _KIND_OF_SCHEME.get(url.partition("://")[0].lower()), Endpoint()
     if kind is not None:
         try:
             address = address_of(url)

@@ -31,7 +31,7 @@ from controller.learning.estimator_process import (
 from controller.learning.learning import Learning
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.identification.forward import Sensor
@@ -380,6 +380,6 @@ def test_answers_of_another_table_are_refused() -> None:
 
 def test_no_command_comes_by_a_message() -> None:
     """What an amplifier could play is refused, wherever it stands in it."""
-    layer = Layer(0, (Tone(0, 110.0, 1.0),))
+    layer = AmplifierLayer(0, (AmplifierTone(0, 110.0, 1.0),))
     with pytest.raises(pickle.UnpicklingError, match="drivers"):
         unpacked(pickle.dumps(Note([layer])))  # type: ignore[arg-type]

@@ -29,7 +29,7 @@ from drivers.errors import LinkError, LinkTimeout
 from drivers.playing import Playback, Voice
 from drivers.ports import Port, SerialPort, open_connection
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from drivers.urls import Place
+from drivers.urls import Endpoint
 from era_haptics.lab.expected_output import ExpectedOutputs, UncertainPlayback
 from virtual_lines import in_virtual_time
 
@@ -45,7 +45,7 @@ def test_device_is_opened_alone_with_low_latency_and_its_settings(
     made = Mock()
     made.return_value.fileno.return_value = near
     monkeypatch.setattr(ports.serial, "Serial", made)
-    ports._open_device(Place(device, baud=19_200, parity="O", stop=2))
+    ports._open_device(Endpoint(device, baud=19_200, parity="O", stop=2))
     made.return_value.set_low_latency_mode.assert_called_once_with(True)
     settings = {key: made.call_args.kwargs[key] for key in ("baudrate", "parity", "stopbits")}
     assert settings == {"baudrate": 19_200, "parity": parity, "stopbits": 2}
@@ -63,7 +63,9 @@ async def test_port_that_fails_amid_its_opening_is_released(
     name = os.ttyname(near)
 
     async def open_it() -> Port:
-        return await ports.open_port(Place(name, baud=9600), lambda data: None, lambda cause: None)
+        return await ports.open_port(
+            Endpoint(name, baud=9600), lambda data: None, lambda cause: None
+        )
 
     def fail(port: serial.Serial) -> None:
         raise OSError(errno.EIO, "gone")

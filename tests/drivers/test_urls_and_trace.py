@@ -19,7 +19,7 @@ from amplifier_eds import eds_text
 from drivers import trace
 from drivers.by_hand.reaching import status_rows
 from drivers.errors import CommandError
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from drivers.trace import Direction, TraceWriter, tracing
@@ -44,7 +44,7 @@ async def test_host_drives_an_amplifier_of_another_edition(wire: str, age: str) 
     """It plays and stops; what is not stated is None, what is not known is ignored."""
     end = MemoryLine(wire, "a")
     group = await group_of(end)
-    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
+    await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
     await group.beat()
     status = await end.hosts["a"].read_status()
     assert end.levels("a") == [0.5, 0.0]

@@ -19,7 +19,7 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import FAULTS, STATES
 from model.arrays import FloatArray
 from registry import threads
@@ -236,10 +236,12 @@ async def playing(
         yield instrument, program, group, host
 
 
-def layer(level: float, *, ramp: float = 0.0, keep_phase: bool = False) -> Layer:
+def layer(level: float, *, ramp: float = 0.0, keep_phase: bool = False) -> AmplifierLayer:
     """Two tones of 100 Hz, the second at full level and 120 degrees behind."""
-    first = Tone(0, 100.0, level, 30.0, keep_phase=keep_phase)
-    return Layer(0, (first, Tone(1, 100.0, 1.0, -90.0, keep_phase=keep_phase)), ramp)
+    first = AmplifierTone(0, 100.0, level, 30.0, keep_phase=keep_phase)
+    return AmplifierLayer(
+        0, (first, AmplifierTone(1, 100.0, 1.0, -90.0, keep_phase=keep_phase)), ramp
+    )
 
 
 async def state(host: Amplifier, name: str) -> None:
@@ -251,7 +253,7 @@ async def state(host: Amplifier, name: str) -> None:
                 return
 
 
-async def failing(group: Group, one: Layer) -> None:
+async def failing(group: Group, one: AmplifierLayer) -> None:
     """Play until that fails."""
     async with asyncio.timeout(PATIENCE):
         await group.apply({"a": [one]})

@@ -49,7 +49,7 @@ from drivers.by_hand.actions import identify
 from drivers.errors import CommandError, LinkError
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
 from era_haptics.lab.conformance import judge_client
 from era_haptics.lab.conformance.contract import of_kind
@@ -382,7 +382,7 @@ async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_
         group = Group(amplifiers, watchdog=2.0)
         await group.open()
         await group.arm()
-        layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
+        layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
         await group.apply(dict.fromkeys(amplifiers, layers))
         statuses = [await each.read_status() for each in amplifiers.values()]
         assert [status["levels"] for status in statuses] == [[5000], [5000]]

@@ -19,7 +19,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_acceleration
 from drivers.host.amplifier import measure_tones, read_sensors
-from drivers.playing import Tone, Transition, Voice
+from drivers.playing import AmplifierTone, Voice, VoiceTransition
 from drivers.protocol.definition import READING_STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
@@ -73,7 +73,7 @@ def test_angle_is_the_frequency_word_times_the_clock(two_amplifiers: Rig) -> Non
     clock.steer(-123, 40.0)
     for time in (41.3, 48.9999, 49.0001, 20_000.7):
         for word, began in ((1999, 41.0), (2000, time - 0.01), (9037, time)):
-            way = Transition(began, 0.0, 0j, 1 + 0j, began)
+            way = VoiceTransition(began, 0.0, 0j, 1 + 0j, began)
             (term,) = motion_of([Voice(0, word / 20, began, way)], clock.straight(time), stroke=1.0)
             angle = term.omega * (time - term.start)
             moved = (term.c0 * complex(math.cos(angle), math.sin(angle))).imag
@@ -86,7 +86,7 @@ def test_tone_goes_on_where_the_clock_goes_round(coarse_rig: Rig) -> None:
     """A steady tone of 110.05 Hz has no step and no new phase at 20 s and at 40 s."""
     bench = Bench(coarse_rig, now=18.0)
     bench.place_fingers({"a": AT}, now=18.0)
-    firmware_machine_play(bench, Tone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
+    firmware_machine_play(bench, AmplifierTone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
     before, over, after = phases(bench, (19.9, 20.4, 40.3), 110.05)
     assert before == pytest.approx(over, abs=1e-5)
     assert before == pytest.approx(after, abs=1e-5)
@@ -99,7 +99,7 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
     bench.place_fingers({"a": AT}, now=0.0)
     for name, frequency in (("left", 110.0), ("right", 170.0)):
         firmware_machine_play(
-            bench, Tone(0, frequency, 0.5), now=0.0, name=name, watchdog=2.0, ramp=0.02
+            bench, AmplifierTone(0, frequency, 0.5), now=0.0, name=name, watchdog=2.0, ramp=0.02
         )
     found = phases(bench, (3.0, 5.0), 110.0, 170.0)
     left, right = (found[1] - found[0]) / (2 * math.pi * np.array([110.0, 170.0]))
@@ -125,7 +125,7 @@ def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
         bench.place_fingers({"a": AT}, now=0.0)
         values = {"session": FIRMWARE_MACHINE_SESSION, "watchdog": 2000, "shift": shift}
         bench.exchange("main", "Arm", values, now=0.0)
-        firmware_machine_play(bench, Tone(0, 110.0, 0.5), now=0.1)
+        firmware_machine_play(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
         found.append(phases(bench, (3.0,), 110.0)[0, 0])
     assert math.degrees(found[1] - found[0]) == pytest.approx(360 * 110 * 5 * 20 / 65536, abs=1e-3)
 
@@ -286,7 +286,9 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
         bench_driving_arm(bench, 0.25, now=START)
-        firmware_machine_play(bench, Tone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
+        firmware_machine_play(
+            bench, AmplifierTone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02
+        )
     for step in range(1, 401):
         prompt.advance(START + 0.1 + step * 0.005)
     for bench in (prompt, late):
@@ -324,7 +326,7 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
         for step in range(1, 101):
             now = START + 0.003 * step
             if step in (20, 45, 70):  # at 20 abruptly
-                tone = Tone(step % 4, 100.0 + step, 1.0)
+                tone = AmplifierTone(step % 4, 100.0 + step, 1.0)
                 firmware_machine_play(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
             bench.advance(now)
             if step == 60:
@@ -352,7 +354,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
     bench_driving_arm(bench, 0.25, now=0.0)
-    firmware_machine_play(bench, Tone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
+    firmware_machine_play(bench, AmplifierTone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
     bench.advance(86_400.0)
     felt = bench.felt(86_400.0 - 9.9, 86_400.0)
     assert felt["a"].peak.max() < 1e-9
@@ -361,7 +363,7 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
 
 A, B = (0.1, 0.07), (0.29, 0.2)
 FREQUENCY = 210.0
-FULL_STROKE = Tone(1, FREQUENCY, 1.0)
+FULL_STROKE = AmplifierTone(1, FREQUENCY, 1.0)
 
 
 def expected(rig: Rig, loads: tuple[FingertipLoad, ...]) -> FloatArray:
@@ -435,7 +437,9 @@ def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
     """A bench that plays on through a touch at 0.5 s, up to 1.2 s."""
     bench = Bench(rig, now=0.0)
     bench.place_fingers({"a": PLACE_A}, now=0.0)
-    firmware_machine_play(bench, Tone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0)
+    firmware_machine_play(
+        bench, AmplifierTone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0
+    )
     keep_alive(bench, 0.5)
     place(bench)
     keep_alive(bench, 1.2)

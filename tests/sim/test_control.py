@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from drivers.by_hand.reaching import random_session
 from drivers.errors import CommandError, LinkError
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import STATES
 from era_haptics.lab.cli import app
 from era_haptics.lab.witness.capture import read_capture
@@ -210,7 +210,7 @@ async def felt_after(rig: Rig, imperfections: Imperfections, *changes: dict[str,
     await asked(0.1, op="fingers", fingers={"1": [0.1, 0.08]})
     for change in changes:
         await asked(0.1, op="plate", **change)
-    play(bench, Tone(0, 110.0, 0.5), now=0.2, token=9, watchdog=2.0)
+    play(bench, AmplifierTone(0, 110.0, 0.5), now=0.2, token=9, watchdog=2.0)
     reply = await asked(2.0, op="felt", since_s=1.5, until_s=2.0)
     return float(reply["fingers"]["1"]["amplitude_m_s2"][0][0])
 
@@ -245,8 +245,8 @@ async def _drive(url: str) -> None:
         amplifier = await lines.amplifier(url, GuardLimits(40.0, 500.0, 1.0), name="main")
         await amplifier.open()
         assert (await amplifier.arm(random_session()))["state"] == STATES["OPERATION_ENABLED"]
-        tone = Tone(0, 110.0, 0.4, 90.0)
-        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.01)], now=True)
+        tone = AmplifierTone(0, 110.0, 0.4, 90.0)
+        await amplifier.stage(1, [AmplifierLayer(0, (tone,), ramp=0.01)], now=True)
         await amplifier.ping()
         assert (await amplifier.stop()).is_confirmed
         assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]

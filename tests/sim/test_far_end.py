@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.playing import Tone
+from drivers.playing import AmplifierTone
 from firmware_machine import play
 from long_form import full_disk
 from model.errors import InputError
@@ -71,7 +71,7 @@ def test_tones_are_told_apart_with_their_phases() -> None:
         recording(signal[:4, None]).tones([110.0, 120.0])
 
 
-HALF_STROKE = Tone(0, 110.0, 0.5)
+HALF_STROKE = AmplifierTone(0, 110.0, 0.5)
 
 
 @pytest.mark.parametrize("ending", ["csv", "wav", "uff"])

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from controller.cli.main import run
 from daemons import SESSION, far_end_process, playing
-from drivers.playing import Tone
+from drivers.playing import AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
 from firmware_machine import play
 from model.rig.rig import Rig
@@ -59,7 +59,7 @@ async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None
             assert line == f"main: serial://{link}?baud=921600\n"
             assert link.readlink().is_char_device()
             assert control.is_socket()
-            tone = Tone(2, 110.0, 0.25)
+            tone = AmplifierTone(2, 110.0, 0.25)
             async with playing(line.split()[1], tone, watchdog=2.0) as amplifier:
                 status = await amplifier.read_status()
             assert (status["state"], status["token"]) == (STATES["OPERATION_ENABLED"], 1)
@@ -129,7 +129,7 @@ def test_view_shows_eras_fingers_and_peaks_in_place(coarse_rig: Rig) -> None:
     # 0.25 of 0.3048 m from the left, 0.05 of 0.2286 m from below.
     assert rows[-1 - int(0.05 / 0.2286 * len(rows))].index("O") == int(0.25 / 0.3048 * 28)
     assert set("".join(rows)) == {"E", "O", " "}
-    play(bench, Tone(0, 40.0, 0.5), now=0.1, watchdog=2.0)
+    play(bench, AmplifierTone(0, 40.0, 0.5), now=0.1, watchdog=2.0)
     bench.advance(1.0)
     bench.advance(1.3)
     moving = shown(context, plate)
@@ -159,7 +159,7 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
         noisy = {"at_m": [0.2, 0.1], "noise_m_s2_rthz": 0.01, "resolution_m_s2": 0.5}
         assert (await far_end.ask("sensors", sensors={"P1": noisy}))["ok"]
         assert (await far_end.ask("record", file=str(file)))["ok"]
-        tone = Tone(0, 110.0, 0.5)
+        tone = AmplifierTone(0, 110.0, 0.5)
         async with playing(far_end.urls["main"], tone, watchdog=0.5) as amplifier:
             assert await far_end.ask("step", seconds=0.4) == {"ok": True, "time_s": 0.4}
             assert (await far_end.ask("state"))["amplifiers"]["main"]["levels"][0] == 0.5
@@ -211,7 +211,7 @@ async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Pa
         far_end_process(
             write_rig(tmp_path / "rig.yaml"), "--serial", "--virtual-time", "--sensor", "P1=0.0,0.0"
         ) as far_end,
-        playing(far_end.urls["main"], Tone(0, 110.0, 0.5), watchdog=2.0),
+        playing(far_end.urls["main"], AmplifierTone(0, 110.0, 0.5), watchdog=2.0),
     ):
         await far_end.ask("inject_fault", fault="over_temperature", lasts=1.0)
         await far_end.ask("step", seconds=0.8)

@@ -48,7 +48,7 @@ from controller.process.log import LogThread
 from drivers.host.amplifier import WATCHDOG as AMPLIFIER_WATCHDOG
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import unpack_layers
 from model.rig.rig import Rig
@@ -601,14 +601,16 @@ SESSION = 9
 
 
 @asynccontextmanager
-async def playing(url: str, tone: Tone, *, watchdog: float) -> AsyncIterator[AmplifierAmplifier]:
+async def playing(
+    url: str, tone: AmplifierTone, *, watchdog: float
+) -> AsyncIterator[AmplifierAmplifier]:
     """Open, arm and play without a ramp; watchdog [s]: of which it falls silent after this."""
     lines = Lines()
     try:
         amplifier = await lines.amplifier(url, GuardLimits(40, 500, 1), name=url)
         await amplifier.open()
         await amplifier.arm(SESSION, watchdog)
-        await amplifier.stage(1, [Layer(0, (tone,), ramp=0.0)], now=True)
+        await amplifier.stage(1, [AmplifierLayer(0, (tone,), ramp=0.0)], now=True)
         yield amplifier
     finally:
         await lines.close()

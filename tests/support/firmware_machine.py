@@ -20,7 +20,7 @@ import numpy as np
 from cobs import cobs
 
 import hand_written as hand
-from drivers.playing import Tone
+from drivers.playing import AmplifierTone
 from drivers.protocol.definition import (
     BY_NUMBER,
     EVENT,
@@ -373,7 +373,7 @@ def bench_driving_arm(bench: Bench, watchdog: float, *, now: float, name: str = 
 
 def play(
     bench: Bench,
-    *tones: Tone,
+    *tones: AmplifierTone,
     now: float,
     name: str = "main",
     token: int = 1,

@@ -32,7 +32,7 @@ from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
 from drivers.host.dialogue import SILENCING, Stopped
 from drivers.host.group import Group
 from drivers.host.line import Priority
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import BOOT_TIME, STATES
 from drivers.protocol.sets import Envelope
 from real_wires import after_each
@@ -167,26 +167,28 @@ class RandomGroup(Chain):
     def _ramp(self) -> float:
         return self.rng.choice((0.0, 0.005, 0.01, 0.03))
 
-    def layers(self) -> list[Layer]:
+    def layers(self) -> list[AmplifierLayer]:
         """Draw layers to play."""
         numbers = self.rng.sample(range(_LAYERS), self.rng.choice((1, 1, 1, 2)))
         return [self._layer(number) for number in numbers]
 
-    def _layer(self, number: int) -> Layer:
+    def _layer(self, number: int) -> AmplifierLayer:
         kind = self.rng.random()
         valid_for = self.rng.choice((0.0, 0.0, 0.05, 0.3))
         if kind < 0.15:
-            return Layer(number, (), self._ramp())
+            return AmplifierLayer(number, (), self._ramp())
         if kind < 0.25:
-            return Layer(number, (), self._ramp(), valid_for, renew=True)
+            return AmplifierLayer(number, (), self._ramp(), valid_for, renew=True)
         channels = self.rng.sample(range(_CHANNELS), self.rng.choice((1, 2)))
         tones = tuple(self._tone(channel, number) for channel in channels)
-        return Layer(number, tones, self._ramp(), valid_for, after=self.rng.random() < 0.15)
+        return AmplifierLayer(
+            number, tones, self._ramp(), valid_for, after=self.rng.random() < 0.15
+        )
 
-    def _tone(self, channel: int, number: int) -> Tone:
+    def _tone(self, channel: int, number: int) -> AmplifierTone:
         rng = self.rng
         shapes = [self._shape() if rng.random() < 0.3 else None for _ in range(2)]
-        return Tone(
+        return AmplifierTone(
             *(channel, rng.choice((100.0, 100.0, 150.0 + number)), rng.choice((0.0, 0.1, 0.2))),
             rng.uniform(-180, 179),
             keep_phase=rng.random() < 0.4,

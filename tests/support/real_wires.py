@@ -33,7 +33,7 @@ from drivers.errors import LinkDegraded, LinkError
 from drivers.host.amplifier import WATCHDOG
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import STATES, reading
 from drivers.protocol.definition import STATUS as DEFINITION_STATUS
 from drivers.protocol.records import Record, Values
@@ -253,9 +253,9 @@ def layer(
     *tones: tuple[int, float, float] | tuple[int, float, float, float],
     number: int = 0,
     ramp: float = 0.02,
-) -> Layer:
+) -> AmplifierLayer:
     """A layer that plays tones of channel, frequency [Hz], level and perhaps phase [degrees]."""
-    return Layer(number, tuple(Tone(*tone) for tone in tones), ramp)
+    return AmplifierLayer(number, tuple(AmplifierTone(*tone) for tone in tones), ramp)
 
 
 _READ_TIMEOUT = 0.02  # s; after which the thread of a bus notices its end

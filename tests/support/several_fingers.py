@@ -37,7 +37,7 @@ from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from controller.sources.tuio import RecordedDatagram
 from courses import Acted, Planted, Step
 from drivers.errors import CommandRefused, LinkError
-from drivers.playing import Layer
+from drivers.playing import AmplifierLayer
 from examples.make_touches import tuio_datagram, write_capture
 from model.answer.answer import Limits
 from model.answer.answer_report import Timing
@@ -141,12 +141,14 @@ class Fingers(Chain):
         self.player.play(effect, contact, threads.now(), level_db_sl=None)
         self.controller.cycle.request_update()
 
-    def refuse(self, why: str, is_refused: Callable[[Sequence[Layer]], bool]) -> list[float]:
+    def refuse(
+        self, why: str, is_refused: Callable[[Sequence[AmplifierLayer]], bool]
+    ) -> list[float]:
         """Let the ledger refuse some layers for a reason; returns when [s] it does."""
         layers, refused = self.controller.cycle.planner.layers, list[float]()
         check = layers.check
 
-        def refuse(asked: Mapping[str, Sequence[Layer]]) -> CommandRefused | None:
+        def refuse(asked: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:
             if not is_refused(asked["main"]):
                 return check(asked)
             refused.append(threads.now())

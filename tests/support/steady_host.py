@@ -12,7 +12,7 @@ import sys
 from drivers.host.amplifier import Amplifier
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from registry.limits import GuardLimits
 
@@ -35,8 +35,8 @@ async def main(url: str, channels: int) -> None:
     await group.arm()
     sys.stdout.write("armed\n")
     sys.stdout.flush()
-    tones = (Tone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels))
-    await group.apply({"a": [Layer(0, tuple(tones))]})
+    tones = (AmplifierTone(n, 1000.0, 0.5, (30.0 * n + 180) % 360 - 180) for n in range(channels))
+    await group.apply({"a": [AmplifierLayer(0, tuple(tones))]})
     while True:
         await group.beat()
         await asyncio.sleep(_BEAT)

@@ -32,7 +32,7 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier as Host
 from drivers.host.group import Group
 from drivers.host.line import Line
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import NETWORK_DELAY, PORT_OPENER
 from drivers.protocol.definition import BY_NUMBER, HELLO
 from drivers.wires.can_bus import CanWire
@@ -657,14 +657,14 @@ class MemoryLine:
         ]
 
 
-def tone(channel: int = 0, level: float = 0.5, **other: object) -> Tone:
+def tone(channel: int = 0, level: float = 0.5, **other: object) -> AmplifierTone:
     """A tone of 100 Hz at half level unless told otherwise."""
-    return Tone(channel, 100.0, level, **other)  # type: ignore[arg-type]
+    return AmplifierTone(channel, 100.0, level, **other)  # type: ignore[arg-type]
 
 
-def layer(number: int, *tones: Tone, **other: object) -> Layer:
+def layer(number: int, *tones: AmplifierTone, **other: object) -> AmplifierLayer:
     """A layer with a ramp of 1 ms."""
-    return Layer(number, tones, 0.001, **other)  # type: ignore[arg-type]
+    return AmplifierLayer(number, tones, 0.001, **other)  # type: ignore[arg-type]
 
 
 async def group_of(*ends: MemoryLine, is_armed: bool = True, **options: Any) -> Group:

@@ -100,7 +100,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, patte
     """Record what an amplifier plays, once."""
     seconds = _SETTLING + _WINDOW
     tones = tuple(
-        contents.Tone(
+        contents.AmplifierTone(
             rig.wiring[name].number,
             tone.frequency,
             tone.amplitude / rig.era(name).full_level,
@@ -111,7 +111,9 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, patte
     with ThreadPoolExecutor(max_workers=1) as thread:
         try:
             playing = thread.submit(
-                amplifier.play, [contents.Layer(0, tones, _RAMP)], duration=seconds + _SETTLING
+                amplifier.play,
+                [contents.AmplifierLayer(0, tones, _RAMP)],
+                duration=seconds + _SETTLING,
             )
             run = play(
                 card,

@@ -29,26 +29,26 @@ from drivers.wires.can_frames import (
     cob_id,
     frames_of,
 )
-from drivers.wires.can_frames import Message as Words
+from drivers.wires.can_frames import CanMessage as Words
 from drivers.wires.modbus_frames import (
     AREA,
     BOX,
     EXCEPTION,
     EXCEPTIONS,
     HEAD,
-    IDENTITY,
     IDENTITY_COUNT,
+    IDENTITY_REGISTER,
     PRESENT,
     READS,
+    REPLY_OFFSET,
     WRITE,
     Adu,
     AduReader,
+    Pdu,
     parse_request,
     response_to,
     unpack_identity,
 )
-from drivers.wires.modbus_frames import REPLY as MODBUS_FRAMES_REPLY
-from drivers.wires.modbus_frames import Message as Pdu
 from era_haptics.lab.witness.capture import (
     A_READ,
     HELLO,
@@ -231,12 +231,12 @@ class ModbusDecoder(Decoder):
     def _read(self, adu: Adu, key: Hashable, request: Pdu) -> WitnessedRequest | Notice:
         number, offset = divmod(request.address, BOX)
         written = self._written.get((adu.unit, number))
-        is_reply = number in BY_NUMBER and offset == MODBUS_FRAMES_REPLY
+        is_reply = number in BY_NUMBER and offset == REPLY_OFFSET
         if is_reply and written is not None and not written.is_read:
             self._remember(_Transaction(adu, written.key, request, written.tag))
             return Notice("read on", key=written.key)
         self._remember(_Transaction(adu, key, request, written.tag if written is not None else 0))
-        if request.address == IDENTITY:
+        if request.address == IDENTITY_REGISTER:
             return WitnessedRequest(HELLO, adu.unit, key)
         is_present = is_reply and BY_NUMBER[number].name in PRESENT
         return WitnessedRequest(BY_NUMBER[number].name if is_present else A_READ, adu.unit, key)
@@ -269,12 +269,12 @@ class ModbusDecoder(Decoder):
     ) -> WitnessedReply:
         unit, key, tag = transaction.adu.unit, transaction.key, transaction.tag
         number, offset = divmod(address, BOX)
-        if address == IDENTITY and len(words) == IDENTITY_COUNT:
+        if address == IDENTITY_REGISTER and len(words) == IDENTITY_COUNT:
             try:
                 return WitnessedReply(unit, key, unpack_identity(words))
             except Refusal as refusal:
                 return WitnessedReply(unit, key, problem=str(refusal))
-        if offset != MODBUS_FRAMES_REPLY or number not in BY_NUMBER or len(words) < HEAD:
+        if offset != REPLY_OFFSET or number not in BY_NUMBER or len(words) < HEAD:
             return WitnessedReply(unit, key)
         written = self._written.get((unit, number))
         if words[0] != tag:

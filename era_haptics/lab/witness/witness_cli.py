@@ -23,7 +23,7 @@ import typer
 
 from drivers.errors import CommandError, LinkError
 from drivers.ports import open_port
-from drivers.urls import Place
+from drivers.urls import Endpoint
 from drivers.wires.known import address_of
 from era_haptics.lab.witness.capture import Direction, WireKind
 from era_haptics.lab.witness.witness import Witness
@@ -47,7 +47,7 @@ class WireEndpoint:
 
     url: str
     kind: WireKind
-    place: Place
+    place: Endpoint
     address: int
 
     @property
@@ -68,7 +68,7 @@ def parse_endpoint(url: str) -> WireEndpoint:
         raise InputError(str(problem)) from problem
     kind = _KINDS.get(url.partition("://")[0].lower())
     place = getattr(address, "place", None)
-    if kind is None or not isinstance(place, Place) or place.name not in url:
+    if kind is None or not isinstance(place, Endpoint) or place.name not in url:
         known = ", ".join(_KINDS)
         raise InputError(f"{url}: scheme must be one of {known}, with a device or HOST:PORT")
     return WireEndpoint(url, kind, place, address.number)

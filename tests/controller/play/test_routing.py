@@ -41,8 +41,8 @@ from controller.play.routing import (
 from controller.sources.touch import Contact, ContactKey
 from drivers.host.group import Group
 from drivers.host.ledger import Ledger
-from drivers.playing import Layer
-from drivers.playing import Tone as Played
+from drivers.playing import AmplifierLayer
+from drivers.playing import AmplifierTone as Played
 from drivers.protocol.definition import CLOCK_UNKNOWN
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet
@@ -567,8 +567,8 @@ def test_route_by_hand() -> None:
     played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
     silent = Played(0, 40.0, 0.0, skip_ending=True)
     assert layers == {
-        "left": Layer(0, (played, silent), ramp=0.02),
-        "right": Layer(0, (Played(0, 250.0, pytest.approx(0.4)),), ramp=0.02),
+        "left": AmplifierLayer(0, (played, silent), ramp=0.02),
+        "right": AmplifierLayer(0, (Played(0, 250.0, pytest.approx(0.4)),), ramp=0.02),
     }
 
 

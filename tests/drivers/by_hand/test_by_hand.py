@@ -21,7 +21,7 @@ from drivers.by_hand.cli import app as amp_app
 from drivers.by_hand.reaching import identify_all
 from drivers.errors import CommandError, CommandRefused, LinkError, LinkTimeout
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import FEATURES, READINGS, STATUS_FLAGS
 from drivers.trace import tracing
 from drivers.urls import with_address
@@ -43,7 +43,7 @@ async def leave_playing(far: WordWiresFarSide, number: int = 1) -> None:
     amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)
     await amplifier.open()
     await amplifier.arm(77, 2.0)
-    await amplifier.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)], now=True)
+    await amplifier.stage(5, [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)], now=True)
     await lines.close()
     assert far.level(number) == pytest.approx(0.5)
 
@@ -222,9 +222,9 @@ COMMANDS_LIMITS = GuardLimits(40.0, 500.0, 0.5)
 DRAWN = f"sim://{example_rig_path()}"
 
 
-def layer(channel: int, frequency: float, level: float) -> Layer:
+def layer(channel: int, frequency: float, level: float) -> AmplifierLayer:
     """One tone at once, in a layer."""
-    return Layer(0, (Tone(channel, frequency, level),), ramp=0.0)
+    return AmplifierLayer(0, (AmplifierTone(channel, frequency, level),), ramp=0.0)
 
 
 def loop_threads() -> list[str]:

@@ -26,16 +26,22 @@ from drivers.errors import (
 )
 from drivers.host.amplifier import Amplifier as AmplifierAmplifier
 from drivers.host.amplifier import Amplifier as Host
-from drivers.host.amplifier import Sensor, measure_tones, read_measured, read_sensors, start_reading
+from drivers.host.amplifier import (
+    AmplifierSensor,
+    measure_tones,
+    read_measured,
+    read_sensors,
+    start_reading,
+)
 from drivers.host.group import Group
 from drivers.opening import Lines
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.ports import PORT_OPENER, Port
 from drivers.protocol.definition import MESSAGES, READING_STATES, UNKNOWN_PLACE, sensor_reading
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, Envelope, LayerSet, achieved_problem
 from drivers.wires.can_frames import unpack_frames
-from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame
+from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
 from real_wires import WORD_WIRES
@@ -111,7 +117,7 @@ async def test_sensors_and_their_tones_come_in_several_replies() -> None:
     """Twenty: ten descriptions and sixteen readings in a reply, in the units of the wire."""
     line = await opened()
     sensors = await read_sensors(line.hosts["a"])
-    assert sensors == (Sensor("ACCELERATION", None, 0.1, 0.2, 512.0, 1000.0),) * 20
+    assert sensors == (AmplifierSensor("ACCELERATION", None, 0.1, 0.2, 512.0, 1000.0),) * 20
     reading = await measure_tones(line.hosts["a"], FREQUENCIES, 0.1)
     assert reading.state == "COMPLETE"
     assert [one.tones for one in reading.sensors] == [((1.0, -90.0), (2.0, -90.0))] * 20
@@ -170,9 +176,9 @@ async def test_tones_that_the_window_does_not_tell_apart_are_not_sent() -> None:
         await start_reading(line.hosts["a"], [110.0], 11.0)
 
 
-def loud(level: float) -> Layer:
+def loud(level: float) -> AmplifierLayer:
     """A tone of 100 Hz on the first channel."""
-    return Layer(0, (Tone(0, 100.0, level),), 0.001)
+    return AmplifierLayer(0, (AmplifierTone(0, 100.0, level),), 0.001)
 
 
 def restart(end: MemoryLine, **changes: object) -> None:
@@ -236,7 +242,7 @@ def test_second_status_amid_hello_is_not_of_another_amplifier() -> None:
     arrivals = []
     for temperature in (250, 251):
         words = MESSAGES["GetStatus"].reply.pack({**far.status(0.0), "temperature": temperature})
-        arrivals += line.received(encode_frame(asked._replace(kind=asked.kind | REPLY), words))
+        arrivals += line.received(encode_frame(asked._replace(kind=asked.kind | REPLY_BIT), words))
         line.request(1, "Hello", {})
     assert [type(each) for each in arrivals] == [Reply]
 
@@ -398,12 +404,12 @@ async def test_ledger_goes_on_with_what_was_achieved(kind: str) -> None:
         commit(made, token, time)
 
     far.playback.commit = rounded  # type: ignore[method-assign]
-    played = await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.58),), 0.001)]})
+    played = await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.58),), 0.001)]})
     achieved = await host.read_achieved(played.layers["a"][0], played.token)
     assert achieved.commands[0].level == 6000
     with pytest.raises(CommandRefused):
-        await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.41),), 0.001)]})
-    await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.4),), 0.001)]})
+        await group.apply({"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.41),), 0.001)]})
+    await group.apply({"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.4),), 0.001)]})
 
 
 @in_virtual_time
@@ -424,8 +430,8 @@ async def test_phase_is_kept_of_a_frequency_that_the_amplifier_rounds() -> None:
     far.playback.commit = rounded  # type: ignore[method-assign]
     far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
     for level in (0.5, 0.4):
-        again = Tone(0, 101.3, level, keep_phase=True)
-        played = await group.apply({"a": [Layer(0, (again,), 0.02)]})
+        again = AmplifierTone(0, 101.3, level, keep_phase=True)
+        played = await group.apply({"a": [AmplifierLayer(0, (again,), 0.02)]})
         assert played.layers["a"][0].commands[0].frequency == 2040
         for playback in (far.playback, host.ledger.playback):
             assert [voice.frequency for voice in playback.all_voices[0]] == [102.0]
@@ -448,9 +454,9 @@ async def test_any_frequency_may_be_said_of_a_tone_at_level_0(said: int) -> None
 
     far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
     far.handle = handled  # type: ignore[method-assign]
-    pulse = Tone(0, 170.0, 0.0, onset=Envelope(100, ((300, 0),)))
+    pulse = AmplifierTone(0, 170.0, 0.0, onset=Envelope(100, ((300, 0),)))
     for _ in range(2):
-        played = await group.apply({"a": [Layer(0, (pulse,), 0.001)]})
+        played = await group.apply({"a": [AmplifierLayer(0, (pulse,), 0.001)]})
         assert played.layers["a"][0].commands[0].frequency == 3400
         assert {voice.frequency for voice in far.playback.all_voices[0]} == {170.0}
 
@@ -462,13 +468,17 @@ async def test_layers_that_play_on_are_no_contradiction_where_sets_are_inexact()
     far = end.far["a"]
     group = await group_of(end)
     onset = Envelope(1000, ((1000, 0),) * 9)
-    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
-    await group.apply({"a": [Layer(1, (Tone(0, 150.0, 0.1, onset=onset),), 0.001)]})
+    await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
+    await group.apply(
+        {"a": [AmplifierLayer(1, (AmplifierTone(0, 150.0, 0.1, onset=onset),), 0.001)]}
+    )
     take = far._take
     far._take = lambda part, now: {**take(part, now), "exact": 0}  # type: ignore[method-assign]
     for _ in range(3):
-        await group.apply({"a": [Layer(0, renew=True)]})
-        await group.apply({"a": [Layer(1, (Tone(0, 200.0, 0.1),), 0.001, after=True)]})
+        await group.apply({"a": [AmplifierLayer(0, renew=True)]})
+        await group.apply(
+            {"a": [AmplifierLayer(1, (AmplifierTone(0, 200.0, 0.1),), 0.001, after=True)]}
+        )
     assert group.is_armed
 
 
@@ -482,7 +492,7 @@ async def test_levels_that_are_measured_have_an_error() -> None:
     far, (host,) = end.far["a"], end.hosts.values()
     far.capabilities = {**far.capabilities, "features": far.capabilities["features"] | 1 << 2}
     group = await group_of(end)
-    await group.apply({"a": [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)]})
+    await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]})
     status = far.status
 
     def measured(level: int) -> None:
@@ -633,7 +643,7 @@ async def test_group_plays_over_a_wire_and_stops(
         group = Group(amplifiers, watchdog=2.0)
         await group.open()
         await group.arm()
-        layers = [Layer(0, (Tone(0, 100.0, 0.5),), 0.0)]
+        layers = [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.0)]
         await group.apply(dict.fromkeys(amplifiers, layers))
         levels = [far.level(number) for number in far.amplifiers]
         assert levels == pytest.approx([0.5, 0.5], abs=1e-9)

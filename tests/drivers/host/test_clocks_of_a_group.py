@@ -18,7 +18,7 @@ from drivers.errors import DriverError, LinkDegraded, Preempted
 from drivers.host.clock import HeldClock
 from drivers.host.group import Group
 from drivers.host.joint_sets import Clocks
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, FEATURES, HELLO, HIGH_TIME, MESSAGES, SPAN
 from drivers.protocol.records import Refusal, Values
 from drivers.wires.can_frames import CanFrame, pack_frames
@@ -37,7 +37,7 @@ from virtual_lines import (
 )
 
 PACKED = len(pack_frames([CanFrame(0, b"")]))
-LOUD = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
+LOUD = AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)
 STATUS = {
     **{"state": ("state", 255), "latch": ("latch", 0), "watchdog_left": ("watchdog_left", 65535)},
     **{"temperature": ("temperature", 32767), "channels": ("channels", 200 << 8 | 8)},
@@ -294,7 +294,7 @@ async def test_line_that_lies_has_no_effect_but_counts(kind: str, lie: str) -> N
     has_failed = False
     try:
         for level in (0.4, 0.3, 0.2):
-            await group.apply({"a": [Layer(0, (Tone(0, 100.0, level),), 0.001)]})
+            await group.apply({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, level),), 0.001)]})
             await asyncio.sleep(0.02)
             assert end.levels("a") == [level, 0.0]
             await group.beat()
@@ -385,8 +385,10 @@ async def test_clock_that_lies_costs_promise_and_stops_nothing(
             far.clock.shift(round(jump / HIGH_TIME))
         if beat % 5 == 0:
             level = 0.1 + beat / 1000
-            tones = (Tone(0, 100.0, level),)
-            await group.apply({name: [Layer(beat % 3, tones, 0.001)] for name in group.amplifiers})
+            tones = (AmplifierTone(0, 100.0, level),)
+            await group.apply(
+                {name: [AmplifierLayer(beat % 3, tones, 0.001)] for name in group.amplifiers}
+            )
         await asyncio.sleep(0.05)
         await group.beat()
     too_slow = {"clock_rate"} if kind in (Still, Backwards) else set()
@@ -572,8 +574,10 @@ def test_sets_beside_readings_of_clocks_are_played(lines: tuple[str, ...]) -> No
             sent = list[str]()
             for line in {each.line for each in group.amplifiers.values()}:
                 line.seen = lambda way, _, name, __, sent=sent: sent.append(f"{way} {name}")
-            tones = (Tone(0, 100.0, 0.1 + number / 100),)
-            await group.apply({each: [Layer(0, tones, 0.001)] for each in group.amplifiers})
+            tones = (AmplifierTone(0, 100.0, 0.1 + number / 100),)
+            await group.apply(
+                {each: [AmplifierLayer(0, tones, 0.001)] for each in group.amplifiers}
+            )
             after = sent.index("out Set")
             between.append((*sent[after : sent.index("out Commit", after)],))
         assert {each.committed for each in group.amplifiers.values()} == {group.sets.token}
@@ -652,7 +656,12 @@ def test_no_clock_of_a_line_follows_one_that_jumped(plays: bool) -> None:
         group, clocks = await held("usb-high-speed", 1, "abc")
         await skew(group, clocks, 4.0)
         if plays:
-            await group.apply({each: [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)] for each in "abc"})
+            await group.apply(
+                {
+                    each: [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)]
+                    for each in "abc"
+                }
+            )
         (jumped,) = (
             number
             for number, each in enumerate("abc")
@@ -794,8 +803,8 @@ def test_marks_that_come_twice_accuse_no_clock() -> None:
             await asyncio.sleep(0.05)
             await group.beat()
             await asyncio.sleep(rng.uniform(0.0, 0.04))
-            tones = (Tone(0, 100.0, 0.1 + number / 200),)
-            await group.apply({each: [Layer(0, tones, 0.001)] for each in "ab"})
+            tones = (AmplifierTone(0, 100.0, 0.1 + number / 200),)
+            await group.apply({each: [AmplifierLayer(0, tones, 0.001)] for each in "ab"})
             assert max(group.clock_errors.values()) < 1e-4
         assert not any(each.reported_at for each in group.amplifiers.values())
 

@@ -16,7 +16,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.host.dialogue import SILENCING
 from drivers.host.group import Group
 from drivers.host.line import Priority
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet
@@ -45,7 +45,7 @@ def test_layers_play_together_and_leave_each_other_alone(wire: str, lines: str) 
     async def test(group: Group, ends: list[MemoryLine]) -> None:
         names = [*group.amplifiers]
         await group.apply({name: [layer(0, tone())] for name in names})
-        second = layer(1, Tone(0, 150.0, 0.2), Tone(1, 150.0, 0.1))
+        second = layer(1, AmplifierTone(0, 150.0, 0.2), AmplifierTone(1, 150.0, 0.1))
         await group.apply({name: [second] for name in names})
         await asyncio.sleep(0.01)
         for end in ends:
@@ -172,7 +172,7 @@ async def test_set_that_plays_in_part_stops(group: Group, ends: list[MemoryLine]
         commit(layers[:1], token, time)
 
     far.commit = first_alone  # type: ignore[method-assign]
-    await group.apply({"a": [layer(0, tone()), layer(1, Tone(0, 150.0, 0.2))]})
+    await group.apply({"a": [layer(0, tone()), layer(1, AmplifierTone(0, 150.0, 0.2))]})
     await group.beat()
     await asyncio.sleep(0.05)
     with pytest.raises(CommandRefused):
@@ -481,7 +481,7 @@ async def test_commit_of_a_set_that_is_given_up_is_not_sent(
     (end,) = ends
     await group.apply({each: [layer(0, tone())] for each in "ab"})
     applying = asyncio.ensure_future(
-        group.apply({each: [Layer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
+        group.apply({each: [AmplifierLayer(0, (tone(level=0.3),), 0.001)] for each in "ab"})
     )
     end.outward = lambda name, data: [(0.02 if name == "GetStatus" else 0.0002, data)]
     for _ in range(1000):

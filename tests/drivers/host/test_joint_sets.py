@@ -31,7 +31,7 @@ from drivers.errors import (
     Overtaken,
     Preempted,
 )
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import CLOCK_UNKNOWN, MESSAGES
 from drivers.protocol.sets import LayerSet
 from drivers.wires.can_bus import CanWire
@@ -47,7 +47,7 @@ from late_taps import WIRES as LATE_TAPS_WIRES
 from sim.amplifier.readings import AmplifierClock, Crystal
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 
-LAYER = Layer(0, (Tone(0, 100.0, 0.5),), 0.001)
+LAYER = AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)
 # By hand, of what is written: bytes of ten bits; of eleven after 3.5 characters; CAN frames of at
 # most 111 bits and 24 stuffed, of which each is packed with a head.
 LINES: dict[str, tuple[str, Callable[[], Wire], Callable[[bytes], float]]] = {
@@ -206,7 +206,9 @@ async def test_a_set_is_checked_once_unless_what_plays_may_be_another(
     amplifier, checked = group.amplifiers["a"], list[float]()
     admit = amplifier.ledger.admit
 
-    def noted(layers: Sequence[Layer], now: float, *, delay: float) -> tuple[LayerSet, ...]:
+    def noted(
+        layers: Sequence[AmplifierLayer], now: float, *, delay: float
+    ) -> tuple[LayerSet, ...]:
         checked.append(now)
         return admit(layers, now, delay=delay)
 
@@ -219,7 +221,7 @@ async def test_a_set_is_checked_once_unless_what_plays_may_be_another(
         await amplifier.read_status()
     await group.apply(layers)
     assert len(checked) == checks
-    refusal = group.sets.refusal_of({"a": [Layer(0, (Tone(0, 100.0, 2.0),))]})
+    refusal = group.sets.refusal_of({"a": [AmplifierLayer(0, (AmplifierTone(0, 100.0, 2.0),))]})
     assert refusal is not None
     assert refusal.channel == 0
 
@@ -347,9 +349,9 @@ async def test_set_gives_way_until_an_amplifier_is_to_play_it(
     assert [end.levels()[0] for end in ends] == [0.2] * len(ends)
 
 
-def loud(number: int, level: float) -> Layer:
+def loud(number: int, level: float) -> AmplifierLayer:
     """A layer of 100 Hz on the first channel."""
-    return Layer(number, (Tone(0, 100.0, level),), 0.001)
+    return AmplifierLayer(number, (AmplifierTone(0, 100.0, level),), 0.001)
 
 
 @pytest.mark.parametrize("layers", [[0], [1, 2], [], range(8)], ids=str)
@@ -365,7 +367,7 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     ends = [MemoryLine(kind, "a"), MemoryLine(kind, "b")]
     group = await group_of(*ends)
     await group.apply(
-        {"a": [loud(0, 0.5)], "b": [loud(each, 0.1) for each in layers] or [Layer(0)]}
+        {"a": [loud(0, 0.5)], "b": [loud(each, 0.1) for each in layers] or [AmplifierLayer(0)]}
     )
     await started(*ends)
     before = ends[1].far["b"].playback.all_voices[0]

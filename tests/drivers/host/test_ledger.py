@@ -19,7 +19,7 @@ from drivers.errors import CommandError, CommandRefused, LinkTimeout
 from drivers.host.group import Group
 from drivers.host.ledger import Ledger
 from drivers.host.line import Job, Priority
-from drivers.playing import Layer, Playback, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone, Playback
 from drivers.protocol.definition import word_passed
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope
@@ -34,18 +34,20 @@ WIDE = GuardLimits(20.0, 1000.0, 1.0)
 CAN = capabilities(3)
 
 
-def tone(channel: int = 0, level: float = 0.5, frequency: float = 100.0, **other: object) -> Tone:
+def tone(
+    channel: int = 0, level: float = 0.5, frequency: float = 100.0, **other: object
+) -> AmplifierTone:
     """A tone of 100 Hz at half level unless told otherwise."""
-    return Tone(channel, frequency, level, **other)  # type: ignore[arg-type]
+    return AmplifierTone(channel, frequency, level, **other)  # type: ignore[arg-type]
 
 
-def play(ledger: Ledger, token: int, at: float, *layers: Layer) -> None:
+def play(ledger: Ledger, token: int, at: float, *layers: AmplifierLayer) -> None:
     """Admit, send and confirm a set without delay."""
     ledger.sent(token, ledger.admit(layers, at), at)
     ledger.resolve(token, at)
 
 
-def refusal(ledger: Ledger, *layers: Layer, at: float = 1.0) -> CommandRefused:
+def refusal(ledger: Ledger, *layers: AmplifierLayer, at: float = 1.0) -> CommandRefused:
     """The error with which layers are refused."""
     with pytest.raises(CommandRefused) as raised:
         ledger.admit(layers, at)
@@ -73,18 +75,32 @@ BAD = {
 def test_tone_that_must_not_be_played_is_refused_with_its_channel(case: str) -> None:
     """Beside a good one, in the second layer."""
     bad = BAD[case]
-    assert refusal(Ledger(WIDE, CAN), Layer(0, (tone(),)), Layer(1, (bad,))).channel == bad.channel
+    assert (
+        refusal(Ledger(WIDE, CAN), AmplifierLayer(0, (tone(),)), AmplifierLayer(1, (bad,))).channel
+        == bad.channel
+    )
 
 
 @pytest.mark.parametrize(
     "layer",
     [
-        *(Layer(8, (tone(),)), Layer(-1, (tone(),)), Layer(0, (tone(),), ramp=1.001)),
-        *(Layer(0, (tone(),), ramp=math.nan), Layer(0, (tone(),), valid_for=60.1)),
-        *(Layer(0, (tone(),), renew=True), Layer(0, (), after=True), Layer(0, (tone(), tone()))),
+        *(
+            AmplifierLayer(8, (tone(),)),
+            AmplifierLayer(-1, (tone(),)),
+            AmplifierLayer(0, (tone(),), ramp=1.001),
+        ),
+        *(
+            AmplifierLayer(0, (tone(),), ramp=math.nan),
+            AmplifierLayer(0, (tone(),), valid_for=60.1),
+        ),
+        *(
+            AmplifierLayer(0, (tone(),), renew=True),
+            AmplifierLayer(0, (), after=True),
+            AmplifierLayer(0, (tone(), tone())),
+        ),
     ],
 )
-def test_layer_that_cannot_be_is_refused(layer: Layer) -> None:
+def test_layer_that_cannot_be_is_refused(layer: AmplifierLayer) -> None:
     """Numbers, times and flags of a layer, and a channel twice."""
     refusal(Ledger(WIDE, CAN), layer)
 
@@ -94,11 +110,11 @@ def test_values_are_rounded_to_the_safe_side() -> None:
 
     Full level in single precision, which may be 1 + 2^-22, is full level.
     """
-    layer = Layer(0, (tone(level=0.33336, frequency=99.99),), ramp=0.0101, valid_for=1e-5)
+    layer = AmplifierLayer(0, (tone(level=0.33336, frequency=99.99),), ramp=0.0101, valid_for=1e-5)
     (one,) = Ledger(WIDE, CAN).admit([layer], 0.0)
     assert (one.ramp, one.valid_for) == (11, 1)
     assert (one.commands[0].level, one.commands[0].frequency) == (3334, 2000)
-    (full,) = Ledger(WIDE, CAN).admit([Layer(0, (tone(level=1 + 2**-22),))], 0.0)
+    (full,) = Ledger(WIDE, CAN).admit([AmplifierLayer(0, (tone(level=1 + 2**-22),))], 0.0)
     assert full.commands[0].level == 10000
 
 
@@ -107,8 +123,8 @@ def test_least_limit_holds() -> None:
     can = {**capabilities(2), "level_max": 9000}
     can["limits"][1]["level_max"] = 7000
     ledger = Ledger(replace(WIDE, level=0.8), can)
-    assert refusal(ledger, Layer(0, (tone(0, level=0.71),))).channel == 0
-    assert ledger.admit([Layer(0, (tone(0, level=0.7),))], 1.0)
+    assert refusal(ledger, AmplifierLayer(0, (tone(0, level=0.71),))).channel == 0
+    assert ledger.admit([AmplifierLayer(0, (tone(0, level=0.7),))], 1.0)
 
 
 @pytest.mark.parametrize("name", ["slew", "power", "on_time", "duty", "rate"])
@@ -129,7 +145,7 @@ class Asked:
     """
 
     at: float
-    layer: Layer
+    layer: AmplifierLayer
     plays: bool = False
     is_refused: bool = False
     until: float | EllipsisType | None = ...
@@ -140,8 +156,8 @@ class Asked:
 plays = partial(Asked, plays=True)
 refused = partial(Asked, is_refused=True)
 HIGH = partial(tone, frequency=200.0)
-RISING = Layer(0, (tone(),), ramp=0.1)
-SHAPED = Layer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
+RISING = AmplifierLayer(0, (tone(),), ramp=0.1)
+SHAPED = AmplifierLayer(0, (tone(level=0.2, onset=Envelope(100, ((1000, 0), (2000, 0)))),))
 SWELLING = tone(level=0.05, onset=Envelope(500, ((500, 0),)))
 ENDING = tone(level=0.1, ending=Envelope(100, ((8000, 0),)))
 
@@ -151,10 +167,10 @@ PULSE = tone(level=0.0, onset=Envelope(200, ((0, 0),) * 5 + ((9000, 0),)))
 LOW_SOON = Envelope(200, ((9000, 0),) + ((500, 0),) * 6)
 
 
-def sudden(level: float) -> Layer:
+def sudden(level: float) -> AmplifierLayer:
     """A layer whose tone is there within 2 ms, while what it replaces fades for 60 ms."""
     shape = Envelope(10, ((round(10_000 * level), 0),))
-    return Layer(0, (HIGH(level=level, onset=shape),), ramp=0.06)
+    return AmplifierLayer(0, (HIGH(level=level, onset=shape),), ramp=0.06)
 
 
 PIECE = tone(level=0.9, keep_phase=True, onset=Envelope(1000, ((9000, 0),)))
@@ -164,71 +180,71 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     "layers are bounded together": (
         WIDE,
         [
-            plays(0.0, Layer(0, (tone(level=0.6),))),
-            refused(1.0, Layer(1, (HIGH(level=0.41),))),
-            Asked(1.0, Layer(1, (HIGH(level=0.4),))),
-            plays(1.0, Layer(0, ())),
-            refused(1.01, Layer(1, (HIGH(level=0.9),))),
-            Asked(1.03, Layer(1, (HIGH(level=0.9),))),
+            plays(0.0, AmplifierLayer(0, (tone(level=0.6),))),
+            refused(1.0, AmplifierLayer(1, (HIGH(level=0.41),))),
+            Asked(1.0, AmplifierLayer(1, (HIGH(level=0.4),))),
+            plays(1.0, AmplifierLayer(0, ())),
+            refused(1.01, AmplifierLayer(1, (HIGH(level=0.9),))),
+            Asked(1.03, AmplifierLayer(1, (HIGH(level=0.9),))),
         ],
     ),
     # 0.6 fades for 20 ms from 1.0 on; what is too loud at any time has no such moment.
     "a refusal says from when": (
         WIDE,
         [
-            plays(0.0, Layer(0, (tone(level=0.6),))),
-            plays(1.0, Layer(0, ())),
-            refused(1.01, Layer(1, (HIGH(level=0.9),)), until=1.02),
-            Asked(1.02 + 1e-9, Layer(1, (HIGH(level=0.9),))),
-            plays(2.0, Layer(0, (tone(level=0.6),))),
-            refused(3.0, Layer(1, (HIGH(level=0.9),)), until=None),
+            plays(0.0, AmplifierLayer(0, (tone(level=0.6),))),
+            plays(1.0, AmplifierLayer(0, ())),
+            refused(1.01, AmplifierLayer(1, (HIGH(level=0.9),)), until=1.02),
+            Asked(1.02 + 1e-9, AmplifierLayer(1, (HIGH(level=0.9),))),
+            plays(2.0, AmplifierLayer(0, (tone(level=0.6),))),
+            refused(3.0, AmplifierLayer(1, (HIGH(level=0.9),)), until=None),
         ],
     ),
     # Level 0.1 with an ending through 0.8 waits: 0.3 beside it is refused, 0.15 is not.
     "a set that waits counts with its ending": (
         WIDE,
         [
-            plays(0.0, Layer(0, (SWELLING,))),
-            plays(0.01, Layer(0, (ENDING,), after=True)),
-            refused(0.02, Layer(1, (HIGH(level=0.3),))),
-            Asked(0.02, Layer(1, (HIGH(level=0.15),))),
+            plays(0.0, AmplifierLayer(0, (SWELLING,))),
+            plays(0.01, AmplifierLayer(0, (ENDING,), after=True)),
+            refused(0.02, AmplifierLayer(1, (HIGH(level=0.3),))),
+            Asked(0.02, AmplifierLayer(1, (HIGH(level=0.15),))),
         ],
     ),
     # 0.9 follows 0.9: one voice, unless its phase is new; 0.1 is left beside both.
     "what waits goes on as one voice": (
         WIDE,
         [
-            plays(0.0, Layer(0, (PIECE,))),
-            refused(0.05, Layer(0, (replace(PIECE, keep_phase=False),), after=True)),
-            refused(0.05, Layer(0, (replace(PIECE, frequency=200.0),), after=True)),
-            plays(0.05, Layer(0, (PIECE,), after=True)),
-            refused(0.06, Layer(1, (HIGH(level=0.11),))),
-            Asked(0.06, Layer(1, (HIGH(level=0.1),))),
+            plays(0.0, AmplifierLayer(0, (PIECE,))),
+            refused(0.05, AmplifierLayer(0, (replace(PIECE, keep_phase=False),), after=True)),
+            refused(0.05, AmplifierLayer(0, (replace(PIECE, frequency=200.0),), after=True)),
+            plays(0.05, AmplifierLayer(0, (PIECE,), after=True)),
+            refused(0.06, AmplifierLayer(1, (HIGH(level=0.11),))),
+            Asked(0.06, AmplifierLayer(1, (HIGH(level=0.1),))),
         ],
     ),
     # Gains of a raised cosine add up to one, in power to less than one.
     "a cross-fade at full level": (
         replace(WIDE, power=1.0),
         [
-            plays(0.0, Layer(0, (tone(0, 1.0),))),
-            Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),))),
-            Asked(1.0, Layer(0, (tone(1, 1.0, 200.0),))),
+            plays(0.0, AmplifierLayer(0, (tone(0, 1.0),))),
+            Asked(1.0, AmplifierLayer(0, (tone(0, 1.0, 200.0),))),
+            Asked(1.0, AmplifierLayer(0, (tone(1, 1.0, 200.0),))),
         ],
     ),
     # An ending at full level 1 ms after the commit, amid a ramp of 1 s: with the old tone nearly 2.
     "an ending amid a cross-fade": (
         WIDE,
         [
-            plays(0.0, Layer(0, (tone(0, 1.0),))),
-            refused(1.0, Layer(0, (LOUD_END,), ramp=1.0, valid_for=0.001)),
-            Asked(1.0, Layer(0, (tone(0, 1.0, 200.0),), ramp=1.0, valid_for=0.001)),
+            plays(0.0, AmplifierLayer(0, (tone(0, 1.0),))),
+            refused(1.0, AmplifierLayer(0, (LOUD_END,), ramp=1.0, valid_for=0.001)),
+            Asked(1.0, AmplifierLayer(0, (tone(0, 1.0, 200.0),), ramp=1.0, valid_for=0.001)),
         ],
     ),
     # A set that comes after 80 ms or later lets a pulse go on, which ends before its ramp does.
     "a pulse that ends before a ramp": (
         WIDE,
         [
-            plays(0.0, Layer(0, (PULSE,))),
+            plays(0.0, AmplifierLayer(0, (PULSE,))),
             refused(0.0, sudden(0.9)),
             Asked(0.0, sudden(0.1)),
             Asked(0.15, sudden(0.9)),
@@ -237,22 +253,25 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     # It goes on (0.9 in 20 ms) or fades (pi/2 · 0.9 in 60), beside pi/2 · 0.05 in 60: 69.9.
     "a pulse that beats with what follows": (
         replace(WIDE, slew=69.9),
-        [plays(0.0, Layer(0, (PULSE,))), Asked(0.0, Layer(0, (tone(level=0.05),), ramp=0.06))],
+        [
+            plays(0.0, AmplifierLayer(0, (PULSE,))),
+            Asked(0.0, AmplifierLayer(0, (tone(level=0.05),), ramp=0.06)),
+        ],
     ),
     "a pulse that beats too fast": (
         replace(WIDE, slew=69.8),
         [
-            plays(0.0, Layer(0, (PULSE,))),
-            refused(0.0, Layer(0, (tone(level=0.05),), ramp=0.06)),
+            plays(0.0, AmplifierLayer(0, (PULSE,))),
+            refused(0.0, AmplifierLayer(0, (tone(level=0.05),), ramp=0.06)),
         ],
     ),
     # 0.5 in two layers of one channel: 1, in two channels: a half.
     "power of all layers and channels": (
         replace(WIDE, power=0.6),
         [
-            plays(0.0, Layer(0, (tone(0),))),
-            refused(1.0, Layer(1, (HIGH(0),))),
-            Asked(1.0, Layer(1, (HIGH(1),))),
+            plays(0.0, AmplifierLayer(0, (tone(0),))),
+            refused(1.0, AmplifierLayer(1, (HIGH(0),))),
+            Asked(1.0, AmplifierLayer(1, (HIGH(1),))),
         ],
     ),
     # pi/2 · 0.5 / 0.1 s = 7.85 per second along a ramp; 10 by a knot; a fade never rises.
@@ -263,16 +282,16 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     ),
     "a fade": (
         replace(WIDE, slew=10.01),
-        [Asked(0.0, SHAPED), plays(0.0, RISING), Asked(1.0, Layer(0, (), ramp=0.001))],
+        [Asked(0.0, SHAPED), plays(0.0, RISING), Asked(1.0, AmplifierLayer(0, (), ramp=0.001))],
     ),
     # 2 s: 1.98 s and a ramp of 20 ms; after 1.5 s of it the rest less 100 ms of way.
     "on-time": (
         replace(WIDE, on_time=2.0),
         [
-            plays(0.0, Layer(0, (tone(),)), valid_for=(1980, 1980)),
-            Asked(1.5, Layer(1, (tone(1),)), valid_for=(380, 380)),
-            refused(1.9, Layer(0, renew=True)),
-            Asked(1.9, Layer(0, (), ramp=1.0), longest=100),
+            plays(0.0, AmplifierLayer(0, (tone(),)), valid_for=(1980, 1980)),
+            Asked(1.5, AmplifierLayer(1, (tone(1),)), valid_for=(380, 380)),
+            refused(1.9, AmplifierLayer(0, renew=True)),
+            Asked(1.9, AmplifierLayer(0, (), ramp=1.0), longest=100),
         ],
     ),
     # 2 s of 10 s: after two of 0.5 s and a ramp of 20 ms, 0.94 s and such a ramp are left; each may
@@ -280,19 +299,19 @@ COURSES: Mapping[str, tuple[GuardLimits, Sequence[Asked]]] = {
     "duty": (
         replace(WIDE, duty=0.2),
         [
-            plays(0.0, Layer(0, (tone(),), valid_for=0.5)),
-            plays(2.0, Layer(0, (tone(),), valid_for=0.5)),
-            Asked(4.0, Layer(0, (tone(),)), valid_for=(740, 940)),
+            plays(0.0, AmplifierLayer(0, (tone(),), valid_for=0.5)),
+            plays(2.0, AmplifierLayer(0, (tone(),), valid_for=0.5)),
+            Asked(4.0, AmplifierLayer(0, (tone(),)), valid_for=(740, 940)),
         ],
     ),
     # Three sets a second; silence is never refused.
     "rate": (
         replace(WIDE, rate=3.0),
         [
-            *(plays(0.1 * number, Layer(0, (tone(),))) for number in range(3)),
-            refused(0.5, Layer(0, (tone(),)), until=1.1),
-            Asked(0.5, Layer(0, ())),
-            Asked(1.11, Layer(0, (tone(),))),
+            *(plays(0.1 * number, AmplifierLayer(0, (tone(),))) for number in range(3)),
+            refused(0.5, AmplifierLayer(0, (tone(),)), until=1.1),
+            Asked(0.5, AmplifierLayer(0, ())),
+            Asked(1.11, AmplifierLayer(0, (tone(),))),
         ],
     ),
 }
@@ -317,21 +336,21 @@ def test_ledger_admits_what_is_within_the_limits(name: str) -> None:
 
 
 # Each played up to 10 ms after it was sent; None: silence. 0.9 beside what may go on is too much.
-LATE: Mapping[str, Sequence[tuple[float, Layer | None]]] = {
+LATE: Mapping[str, Sequence[tuple[float, AmplifierLayer | None]]] = {
     # Silence from 85 ms on along 60 ms leaves a pulse that is over after 140; from 75 ms on not.
-    "a pulse that silence lets go on": [(0.0, Layer(0, (PULSE,))), (0.075, None)],
+    "a pulse that silence lets go on": [(0.0, AmplifierLayer(0, (PULSE,))), (0.075, None)],
     # 0.9 at 20 ms and little more until 160: if it plays late, it fades at 31 ms from nearly there.
     "a fade where a pulse is low": [
-        (0.0, Layer(0, (tone(level=0.0, onset=LOW_SOON),))),
-        (0.031, Layer(0, (), ramp=0.13)),
+        (0.0, AmplifierLayer(0, (tone(level=0.0, onset=LOW_SOON),))),
+        (0.031, AmplifierLayer(0, (), ramp=0.13)),
     ],
     # Of eight voices, at 1.1 all sound and 0.5 is cut short for a ninth; at 1.11 one is over.
     "a fade that is not cut short": [
-        (0.0, Layer(0, (tone(level=0.5),))),
-        *((0.1 * number, Layer(number, (tone(level=0.01),))) for number in range(1, 8)),
-        (1.0, Layer(0, (), ramp=1.0)),
-        (1.055, Layer(1, (), ramp=0.05)),
-        (1.1, Layer(0, (tone(level=0.01),))),
+        (0.0, AmplifierLayer(0, (tone(level=0.5),))),
+        *((0.1 * number, AmplifierLayer(number, (tone(level=0.01),))) for number in range(1, 8)),
+        (1.0, AmplifierLayer(0, (), ramp=1.0)),
+        (1.055, AmplifierLayer(1, (), ramp=0.05)),
+        (1.1, AmplifierLayer(0, (tone(level=0.01),))),
     ],
 }
 
@@ -346,7 +365,7 @@ def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> N
         else:
             ledger.sent(token, ledger.admit([layer], at), at)
             ledger.resolve(token, at + 0.01)
-    loud = Layer(2, (HIGH(level=0.9),))
+    loud = AmplifierLayer(2, (HIGH(level=0.9),))
     refusal(ledger, loud, at=at + 0.025)
     assert ledger.admit([loud], at + 1.0)
 
@@ -354,50 +373,50 @@ def test_what_a_commit_may_leave_playing_if_it_comes_late_counts(name: str) -> N
 def test_check_that_fails_refuses_and_leaves_silence_possible() -> None:
     """Whatever goes wrong in checking: refused, nothing is noted, and a silent set is admitted."""
     ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(),)))
+    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(),)))
     broken = replace(tone(1), onset=object())  # type: ignore[arg-type]
-    refusal(ledger, Layer(1, (broken,)))
+    refusal(ledger, AmplifierLayer(1, (broken,)))
     assert ledger.doubt is None
     assert ledger.playback.tokens == {0: 1}
-    assert ledger.admit([Layer(0, ())], 1.0)
+    assert ledger.admit([AmplifierLayer(0, ())], 1.0)
 
 
 def test_what_was_achieved_counts_from_then_on() -> None:
     """0.5 was sent, 0.45 plays: 0.54 beside it is admitted, 0.56 is not."""
     ledger = Ledger(WIDE, CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(level=0.5),)))
-    (sent,) = ledger.admit([Layer(0, (tone(level=0.45),))], 0.5)
+    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(level=0.5),)))
+    (sent,) = ledger.admit([AmplifierLayer(0, (tone(level=0.45),))], 0.5)
     ledger.playback.correct(sent, 2)  # of another set: without effect
-    refusal(ledger, Layer(1, (tone(level=0.54, frequency=200),)))
+    refusal(ledger, AmplifierLayer(1, (tone(level=0.54, frequency=200),)))
     ledger.playback.correct(sent, 1)
-    refusal(ledger, Layer(1, (tone(level=0.56, frequency=200),)))
-    assert ledger.admit([Layer(1, (tone(level=0.54, frequency=200),))], 1.0)
+    refusal(ledger, AmplifierLayer(1, (tone(level=0.56, frequency=200),)))
+    assert ledger.admit([AmplifierLayer(1, (tone(level=0.54, frequency=200),))], 1.0)
 
 
 def test_other_capabilities_leave_what_was_spent() -> None:
     """0.9 of one second within ten; a lower level limit does not give it back, reopened or not."""
     ledger = Ledger(replace(WIDE, duty=0.1), CAN)
-    play(ledger, 1, 0.0, Layer(0, (tone(),), ramp=0.0))
-    play(ledger, 2, 0.9, Layer(0, (), ramp=0.0))
+    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(),), ramp=0.0))
+    play(ledger, 2, 0.9, AmplifierLayer(0, (), ramp=0.0))
     ledger.adopt({**CAN, "level_max": 5000})
-    refusal(ledger, Layer(0, (tone(level=0.51),)), at=5.0)
-    (one,) = ledger.admit([Layer(0, (tone(),), ramp=0.0)], 5.0)
+    refusal(ledger, AmplifierLayer(0, (tone(level=0.51),)), at=5.0)
+    (one,) = ledger.admit([AmplifierLayer(0, (tone(),), ramp=0.0)], 5.0)
     assert 0 < one.valid_for <= 100
     reopened = Ledger(replace(WIDE, duty=0.1), {**CAN, "level_max": 4000})
     reopened.go_on_from(ledger)
-    (one,) = reopened.admit([Layer(0, (tone(level=0.3),), ramp=0.0)], 5.0)
+    (one,) = reopened.admit([AmplifierLayer(0, (tone(level=0.3),), ramp=0.0)], 5.0)
     assert 0 < one.valid_for <= 100
 
 
 def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
     """By confirmation, or by a status with another token; nothing is kept of refused sets."""
     ledger = Ledger(WIDE, CAN)
-    layer = Layer(0, (tone(),))
+    layer = AmplifierLayer(0, (tone(),))
     ledger.sent(7, ledger.admit([layer], 0.0), 0.0)
     assert ledger.doubt is not None
     assert ledger.doubt.token == 7
     refusal(ledger, layer)
-    assert ledger.admit([Layer(0, ())], 1.0)
+    assert ledger.admit([AmplifierLayer(0, ())], 1.0)
     ledger.resolve(6, 1.0)
     assert (ledger.doubt, ledger.playback.level(0, 1.0)) == (None, 0.0)
     ledger.sent(8, ledger.admit([layer], 1.0), 1.0)
@@ -405,7 +424,7 @@ def test_doubt_admits_silence_only_until_it_is_resolved() -> None:
     assert ledger.playback.level(0, 2.0) == pytest.approx(0.5)
 
 
-def random_layer(random_: random.Random, number: int) -> Layer:
+def random_layer(random_: random.Random, number: int) -> AmplifierLayer:
     """A layer of up to three tones of three frequencies, with shapes, fades and ends."""
 
     def shape() -> Envelope | None:
@@ -415,7 +434,7 @@ def random_layer(random_: random.Random, number: int) -> Layer:
         return Envelope(random_.choice((20, 100)), tuple(knots[: random_.randrange(4)]))
 
     tones = tuple(
-        Tone(
+        AmplifierTone(
             channel,
             random_.choice((100.0, 150.0, 200.0)),
             random_.choice((0.0, 0.2, 0.4, 0.7)),
@@ -430,8 +449,10 @@ def random_layer(random_: random.Random, number: int) -> Layer:
     ramp = random_.choice((0.005, 0.02, 0.08)) if tones else 0.08  # silence is never refused
     valid_for = random_.choice((0.0, 0.05, 0.2))
     if valid_for and random_.random() < 0.1:
-        return Layer(number, renew=True, valid_for=valid_for)
-    return Layer(number, tones, ramp, valid_for, after=bool(tones) and random_.random() < 0.2)
+        return AmplifierLayer(number, renew=True, valid_for=valid_for)
+    return AmplifierLayer(
+        number, tones, ramp, valid_for, after=bool(tones) and random_.random() < 0.2
+    )
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -479,8 +500,8 @@ def test_what_waits_for_an_onset_ends_within_the_longest_vibration() -> None:
     """
     ledger = Ledger(replace(WIDE, on_time=2.0), CAN)
     onset = Envelope(1000, ((1000, 0),) * 9)  # ten steps of 0.1 s
-    play(ledger, 1, 0.0, Layer(0, (tone(onset=onset),), ramp=0.1, valid_for=1.5))
-    waits = Layer(0, (tone(keep_phase=True),), ramp=0.1, after=True)
+    play(ledger, 1, 0.0, AmplifierLayer(0, (tone(onset=onset),), ramp=0.1, valid_for=1.5))
+    waits = AmplifierLayer(0, (tone(keep_phase=True),), ramp=0.1, after=True)
     (one,) = ledger.admit([waits], 0.5)
     assert one.valid_for == pytest.approx(800, abs=2)
 
@@ -565,7 +586,7 @@ async def test_refusal_after_no_reply_says_that_it_may_have_played(
 ) -> None:
     """The reply to a commit is lost, and the commit that is repeated is refused; then one alone."""
     (end,), (host,) = ends, group.amplifiers.values()
-    await host.stage(5, [Layer(0, (Tone(0, 100.0, 0.5),), 0.001)])
+    await host.stage(5, [AmplifierLayer(0, (AmplifierTone(0, 100.0, 0.5),), 0.001)])
     far = end.far["a"]
     handle, commits = far.handle, iter([True])
 
@@ -580,7 +601,7 @@ async def test_refusal_after_no_reply_says_that_it_may_have_played(
     with pytest.raises(CommandRefused) as raised:
         await host.commit(5, word_passed(end.loop.time()))
     assert raised.value.may_play
-    await host.stage(6, [Layer(0, ())])
+    await host.stage(6, [AmplifierLayer(0, ())])
     with pytest.raises(CommandRefused) as raised:
         await host.commit(6, word_passed(end.loop.time()))
     assert not raised.value.may_play

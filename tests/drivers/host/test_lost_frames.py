@@ -27,11 +27,11 @@ from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkTimeou
 from drivers.host.amplifier import read_measured
 from drivers.host.dialogue import Stopped
 from drivers.host.group import Group
-from drivers.playing import Layer, Tone
+from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Envelope, LayerSet
-from drivers.wires.serial_frames import REPLY, FrameReader, encode_frame, pack_words
+from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame, pack_words
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier as FarEnd
 from virtual_lines import (
     KINDS,
@@ -56,7 +56,7 @@ LINES = {
 SET = MESSAGES["Set"].number
 
 
-def of_parts(count: int, level: float = 0.05) -> list[Layer]:
+def of_parts(count: int, level: float = 0.05) -> list[AmplifierLayer]:
     """Layers whose set has about so many parts: a layer of two onsets of 24 knots has 111 words."""
     tones = [tone(each, level, onset=Envelope(20, ((100, 0),) * 24)) for each in (0, 1)]
     return [layer(number, *tones) for number in range(count)]
@@ -201,7 +201,7 @@ async def test_reply_to_a_part_but_the_last_is_none_of_its_set(
     def replied(name: str, data: bytes) -> list[tuple[float, bytes]]:
         (frame,) = FrameReader().feed(data)
         if name == "Set":
-            reply = frame._replace(kind=SET | REPLY, payload=payload)
+            reply = frame._replace(kind=SET | REPLY_BIT, payload=payload)
             end.later(0.0001, end.line.received, encode_frame(reply))
         return unaltered(name, data)
 
@@ -581,10 +581,12 @@ async def test_session_is_one_on_each_line(group: Group, ends: list[MemoryLine])
     assert a == b != c
 
 
-def _layer(number: float, channel: float = 0, level: float = 0, frequency: float = 0) -> Layer:
+def _layer(
+    number: float, channel: float = 0, level: float = 0, frequency: float = 0
+) -> AmplifierLayer:
     """A layer with a ramp of 1 ms and a tone, or none without a frequency."""
-    tones = (Tone(int(channel), frequency, level),) if frequency else ()
-    return Layer(int(number), tones, 0.001)
+    tones = (AmplifierTone(int(channel), frequency, level),) if frequency else ()
+    return AmplifierLayer(int(number), tones, 0.001)
 
 
 @dataclass

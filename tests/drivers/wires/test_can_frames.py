@@ -29,7 +29,7 @@ from drivers.wires.can_frames import (
     SOCKETCAND,
     Assembler,
     CanFrame,
-    Message,
+    CanMessage,
     TextFormat,
     TextReader,
     frames_of,
@@ -125,7 +125,7 @@ def test_frames_of_every_length_hold_all_words(words: int) -> None:
     assert len(made) == frames_of(words) == 1 + max(0, -(-(words - 2) // 3))
     whole = Assembler(WireCounters())
     *_, last = (whole.add(data, 0.0) for data in reversed(made))
-    assert last == Message(9, 5, tuple(range(words)))
+    assert last == CanMessage(9, 5, tuple(range(words)))
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_frames_of_number_0_begin_anew_with_each_first() -> None:
     first, second = segments(0, 30, [4, 0, 255, 1])
     lost, _ = segments(0, 30, [5, 0, 255, 1])
     assert [whole.add(data, 0.0) for data in (second, lost, first)] == [None] * 3
-    assert whole.add(second, 0.0) == Message(0, 30, (4, 0, 255, 1))
+    assert whole.add(second, 0.0) == CanMessage(0, 30, (4, 0, 255, 1))
 
 
 BUS_PORT_SET = [CanFrame(0x201, bytes([number])) for number in range(22)]

@@ -35,7 +35,7 @@ from pymodbus.logging import Log
 from drivers import ports
 from drivers.errors import CommandError, LinkError
 from drivers.ports import Port
-from drivers.urls import Place
+from drivers.urls import Endpoint
 from drivers.wires import can_bus, modbus_frames
 from drivers.wires.can_bus import PythonCanAddress
 from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextReader
@@ -504,7 +504,7 @@ HEARD: list[bytes] = []
 OPENINGS: dict[str, Callable[[], Coroutine[Any, Any, Port]]] = {
     "port": partial(
         ports.open_port,
-        Place("/dev/ttyUSB9", baud=9600),
+        Endpoint("/dev/ttyUSB9", baud=9600),
         lambda data: None,
         lambda what: None,
     ),

@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from benchmarks.direct_plate import direct_acceleration
-from drivers.playing import Playback, Tone, Transition, Voice
+from drivers.playing import AmplifierTone, Playback, Voice, VoiceTransition
 from drivers.protocol.sets import Command, Envelope, LayerSet
 from firmware_machine import bench_driving_arm, keep_alive, play
 from model.answer.answer import Layer
@@ -71,7 +71,7 @@ def two_amplifiers(coarse_rig: Rig) -> Rig:
 def played(
     rig: Rig,
     imperfections: Imperfections,
-    commands: Mapping[str, tuple[Tone, ...]],
+    commands: Mapping[str, tuple[AmplifierTone, ...]],
     *,
     until: float = 1.0,
     stop: float | None = None,
@@ -102,7 +102,7 @@ def test_imperfections_apply_gain_and_phase(two_amplifiers: Rig) -> None:
     shares: list[complex] = []
     for imperfections in (PERFECT, errors):
         for name, channel in (("left", 0), ("right", 1)):
-            drive = {name: (Tone(channel, 110.0, 0.5),)}
+            drive = {name: (AmplifierTone(channel, 110.0, 0.5),)}
             times, samples = played(two_amplifiers, imperfections, drive, until=3.0)
             shares.append(phasor(times, samples, 110.0, since=2.5))
     assert shares[2] == pytest.approx(shares[0], rel=1e-9)
@@ -114,11 +114,14 @@ def test_imperfections_second_harmonic_is_another_tone(two_amplifiers: Rig) -> N
     """A tenth of the motion at twice its frequency and phase, from its onset on, as if played."""
     share = cmath.rect(0.1, math.radians(40))
     errors = Imperfections({Channel("left", 0): ChannelErrors(harmonic=share)})
-    drive = {"left": (Tone(0, 110.0, 0.5, 25.0), Tone(1, 170.0, 0.2))}
+    drive = {"left": (AmplifierTone(0, 110.0, 0.5, 25.0), AmplifierTone(1, 170.0, 0.2))}
     _, distorted = played(two_amplifiers, errors, drive, until=0.2)
     _, plain = played(two_amplifiers, PERFECT, drive, until=0.2)
     _, harmonic = played(
-        two_amplifiers, PERFECT, {"left": (Tone(0, 220.0, 0.05, 2 * 25.0 + 40.0),)}, until=0.2
+        two_amplifiers,
+        PERFECT,
+        {"left": (AmplifierTone(0, 220.0, 0.05, 2 * 25.0 + 40.0),)},
+        until=0.2,
     )
     largest = np.abs(harmonic).max()
     assert_allclose(distorted - plain, harmonic, rtol=0, atol=1e-3 * largest)
@@ -127,7 +130,7 @@ def test_imperfections_second_harmonic_is_another_tone(two_amplifiers: Rig) -> N
 
 def test_imperfections_skew_shifts_the_phase(two_amplifiers: Rig) -> None:
     """One amplifier 1 ms behind the other: at 110 Hz its share lags by 39.6 degrees."""
-    drive = {"right": (Tone(0, 110.0, 0.5),)}
+    drive = {"right": (AmplifierTone(0, 110.0, 0.5),)}
     skewed = Imperfections(delays={"right": 0.003, "left": 0.0015})
     shares = [
         phasor(*played(two_amplifiers, each, drive, until=3.0), 110.0, since=2.5)
@@ -147,7 +150,7 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
         bench.place_fingers({"a": AT}, now=0.0)
         bench_driving_arm(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
-            play(bench, Tone(0, frequency, 0.5), now=now, name="left", token=token)
+            play(bench, AmplifierTone(0, frequency, 0.5), now=now, name="left", token=token)
         bench.advance(0.4)
         windows = [(0.09, 0.0999), (0.1001, 0.1199), (0.1201, 0.15)]
         frequencies.append(
@@ -262,7 +265,7 @@ def test_imperfections_of_the_plate_are_those_of_another_rig(coarse_rig: Rig) ->
             for era in coarse_rig.eras
         ),
     )
-    drive = {"main": (Tone(0, 110.0, 0.5), Tone(1, 110.0, 0.5))}
+    drive = {"main": (AmplifierTone(0, 110.0, 0.5), AmplifierTone(1, 110.0, 0.5))}
     _, found = played(coarse_rig, Imperfections(plate=errors), drive)
     _, expected = played(built, PERFECT, drive)
     assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
@@ -332,7 +335,7 @@ def test_base_moves_by_its_voices(seed: int, late: float) -> None:
 def test_pieces_of_an_envelope_join(start: float) -> None:
     """One piece plays at any moment: there is no gap by rounding that a sample could fall into."""
     knots = tuple(0.01j * n for n in range(1, 19))
-    way = Transition(start, 0.005, 0j, 0.19j, start + 0.095, knots)
+    way = VoiceTransition(start, 0.005, 0j, 0.19j, start + 0.095, knots)
     terms = motion_of([Voice(0, 80.0, start, way)], EXACT, stroke=1e-4)
     assert [one.end for one in terms[:-1]] == [one.start for one in terms[1:]]
     assert (terms[0].start, terms[-1].end) == (start, math.inf)

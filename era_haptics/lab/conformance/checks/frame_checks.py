@@ -51,8 +51,10 @@ from drivers.wires.modbus_frames import (
     EXCEPTIONS,
     HEAD,
     IDENTITY_COUNT,
+    IDENTITY_REGISTER,
     PRESENT,
     READ,
+    REPLY_OFFSET,
     WRITE,
     Adu,
     AduReader,
@@ -63,17 +65,15 @@ from drivers.wires.modbus_frames import (
     unpack_identity,
     write_pdu,
 )
-from drivers.wires.modbus_frames import IDENTITY as MODBUS_FRAMES_IDENTITY
-from drivers.wires.modbus_frames import REPLY as MODBUS_FRAMES_REPLY
 from drivers.wires.serial_frames import (
     NEUTRAL,
+    REPLY_BIT,
     Frame,
     FrameReader,
     encode_frame,
     pack_words,
     unpack_words,
 )
-from drivers.wires.serial_frames import REPLY as SERIAL_FRAMES_REPLY
 from drivers.wires.serial_frames import unpack_identity as serial_frames_unpack_identity
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
@@ -314,7 +314,7 @@ class ModbusClient(JudgeClient):
 
     def question(self, address: int) -> bytes:
         """Return the frame that reads the identity of a unit."""
-        return self.adu(read_pdu(MODBUS_FRAMES_IDENTITY, IDENTITY_COUNT), unit=address)
+        return self.adu(read_pdu(IDENTITY_REGISTER, IDENTITY_COUNT), unit=address)
 
     def adu(self, pdu: bytes, *, unit: int | None = None) -> bytes:
         """Return a PDU in a frame under the next transaction number."""
@@ -354,7 +354,7 @@ class ModbusClient(JudgeClient):
 
     async def hello(self) -> Values:
         """Read the identity."""
-        registers = await self.read(MODBUS_FRAMES_IDENTITY, IDENTITY_COUNT)
+        registers = await self.read(IDENTITY_REGISTER, IDENTITY_COUNT)
         expect_equal(registers[0], 0, "tag of the identity")
         return read_as("identity", unpack_identity, registers)
 
@@ -369,7 +369,7 @@ class ModbusClient(JudgeClient):
                 return RequestOutcome(code, None, (), when)
         sent = threads.now()
         count = HEAD + min(self.reply_words.get(number, MAX_WORDS), MAX_WORDS)
-        shown, result, *reply = await self.read(BOX * number + MODBUS_FRAMES_REPLY, count)
+        shown, result, *reply = await self.read(BOX * number + REPLY_OFFSET, count)
         when = when or When(sent, threads.now())
         if tag is not None:
             expect_equal(shown, tag, f"tag of the reply to {message_name(number)}")
@@ -441,9 +441,7 @@ async def areas(subject: Subject) -> None:
         await client.transact(client.write_of(number, words, tag=tag))
 
     async def area(number: int, count: int = AREA, at: int = 0, function: int = READ) -> list[int]:
-        return [
-            *await client.read(BOX * number + MODBUS_FRAMES_REPLY + at, count, function=function)
-        ]
+        return [*await client.read(BOX * number + REPLY_OFFSET + at, count, function=function)]
 
     for number in set(BY_NUMBER) - {_MODBUS_FRAMES_STATUS}:
         shown = await area(number)
@@ -475,8 +473,8 @@ async def areas(subject: Subject) -> None:
         tag, result, first = await area(number, 3)
         shown_once = tag, result, first > 0
         expect_equal(shown_once, (9, 0, True), "tag, result, words once a refusal was read")
-    texts = await client.read(MODBUS_FRAMES_IDENTITY, IDENTITY_COUNT, function=READ_HOLDING)
-    part = await client.read(MODBUS_FRAMES_IDENTITY + 2, 16)
+    texts = await client.read(IDENTITY_REGISTER, IDENTITY_COUNT, function=READ_HOLDING)
+    part = await client.read(IDENTITY_REGISTER + 2, 16)
     expect_equal(part, texts[2:18], "part of the identity")
 
 
@@ -486,14 +484,14 @@ async def present_areas(subject: Subject) -> None:
     client = _client(subject)
     await client.look_around()
     await subject.run([subject.arm, subject.one(), subject.ping])
-    kept = await client.read(BOX * _MODBUS_FRAMES_PING + MODBUS_FRAMES_REPLY, AREA)
+    kept = await client.read(BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET, AREA)
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
-    again = await client.read(BOX * _MODBUS_FRAMES_PING + MODBUS_FRAMES_REPLY, AREA)
+    again = await client.read(BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET, AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     first, *_ = subject.parts(subject.one(), now=0, count=3)
     await subject.send(send("Set", **first))
     tag = client.number
-    shown = await client.read(BOX * _MODBUS_FRAMES_SET + MODBUS_FRAMES_REPLY, AREA)
+    shown = await client.read(BOX * _MODBUS_FRAMES_SET + REPLY_OFFSET, AREA)
     expect_equal(shown, (tag, 0, *_NO_WORDS), "reply area after a part that is kept")
     if not (client.is_rtu or client.has_gateway):
         await subject.run([stage(subject.one())])
@@ -510,13 +508,13 @@ async def present_areas(subject: Subject) -> None:
         await client.expect_silence(data, "a Ping for all")
         await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
-        (tag,) = await client.read(BOX * _STOP + MODBUS_FRAMES_REPLY, 1)
+        (tag,) = await client.read(BOX * _STOP + REPLY_OFFSET, 1)
         expect(tag != 4242, "tag after a Stop for all", expected="as before", seen=tag)
 
 
 def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
     """Yield PDUs with the exceptions that they must raise."""
-    area = BOX * _MODBUS_FRAMES_PING + MODBUS_FRAMES_REPLY
+    area = BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET
     last = area + AREA
     functions = (1, 2, 5, 6, 22, 43, 100)
     for function in functions:
@@ -537,9 +535,9 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
     for what, first, count, code in (
         ("a read beyond an area", last - 1, 2, 2),
         ("a read behind an area", last, 1, 2),
-        ("a read of no message", BOX * 63 + MODBUS_FRAMES_REPLY, 1, 2),
+        ("a read of no message", BOX * 63 + REPLY_OFFSET, 1, 2),
         ("a read of what is written", BOX * _MODBUS_FRAMES_PING, 1, 2),
-        ("a read beyond the identity", MODBUS_FRAMES_IDENTITY, IDENTITY_COUNT + 1, 2),
+        ("a read beyond the identity", IDENTITY_REGISTER, IDENTITY_COUNT + 1, 2),
         ("a read of 0 registers", area, 0, 3),
         ("a read of 126 registers", area, 126, 3),
         ("a read of 126 registers where there are none", 0, 126, 3),
@@ -614,7 +612,7 @@ class SerialClient(JudgeClient):
     def hear(self, data: bytes) -> bytes:
         """Take messages from bytes."""
         for frame in self._reader.feed(data):
-            is_text = frame.kind == HELLO | SERIAL_FRAMES_REPLY
+            is_text = frame.kind == HELLO | REPLY_BIT
             if len(frame.payload) % 2 and not is_text:
                 self.invalid.append(frame.payload)
                 continue
@@ -642,9 +640,7 @@ class SerialClient(JudgeClient):
         """Read the identity, by a Hello of any length and version."""
         frame = (await self._replied(HELLO, payload, version)).frame
         seen = frame.kind, frame.version
-        expect_equal(
-            seen, (HELLO | SERIAL_FRAMES_REPLY, NEUTRAL), "type, version of the reply to Hello"
-        )
+        expect_equal(seen, (HELLO | REPLY_BIT, NEUTRAL), "type, version of the reply to Hello")
         return read_as("identity", serial_frames_unpack_identity, frame.payload)
 
     async def exchange(
@@ -654,11 +650,11 @@ class SerialClient(JudgeClient):
         sent = threads.now()
         heard = await self._replied(number, pack_words(words) + behind, version)
         answer = RequestOutcome("", None, heard.words, When(sent, heard.at))
-        if heard.type == NAK | SERIAL_FRAMES_REPLY:
+        if heard.type == NAK | REPLY_BIT:
             answer = self.refusal(sent, heard.at, number, heard.words)
         is_refused, is_neutral = bool(answer.code), answer.code == "UNSUPPORTED_VERSION"
         required = (
-            (NAK if is_refused else number) | SERIAL_FRAMES_REPLY,
+            (NAK if is_refused else number) | REPLY_BIT,
             NEUTRAL if is_neutral else VERSION,
         )
         seen = heard.type, heard.frame.version
@@ -691,7 +687,7 @@ class SerialClient(JudgeClient):
         good = self.request(number, words)
         content = cobs.decode(good[1:-1])
         long = content[:-_CRC_SIZE] + bytes(2 * MAX_WORDS + 2 - 2 * len(words))
-        reply = bytes([content[0] | SERIAL_FRAMES_REPLY]) + content[1:-_CRC_SIZE]
+        reply = bytes([content[0] | REPLY_BIT]) + content[1:-_CRC_SIZE]
         bits = (
             (f"a wrong byte {at}", altered(content, at)) for at in (-4, -3, -2, -1, _SEQUENCE_AT)
         )

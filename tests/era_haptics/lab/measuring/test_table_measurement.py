@@ -17,7 +17,7 @@ from benchmarks.direct_plate import direct_responder
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import Staged
-from drivers.playing import Layer
+from drivers.playing import AmplifierLayer
 from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import Float32Array, FloatArray
@@ -278,12 +278,12 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
     class Observed(BlockingAmplifier):
         """Notes how what it plays ends."""
 
-        def apply(self, layers: Sequence[Layer]) -> Staged:
+        def apply(self, layers: Sequence[AmplifierLayer]) -> Staged:
             staged = super().apply(layers)
             playing.set()
             return staged
 
-        def play(self, layers: Sequence[Layer], *, duration: float) -> Staged:
+        def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> Staged:
             try:
                 staged = super().play(layers, duration=duration)
             except CommandRefused:

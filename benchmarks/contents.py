@@ -168,7 +168,7 @@ def _print_sharing(names: tuple[str, str], table: "LocalizationTable", *, count:
     import numpy as np
 
     from model import drive_modes as coherent
-    from model.answer.stimulus import Contents, Stream
+    from model.answer.answer import Contents, Stream
     from model.answer.tone_search import choose_by_numpy, choose_tones
 
     chosen = coherent.TARGET_STARTS, coherent.ALIGNMENTS, coherent.REALIGNMENTS
@@ -261,8 +261,9 @@ def _print_distorted(
     """Print how far each content is above the second harmonics, sums and differences there."""
     import numpy as np
 
+    from model.answer.answer import APART_HZ
     from model.answer.plan import answer
-    from model.answer.stimulus import APART_HZ, Finger, Stimulus
+    from model.answer.stimulus import Finger, Stimulus
     from model.vibration import base_amplitudes
 
     above, near = [], []

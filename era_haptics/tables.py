@@ -11,11 +11,11 @@ from era_haptics.drive import (
     as_points,
     expect_rig,
 )
-from model.answer.answer import Answer
+from model.answer.answer import APART_HZ, Answer
 from model.answer.answer_report import Measures, Timing
 from model.answer.answer_report import measures as _measures
 from model.answer.plan import answer as _answer
-from model.answer.stimulus import APART_HZ, MUST, Finger, Stimulus
+from model.answer.stimulus import MUST, Finger, Stimulus
 from model.arrays import FloatArray
 from model.errors import InputError, expect, expect_number, shown
 from model.finger import STRONG_DB_SL, Grid

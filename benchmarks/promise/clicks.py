@@ -163,7 +163,8 @@ def _felt_on(
     """
     import numpy as np
 
-    from model.answer.answer import DriveEnvelope, RingingUnderFingers
+    from model.answer.promise import RingingUnderFingers
+    from model.answer.stimulus import DriveEnvelope
     from model.finger import fingertip_points, fingertip_weights
     from model.vibration import Tone, base_amplitudes
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.transients.cases import Case
-from model.answer.answer import ONSET_RAMP
+from model.answer.stimulus import ONSET_RAMP
 from model.arrays import FloatArray
 from model.finger import contrast_db, fingertip_points, fingertip_weights
 from model.rig.rig import Rig

@@ -40,11 +40,11 @@ from controller.play.layer_contents import Content, Prediction, Selection, Targe
 from controller.play.routing import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import (
+    APART_HZ,
     HELD_BACK,
     IMPERCEPTIBLE_DB_SL,
     MIN_CONTRAST_DB,
     MIXED,
-    ONSET_RAMP,
     OWN,
     OWN_CONTRAST_DB,
     SAME_LEVEL,
@@ -56,7 +56,7 @@ from model.answer.answer import (
 )
 from model.answer.plan import answer, worst_of
 from model.answer.promise import with_tones
-from model.answer.stimulus import ANY, APART_HZ, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
+from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, ONSET_RAMP, Finger, Placement, Stimulus
 from model.arrays import NEARLY, Complex64Array, FloatArray, Point
 from model.drive_modes import UNRESTRICTED
 from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS

@@ -36,9 +36,8 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
 from model.answer import answer
-from model.answer.answer import FADE_RAMP
 from model.answer.answer_report import Timing
-from model.answer.stimulus import Course
+from model.answer.stimulus import FADE_RAMP, Course
 from model.rig.rig import Rig
 
 MIN_LEFT = 0.001

@@ -26,10 +26,10 @@ from controller.sources.touch import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import Played
 from drivers.protocol.definition import HEARTBEAT
-from model.answer.answer import FADE_RAMP, Layer, Limits
+from model.answer.answer import Layer, Limits
 from model.answer.answer_report import Timing
 from model.answer.plan import prepare_answers, query
-from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
+from model.answer.stimulus import FADE_RAMP, MIN_LEVEL_DB_SL, Placement
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry.plugins import failure_text

@@ -42,9 +42,9 @@ from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
 from model import vibration as physics
 from model.answer import answer
-from model.answer.answer import FADE_RAMP, Layer, Limits, amplitudes_of
+from model.answer.answer import Layer, Limits, amplitudes_of
 from model.answer.answer_report import Timing
-from model.answer.stimulus import KNOT_STEP, Course, Placement
+from model.answer.stimulus import FADE_RAMP, KNOT_STEP, Course, Placement
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.ensemble.draws import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.errors import InputError

@@ -43,10 +43,8 @@ from controller.play.layer_contents import (
 from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.routing import PlaybackCapabilities
 from controller.sources.touch import Contact, ContactKey
-from model.answer.answer import Answer
-from model.answer.plan import MAX_SEPARATE
-from model.answer.promise import scaled
-from model.answer.stimulus import APART_HZ
+from model.answer.answer import APART_HZ, Answer
+from model.answer.plan import MAX_SEPARATE, scaled
 from model.arrays import NEARLY
 from model.drive_modes import UNRESTRICTED
 from model.errors import InputError

@@ -1,358 +1,254 @@
 """What is played for fingers, and what each of them feels.
 
-Stimuli of limited duration: what fingers feel of a drive over it, onset and ringing included.
+`Contents` is a question: K contents, each for its fingers, which all others are to be kept from.
+Content j alone is the question "these are targets, all others are quiet", so K contents are K
+searches over one load of the plate; sharing weights among them gains 0.3 dB at most. Contents
+differ in frequency, so their powers add. From a few candidates of each the combination is chosen by
+the worst finger on drawn plates; what is promised is computed on other draws, the same for all
+tones. The contrast at finger k is
 
-A plate follows its drive late: over 40 ms the root mean square at a finger is several decibels
-below, on a sharp resonance ten decibels below, that of the steady vibration, and it rings on. A
-target counts by the mean of its demodulated acceleration over the duration, another fingertip by
-its power, that after the end included; of a course both by its strongest moments. Tones near the
-frequency of a drive stand for its envelope, whichever it is (`DriveEnvelope.shares_at`): by these
-weights are searched and drawn plates judged.
+    C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k,
+
+and at a quiet finger that of the weakest content to all contents together. A single content has the
+tone of the highest contrast at its level. Since contents differ in frequency, a contrast depends on
+whose thresholds amplitudes are compared with: the least over the table's sets of thresholds counts,
+in the choice and in the promise. The weights of one content do not depend on the set; its second
+harmonics do, and candidates are judged by the set to which these are loudest.
+
+`Tones` is what `model.answer.tone_search` finds for a question. `Answer` is what follows from both:
+a `Layer` for each content, and a `Sensation` for each finger.
 """
 
+import cmath
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import fft
 
 from model.answer.stimulus import (
     ANY_BAND,
-    SHAPED_FROM,
-    SILENCE,
-    STRONGEST,
-    Contents,
+    ONSET_RAMP,
     Course,
     Finger,
     Placement,
-    Tones,
+    pulse_ramp,
+    swings_of_pulse,
 )
-from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray, Point
-from model.drive_modes import UNRESTRICTED, Drive, Forms
+from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
+from model.drive_modes import UNRESTRICTED
 from model.files.csv_file import as_frame
-from model.finger import decibels, detection_threshold
-from model.structure.attachments import Source, fingertip_loads
-from model.table.table import LocalizationTable, read_fingertips
-from model.transients.base_motion import Envelopes, rise
-from model.transients.excursions import CLICKS_APART, DECAYED, Swing
-from model.transients.knots import RISE
-from model.transients.time_response import enveloped_accelerations
-from model.vibration import Excitation
+from model.finger import decibels
+from model.structure.attachments import Source
+from model.table.table import LocalizationTable
+from model.transients.base_motion import Envelopes
+from model.transients.excursions import Swing
+from model.vibration import Excitation, Tone
 
-ONSET_RAMP = 0.040
-"""Duration of a plain ramp [s].
+PROMISED_PERCENTILE = 9
+"""Percentile of the drawn plates that is promised.
 
-Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
-at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
+It is about the tenth percentile of plates that are solved exactly: effects beyond the first order
+in parameters other than the thickness cost some tenths of a decibel.
 """
 
-RINGING = 0.100
-"""Time [s] after a short effect over which what other fingers feel is followed.
+REACHED = 1 - 1e-5
+"""Share of a level that counts as all of it."""
 
-Weights keep them quiet as long as they are followed, and no longer: where that was 20 ms, what
-rang after was up to 7 dB stronger on four ERAs, 18 dB on a large table.
+KEPT, MISSING = 16, 4
+"""Frequencies that are searched for a single content, and how many of them may miss the level.
+
+The first is a multiple of what kernels take at once. Those of the highest bounds |c^H w| /
+sqrt(w^H R w) of w = R^-1 c are taken, with R the mean over the quiet fingers: a bound takes one
+system of equations, a search several.
 """
 
-_BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
-"""Distance of the frequencies beside its own that count of a drive, and the least share of one in
-the power of its strongest moments."""
+MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
+"""Candidates of a single content, and the most of any content in all its bands.
 
-_PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
-"""Steps [s] of pulses, and how many one has at most within its duration."""
+So many by the mean over fingertips, and as many by their points.
+"""
 
-_RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
-_TINY = 1e-30
+MAX_COMBINATIONS, PRUNING_STEP = 200, 4
+"""Combinations of candidates that are kept for the next content, and the step of draws in between.
 
-FADE_RAMP = 0.020
-"""Fade-out [s] under fingers that stay on the plate; a shorter one would feel like a tap."""
+Fewer are kept for more than four contents, so that time grows with the square of their number.
+"""
+
+APART_HZ = 30.0
+"""Least distance of the frequencies of two contents [Hz]: nearer ones would be felt to beat."""
 
 
-_LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
+@dataclass(frozen=True)
+class Stream:
+    """A content for some fingers."""
 
+    targets: tuple[int, ...]
+    """Its fingers, by index."""
+    level_db_sl: float
+    bands: tuple[tuple[int, int], ...]
+    """First row of the table's frequencies and one past the last, for each band that it may have.
 
-def pulse_ramp(duration: float) -> float:
-    """Plain ramp [s] of a vibration of this duration [s], a quarter of it.
-
-    The vibration is even over its duration then: no 40 ms of a click of 40 ms are more than 0.8 dB
-    (median) stronger than the first 40, along a ramp of half of it 1.5, as long as it 3 dB.
+    There is one band unless contents may exchange theirs.
     """
-    return min(ONSET_RAMP, duration / 4)
-
-
-@lru_cache
-def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
-    """Return the swings of pulses of a duration one after the other, along plain ramps [s].
-
-    They end along their own, or along that of contents that end. Of a long one its first
-    SHAPED_FROM: by then the onset has decayed as far as the end will.
-    """
-    length = min(duration, SHAPED_FROM)
-    count = math.ceil((length + DECAYED) / _PULSE_STEP)
-    times = np.asarray(_PULSE_STEP * np.arange(count), dtype=float)
-    shares = [
-        rise(times, ramp) - rise(np.asarray(times - length), end) for end in (ramp, FADE_RAMP)
-    ]
-    again = max(duration, CLICKS_APART)
-    one, other = (Swing(tuple(each.tolist()), _PULSE_STEP, again) for each in shares)
-    return one, other
-
-
-def shaped_gain(duration: float) -> float:
-    """Amplitude over a duration [s] relative to the steady one with a shaped onset.
-
-    The target follows a raised cosine, whose square has a mean of 3/8.
-    """
-    return math.sqrt(1 - 5 / 8 * min(RISE, duration) / duration)
+    priority: int = 0
+    """Higher priorities take the stroke first."""
+    duration: float | None = None
+    """Time [s] over which the level is felt, None for a content that lasts."""
+    limit_db_sl: float | None = None
+    """Level up to which it is as strong as others allow, None where its level is fixed."""
+    course: Course | None = None
+    """Course over the duration, whose highest share has the level."""
 
 
 @dataclass(frozen=True, eq=False)
-class OverDuration:
-    """What k fingers feel of a drive over a duration on the nominal plate.
+class Contents:
+    """K contents for k fingers on a plate."""
 
-    gains (k,): mean amplitude relative to the steady one; heard (k, p): squared amplitude to
-    threshold at each point over as long, at its strongest.
-    """
-
-    gains: FloatArray
-    heard: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class DriveEnvelope:
-    """Envelope (n,) of a drive at even steps [s], as long as it is followed.
-
-    within: steps over which it is felt, of a course the strongest, else the first; share: of the
-    followed part in the duration, the rest of which is steady.
-    """
-
-    values: FloatArray
-    step: float
-    within: int
-    share: float = 1.0
-    is_course: bool = False
-
-    @classmethod
-    def of_pulse(cls, duration: float, ramp: float) -> "DriveEnvelope":
-        """Along plain ramps [s], to beyond the end, where a quiet finger may feel most."""
-        length = min(duration, SHAPED_FROM)  # the rest is steady
-        count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
-        step = length / count
-        every = count + math.ceil(RINGING / step)
-        times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
-        values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
-        return cls(np.asarray(values), step, count, length / duration)
-
-    @classmethod
-    def of_course(cls, course: Course) -> "DriveEnvelope":
-        """Along a course, or a plain ramp where it starts or ends above 0."""
-        count = math.ceil((course.duration + RINGING) / course.step)
-        times = np.asarray(course.step * np.arange(count), dtype=float)
-        after, (first, *_, last) = np.asarray(times - course.duration), course.shares
-        values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
-        values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
-        within = round(STRONGEST / course.step)
-        return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
+    places: tuple[Point, ...]
+    """Places of all fingers [m]."""
+    loads: tuple[float, ...]
+    """Load of each finger relative to the rig's fingertip, empty for 1 each."""
+    streams: tuple[Stream, ...]
+    """The contents."""
+    quiet: tuple[int, ...]
+    """Fingers, by index, that are to feel nothing; those without a content are unprotected."""
+    apart_hz: float = 0.0
+    """Least distance of the contents' frequencies [Hz] where their bands allow it."""
+    background: Complex64Array | None = None
+    """Form of the rest of the plate at all of the table's frequencies; None with other fingers."""
+    drive_mode: str = UNRESTRICTED
+    """Any but UNRESTRICTED plays one content."""
+    is_shaped: bool = False
+    """Whether onsets are shaped, after which nothing rings."""
+    least_ramp: float = 0.0
+    """Least ramp [s] of short contents, whose ramp is otherwise a quarter of their duration."""
+    avoided: tuple[int, ...] = ()
+    """Rows of the table's frequencies that no content may have."""
 
     @property
-    def lasts(self) -> float:
-        """How long it is felt [s], what is steady apart."""
-        return self.within * self.step
+    def is_ranked(self) -> bool:
+        """Whether only KEPT frequencies are searched at first: for one content of one finger."""
+        first = self.streams[0]
+        return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
 
-    def moments(self, squares: FloatArray) -> FloatArray:
-        """Means of squares (n, ...) over what is felt, from all times on, (n', ...)."""
-        sums = np.cumsum(squares, axis=0, dtype=float)
-        sums[self.within :] -= sums[: -self.within].copy()
-        return np.asarray(sums[self.within - 1 :] / self.within)
+    @property
+    def candidates(self) -> int:
+        """Number of candidates of each content in each of its bands, by means and by points."""
+        count, bands = len(self.streams), len(self.streams[0].bands)
+        return max(1, min(MIN_CANDIDATES + count // 2, MAX_CANDIDATES // bands))
 
-    def felt(self, squares: FloatArray, weights: FloatArray) -> OverDuration:
-        """From squared amplitudes to threshold (n + 1, k, p), the last of them steady.
+    @property
+    def combinations(self) -> int:
+        """Number of combinations of candidates that are kept."""
+        return min(MAX_COMBINATIONS, 4 * MAX_COMBINATIONS // len(self.streams))
 
-        weights (k, p): of the points in the mean.
-        """
-        power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]
-        own = power if self.is_course else power[:1]
-        felt = (np.sqrt(own) * weights).sum(axis=2).max(axis=0)
-        steady = (np.sqrt(squares[-1]) * weights).sum(axis=1)
-        return OverDuration(felt / np.maximum(steady, 1e-30), power.max(axis=0))
+    @property
+    def rows(self) -> IntArray:
+        """Rows of the table's frequencies that contents may have, ascending, (f,)."""
+        bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
+        return np.setdiff1d(np.concatenate(bands), self.avoided)
 
-    def shares_at(self, off: FloatArray) -> FloatArray:
-        """Shares (b,) of the steady power of tones that are off its frequency (b,) [Hz].
+    def others(self, number: int) -> list[int]:
+        """Fingers that a content, by its number, is kept from."""
+        every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
+        return sorted(every - {*self.streams[number].targets})
 
-        With the energy of the drive on any plate (Parseval); of a course that of the strongest
-        moments of each. Of two tones each has more of what is nearer to it: beside the drive's own,
-        at which a null may be, as its square.
-        """
-        count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
-        count = fft.next_fast_len(count)
-        transform, nu = fft.fft(self.values, count), fft.fftfreq(count, self.step)
-        near = np.array([np.interp(nu, off, each) for each in np.eye(len(off))])
-        own = int(np.argmin(np.abs(off)))
-        is_beside = near[own] > 0
-        near[:, is_beside] **= 2
-        near[own, is_beside] += 1 - near[:, is_beside].sum(axis=0)
-        squares = np.abs(fft.ifft((transform * np.sqrt(near)).astype(np.complex64))) ** 2
-        if self.is_course:
-            power, all_ = self.moments(squares.T).max(axis=0), self.moments(self.values**2).max()
-            return np.asarray(power * (all_ / power.sum()))
-        power = self.share * squares.sum(axis=1) / self.within
-        power[own] += 1 - self.share
-        return np.asarray(power)
+    @property
+    def levels(self) -> Float32Array:
+        """Amplitude to threshold of each content, (K,)."""
+        levels = [10 ** (stream.level_db_sl / 20) for stream in self.streams]
+        return np.array(levels, dtype=np.float32)
 
 
-def on_drawn_plates(
-    energies: FloatArray, heard: FloatArray, factor: FloatArray | float
-) -> FloatArray:
-    """Power over a duration on drawn plates (..., 1 + d), from energies, nominal first.
-
-    heard (...): over the duration on the nominal plate; factor: of power over the duration to
-    energies, as at the target. What other plates add to the energy is felt by as much.
-    """
-    added = factor * (energies - energies[..., :1])
-    return np.asarray(np.maximum(heard[..., None] + added, 0.0))
+_ROUNDING = 1e-6  # of single precision
 
 
 @dataclass(frozen=True, eq=False)
-class RingingUnderFingers:
-    """Drives along an envelope, under fingers at places [m] of a plate.
+class Tones:
+    """m tones of K contents, one of each or more, and what k fingers feel of them.
 
-    loads: of each relative to the rig's fingertip, empty for 1.
+    With s sets of thresholds, the rig's own first.
     """
 
-    table: LocalizationTable
-    places: tuple[Point, ...]
-    loads: tuple[float, ...]
-    envelope: DriveEnvelope
-    _solved: dict[tuple[tuple[int, bytes], ...], OverDuration] = field(default_factory=dict)
+    rows: list[int]
+    """Row (m,) of each tone's frequency in the table."""
+    weights: Sequence[Sequence[complex]]
+    """Weights of the ERAs (m, n), up to full stroke."""
+    gains: list[float]
+    """Gain (m,) of each tone to its level, within the stroke."""
+    owners: Sequence[int]
+    """Content (m,) of each tone."""
+    contrast_db: Sequence[Sequence[float]]
+    """Contrast (k, 3): nominal, on half of the drawn plates, and promised.
+
+    The least over the sets of thresholds; NaN without other contents or fingers.
+    """
+    level_db_sl: Sequence[Sequence[float]]
+    """Level (k, 2) of a finger's own content by the rig's own set: nominal and promised."""
+    foreign_db_sl: Sequence[Sequence[float]]
+    """Level (k, s) of other contents by each set, which nine of ten plates do not exceed.
+
+    NaN at fingers that neither feel a content nor are quiet.
+    """
+    worst_db: float
+    """Promised contrast of the worst finger, NaN for one finger alone."""
+    stroke_factor: float
+    """Least factor on the gains for the stroke, 1 for none."""
+    is_apart: bool
+    """Whether the frequencies are as far apart as wanted."""
+
+    def excitations(
+        self,
+        content: int,
+        eras: Sequence[Source],
+        frequencies: FloatArray,
+        highest_drives: FloatArray,
+    ) -> list[Excitation]:
+        """Return the excitations of a content, one for each of its tones, the carrier first.
+
+        frequencies (f,) [Hz] and highest_drives (f, eras) are the table's. The strongest ERA, or
+        the first of those nearly as strong, has phase zero.
+        """
+        found = list[Excitation]()
+        every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
+        for row, values, gain, owner in every:
+            if owner != content:
+                continue
+            frequency, tones = float(frequencies[row]), dict[str, Tone]()
+            # Python's numbers: numpy's take ten times as long, one by one.
+            enough = (1 - NEARLY) * max(map(abs, values))
+            (strongest, *_) = [value for value in values if abs(value) >= enough]
+            factor = strongest.conjugate() / abs(strongest)
+            for era, highest, value in zip(eras, highest_drives[row].tolist(), values, strict=True):
+                if value != 0:
+                    w = value * factor
+                    if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
+                        w = w.real
+                    amplitude = gain * min(abs(w), 1.0) * highest
+                    tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
+            found.append(tones)
+        return found
 
     @classmethod
-    def of_streams(
-        cls, table: LocalizationTable, contents: Contents
-    ) -> list["RingingUnderFingers | None"]:
-        """One for each content that has a duration, None for those that last or are shaped."""
-        found: list[RingingUnderFingers | None] = []
-        for stream in contents.streams:
-            envelope: DriveEnvelope | None = None
-            if stream.course is not None:
-                envelope = DriveEnvelope.of_course(stream.course)
-            elif stream.duration is not None and not contents.is_shaped:
-                ramp = max(pulse_ramp(stream.duration), contents.least_ramp)
-                envelope = DriveEnvelope.of_pulse(stream.duration, ramp)
-            fingers = table, contents.places, contents.loads
-            found.append(None if envelope is None else cls(*fingers, envelope))
-        return found
-
-    @cached_property
-    def shares(self) -> FloatArray:
-        """Shares (f, f) of the power at its own frequency, of tones at all of the table's.
-
-        A row for each of the table's frequencies that a drive may have.
-        """
-        hertz, known = self.table.frequencies, dict[tuple[float, ...], FloatArray]()
-        ends = (hertz <= hertz[0] + _BESIDE_HZ).sum(), (hertz >= hertz[-1] - _BESIDE_HZ).sum()
-        beyond = int(max(ends)) - 1
-        wide = np.pad(hertz, beyond, mode="reflect", reflect_type="odd")
-        # Tones beyond the table count as those as far within it.
-        rows = np.pad(np.arange(len(hertz)), beyond, mode="reflect")
-        found = np.zeros((len(hertz), len(hertz)))
-        for own, at in enumerate(hertz.tolist()):
-            off = np.round(wide - at, 6)
-            near = np.abs(off) <= _BESIDE_HZ
-            key = tuple(off[near].tolist())
-            if key not in known:
-                known[key] = self.envelope.shares_at(off[near])
-            np.add.at(found[own], rows[near], known[key])
-        strongest = self.envelope.moments(self.envelope.values**2).max()
-        found[found < _LEAST_SHARE * strongest] = 0.0
-        return found
-
-    def spectrum(self, drive: Drive) -> Drive:
-        """Tones for the tones of a drive, near the frequency of each.
-
-        They have together the energy of the drive on any plate (Parseval), but for what it excites
-        far beside. Above the threshold at its own frequency.
-        """
-        found, thresholds = [], self.table.thresholds
-        for own, weights in drive:
-            for row in np.flatnonzero(self.shares[own]).tolist():
-                factor = math.sqrt(self.shares[own, row]) * thresholds[row] / thresholds[own]
-                found.append((row, np.asarray(factor * weights, dtype=np.complex64)))
-        return found
-
-    def forms(self, steady: Forms, some: IntArray) -> Forms:
-        """Forms over the envelope at some of the table's frequencies, from steady ones at all."""
-        shares, own = self.shares[some].astype(np.float32), np.sqrt(self.shares[some, some])
-        size = (np.abs(steady.targets) ** 2).sum(axis=(0, 2))
-        gain = np.sqrt(shares @ size / np.maximum(size[some], _TINY))
-        found, by_carrier = steady.at(some), own.astype(np.float32)[:, None, None, None]
-        return replace(
-            found,
-            targets=found.targets * gain[:, None],
-            quiet=(shares @ steady.quiet.reshape(len(steady.quiet), -1)).reshape(found.quiet.shape),
-            level_margin=0.0,
-            few=None if found.few is None else found.few * by_carrier,
-            fine=None if found.fine is None else found.fine * by_carrier,
-        )
-
-    def lasting_long_enough(self, some: IntArray) -> IntArray:
-        """Those of some of the table's frequencies whose spectrum does not reach 0; all, if none.
-
-        A drive of fewer periods moves the plate as a whole, which no frequency of a table tells.
-        """
-        hertz, envelope = self.table.frequencies[some], self.envelope
-        long = some if envelope.is_course else some[hertz * envelope.lasts >= _LEAST_PERIODS]
-        return long if len(long) else some
-
-    def over_drive(self, drive: Drive) -> OverDuration:
-        """What fingers feel of a drive, as `over`; solved once."""
-        hertz, drives = self.table.frequencies, self.table.highest_drives
-        key = tuple([(row, weights.tobytes()) for row, weights in drive])
-        if key not in self._solved:
-            self._solved[key] = self.over(
-                [
-                    (float(hertz[row]), np.multiply(weights, drives[row], dtype=complex))
-                    for row, weights in drive
-                ]
-            )
-        return self._solved[key]
-
-    def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
-        """What fingers feel at their fine points of tones together.
-
-        Of each its frequency [Hz] and the motions of the bases (eras,) [m].
-        """
-        table, tips = self.table, read_fingertips(self.table, self.places)
-        k, p, r = tips.fine.shape
-        loads = fingertip_loads(table.fingertip, self.places, self.loads)
-        centres = tips.fine[: len(loads), 0].astype(float)
-        fingers = [(at, load.fingertip) for at, load in zip(centres, loads, strict=True)]
-        squares = np.zeros(())
-        for frequency, bases in tones:
-            found = enveloped_accelerations(
-                table.in_time,
-                bases,
-                float(frequency),
-                points=tips.fine.reshape(-1, r).astype(float),
-                fingers=fingers,
-                envelope=self.envelope.values,
-                step=self.envelope.step,
-            )
-            threshold = detection_threshold(np.array(frequency), table.threshold)
-            squares = squares + (found.real**2 + found.imag**2) / threshold**2
-        return self.envelope.felt(squares.reshape(-1, k, p), tips.fine_weights.astype(float))
+    def none(cls, fingers: int, sets: int) -> "Tones":
+        """Return no tones, as so many fingers feel them; sets: number of sets of thresholds."""
+        contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
+        heard = [(-math.inf,) * sets] * fingers
+        return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)
 
 
 MIN_CONTRAST_DB, OWN_CONTRAST_DB = 6.0, 12.0
-"""Promised contrast from which a vibration is served, and from which it is a finger's own."""
+"""Promised contrast [dB] from which a vibration is served, and from which it is a finger's own."""
 
 IMPERCEPTIBLE_DB_SL = -10.0
-"""Level at which a finger stays unaware: ten decibels for the differences between people."""
+"""Level that a finger does not notice: ten decibels allow for differences between people."""
 
 SAME_LEVEL = 0.1
-"""Difference of two levels that are one [dB]."""
+"""Difference [dB] below which two levels count as equal."""
 
 _SHORT_OF = 0.05  # dB; a level closer to the wanted one is reached
 
@@ -364,37 +260,39 @@ class Sensation:
     """What a finger gets.
 
     Promised measures are those that nine of ten plates within the rig's uncertainty reach, or do
-    not exceed; the others those of the plate as modelled, with the fingers on it.
-
-    - verdict: `own`, `mixed` (below OWN_CONTRAST_DB, or what pauses beside others that are felt),
-      `shared` (the vibration of another finger), `held back`, with the contrast that it would have
-      had, or `quiet`
-    - layer: number of the layer that plays it, None without one
-    - level_db_sl, promised_level_db_sl: of its stimulus, over the duration if that is limited
-    - contrast_db, median_contrast_db, promised_contrast_db: its level above that of all other
-      vibrations here, or of an only one above its own at the loudest quiet finger; of a quiet
-      finger the weakest vibration at its own finger above all of them here. As modelled, of half
-      and of nine of ten plates, each the least over the rig's sets of thresholds; None where there
-      is nothing to compare with
-    - foreign_level_db_sl: of all other vibrations here, promised, not nominal as level_db_sl: the
-      greatest over the sets
-    - pauses: whether it ends, or comes and goes
-    - lowered_db: by how much it is weaker than its stimulus asks
-    - is_disturbing: whether it is held back because of a finger's max_foreign_db_sl
+    not exceed; the others are nominal, those of the modelled plate with the fingers on it.
     """
 
     finger: Finger
     verdict: str
+    """`own`; `mixed`; `shared`; `held back`; or `quiet`.
+
+    A vibration is mixed below OWN_CONTRAST_DB, or where it pauses while others are felt. Shared is
+    the vibration of another finger. One that is held back has the contrast that it would have had.
+    """
     layer: int | None = None
+    """Number of the layer that plays its vibration, None without one."""
     level_db_sl: float = -math.inf
+    """Level of its stimulus, over the duration if that is limited."""
     promised_level_db_sl: float = -math.inf
     contrast_db: float | None = None
+    """Level above that of all other vibrations here, None where there is nothing to compare.
+
+    Of a single vibration: above its own level at the loudest quiet finger. Of a quiet finger: the
+    weakest vibration, at its own finger, above all of them here. As all contrasts the least over
+    the rig's sets of thresholds.
+    """
     median_contrast_db: float | None = None
+    """The same contrast, on half of the plates."""
     promised_contrast_db: float | None = None
     foreign_level_db_sl: float | None = None
+    """Promised level of all other vibrations here, the greatest over the sets of thresholds."""
     lowered_db: float = 0.0
+    """By how much it is weaker than its stimulus asks [dB]."""
     is_disturbing: bool = False
+    """Whether it is held back because of a finger's max_foreign_db_sl."""
     pauses: bool = False
+    """Whether it ends, or comes and goes."""
 
     @property
     def is_foreign_felt(self) -> bool:
@@ -404,27 +302,29 @@ class Sensation:
 
 @dataclass(frozen=True)
 class Layer:
-    """What is played at once for the fingers of one vibration, by number.
-
-    excitation: of all ERAs; side_bands: excitations beside it where its strength comes and goes;
-    ramp [s]; onset, ending: envelopes that replace it; swings: ways in which its level comes and
-    goes, without any it lasts; contrast_to_plate_db: level above that of
-    the plate farther than 50 mm, root mean square, where no other finger is there.
-    """
+    """What is played at once for the fingers of one vibration."""
 
     excitation: Excitation
+    """Tones of all ERAs."""
     fingers: tuple[int, ...] = (0,)
+    """Fingers that feel it, by number."""
     side_bands: tuple[Excitation, ...] = ()
+    """Excitations beside it that make its strength come and go."""
     ramp: float = ONSET_RAMP
+    """Duration [s] of the plain onset and ending."""
     onset: Envelopes | None = None
+    """Shaped onset in place of the ramp."""
     ending: Envelopes | None = None
+    """Shaped ending in place of the ramp."""
     drive_mode: str = UNRESTRICTED
     contrast_to_plate_db: float | None = None
+    """Level above that of the plate beyond 50 mm, root mean square, if there is no other finger."""
     swings: tuple[Swing, ...] = ()
+    """Ways in which its level may come and go; empty for a layer that lasts."""
 
     @property
     def frequency(self) -> float | None:
-        """Its frequency, without those of side bands [Hz]; None of several or where it is empty."""
+        """Its frequency [Hz], side bands excluded; None if it has several or is empty."""
         frequencies = {tone.frequency for tone in self.excitation.values()}
         return frequencies.pop() if len(frequencies) == 1 else None
 
@@ -435,26 +335,18 @@ class Layer:
 
     @property
     def drives(self) -> list[tuple[Excitation, tuple[Swing, ...]]]:
-        """The same, each with the swings of its level."""
+        """The excitation and its side bands, each with the swings of its level."""
         return [(each, self.swings) for each in self.excitations]
 
     @property
     def voices(self) -> tuple["Layer", ...]:
-        """It without side bands, and each of them as a layer, along its ramp."""
-        beside = [
-            Layer(
-                each,
-                self.fingers,
-                ramp=self.ramp,
-                drive_mode=self.drive_mode,
-                swings=self.swings,
-            )
-            for each in self.side_bands
-        ]
-        return (replace(self, side_bands=()), *beside)
+        """The layer without its side bands, and a layer for each of them, along its ramp."""
+        carrier = replace(self, side_bands=())
+        beside = replace(carrier, onset=None, ending=None, contrast_to_plate_db=None)
+        return carrier, *[replace(beside, excitation=each) for each in self.side_bands]
 
     def scaled(self, gain_db: float) -> "Layer":
-        """The layer louder by so much [dB], its envelopes too: contrasts stay."""
+        """Return the layer with a gain [dB] on its excitations and envelopes: contrasts stay."""
         factor = 10 ** (gain_db / 20)
         louder = [
             {n: replace(tone, amplitude=tone.amplitude * factor) for n, tone in each.items()}
@@ -475,21 +367,21 @@ class Layer:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the amplifiers.
-
-    frequencies: lowest and highest [Hz]; amplitudes: largest ones [m], by ERA, None for the
-    strokes; power: sum of squared levels of all ERAs; slew [1/s]: highest rise of one; excursion:
-    part of the magnets' that may be used.
-    """
+    """Limits of the amplifiers on all layers together."""
 
     frequencies: tuple[float, float] = ANY_BAND
+    """Lowest and highest frequency [Hz]."""
     amplitudes: Mapping[str, float] | None = None
+    """Largest amplitude [m] by ERA, None for the strokes."""
     power: float = math.inf
+    """Sum of the squared levels of all ERAs."""
     slew: float = math.inf
+    """Fastest rise of a level [1/s]."""
     excursion: float = 1.0
+    """Share of the magnets' excursions that may be used."""
 
     def factor_within(self, layers: Sequence[Layer], table: LocalizationTable) -> float:
-        """Return the factor, 1 at most, by which layers of a table are within together."""
+        """Return the factor, 1 at most, that brings layers of a table within all limits."""
         drives = [each for layer in layers for each in layer.drives]
         share, power = table.excursion_of(drives) / self.excursion, 0.0
         strokes = table.full_levels
@@ -505,35 +397,39 @@ NO_LIMITS = Limits()
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What is played for fingers, and what each of them feels.
-
-    asked: the fingers; contents: that are played, and who is kept quiet; tones: of these; held:
-    vibrations given up, by finger, with the contrast that they would have had, and whether they
-    would disturb a finger; applied: what was changed, in words; envelopes: onset and ending of each
-    layer, if shaped; eras, frequencies [Hz], highest_drives (f, eras), thresholds [m/s²]: of the
-    table.
-    """
+    """What is played for fingers, and what each of them feels."""
 
     asked: tuple[Finger, ...]
+    """The fingers, with what each asks for."""
     contents: Contents
+    """Contents that are played, and fingers that are kept quiet."""
     tones: Tones
+    """Tones of the contents."""
     held: tuple[tuple[int, float, bool], ...]
+    """Vibrations that are held back: finger, contrast [dB] that it would have had, and whether it
+    would disturb another one."""
     applied: tuple[str, ...]
+    """What was changed of the fingers' requests, in words."""
     eras: tuple[Source, ...]
+    """ERAs of the table."""
     frequencies: FloatArray
+    """Frequencies (f,) of the table [Hz]."""
     highest_drives: FloatArray
+    """Amplitude of each ERA at full level (f, eras) of the table."""
     thresholds: Float32Array
+    """Detection threshold at each frequency (f,) [m/s²]."""
     envelopes: tuple[tuple[Envelopes | None, Envelopes | None], ...] = ()
+    """Shaped onset and ending of each layer; empty if they are plain ramps."""
 
     def __repr__(self) -> str:
-        """What each finger gets, without the numbers that it follows from."""
+        """Show what each finger gets, without the numbers behind it."""
         return f"Answer(fingers={self.fingers}, applied={self.applied})"
 
     @cached_property
     def fingers(self) -> tuple[Sensation, ...]:
-        """What each finger gets, in the order in which they were given."""
+        """What each finger gets, in the order of `asked`."""
         found, tones = dict[int, Sensation](), self.tones
-        known = [  # None for what there is not
+        known = [  # None in place of NaN
             [None if each != each else each for each in (*contrasts, max(of_others))]
             for contrasts, of_others in zip(tones.contrast_db, tones.foreign_db_sl, strict=True)
         ]
@@ -615,26 +511,27 @@ class Answer:
         return tuple(layers)
 
     def placement(self, layer: Layer) -> Placement:
-        """Where the fingers of a layer are, and all others."""
-        own, others, loads = [], [], []
-        for number in layer.fingers:
-            own.append(self.asked[number].at)
-            loads.append(self.asked[number].load)
-        for number, finger in enumerate(self.asked):
-            if number not in layer.fingers:
-                others.append(finger.at)
-                loads.append(finger.load)
-        return Placement(tuple(own), tuple(others), tuple(loads))
+        """Places of the fingers of a layer, and of all others."""
+        own = [self.asked[number] for number in layer.fingers]
+        others = [each for n, each in enumerate(self.asked) if n not in layer.fingers]
+        return Placement(
+            tuple([each.at for each in own]),
+            tuple([each.at for each in others]),
+            tuple([each.load for each in (*own, *others)]),
+        )
 
     def levels_db_sl(self, number: int, finger: int) -> tuple[float, float]:
-        """Level of a layer at a finger, both by number, and the promised one; of a course at 1."""
+        """Nominal and promised level of a layer at a finger, both by number.
+
+        Of a course at a share of 1.
+        """
         course = self.contents.streams[number].course
         level, promised = self.tones.level_db_sl[finger]
         strongest_db = 0.0 if course is None else course.strongest_db
         return level - strongest_db, promised - strongest_db
 
     def lowered_db(self, number: int) -> float:
-        """By how much a layer, by its number, is weaker than its stimulus asks [dB]."""
+        """By how much [dB] a layer, by its number, is weaker than the strongest of its stimuli."""
         stream = self.contents.streams[number]
         lasts, short = stream.duration is None, -math.inf
         for finger in stream.targets:
@@ -645,7 +542,7 @@ class Answer:
         return short if short > SAME_LEVEL else 0.0
 
     def pauses(self, number: int) -> bool:
-        """Whether a layer, by its number, ends or comes and goes, and with it what it masks."""
+        """Whether a layer, by its number, ends or comes and goes, so that it masks nothing then."""
         stream = self.contents.streams[number]
         stimulus = self.asked[stream.targets[0]].stimulus
         is_modulated = stimulus is not None and stimulus.modulation_hz is not None
@@ -655,7 +552,7 @@ class Answer:
 
     @property
     def is_reached(self) -> bool:
-        """Whether all vibrations have their levels on the plate as modelled."""
+        """Whether all vibrations have their nominal levels."""
         return all(
             self.tones.level_db_sl[finger][0] >= stream.level_db_sl - _SHORT_OF
             for stream in self.contents.streams
@@ -664,17 +561,17 @@ class Answer:
 
     @property
     def excitations(self) -> list[Excitation]:
-        """All that plays together."""
+        """All excitations that play together."""
         return [each for layer in self.layers for each in layer.excitations]
 
     @property
     def amplitudes(self) -> dict[str, float]:
-        """Amplitude of each ERA [m], of all that plays together."""
+        """Amplitude of each ERA [m], by name, of all excitations together."""
         return amplitudes_of(self.excitations)
 
     @property
     def promised_worst_db(self) -> float | None:
-        """The least contrast of all fingers, on nine of ten plates; None for one finger alone."""
+        """Promised contrast [dB] of the worst finger, None for one finger alone."""
         worst = self.tones.worst_db
         return None if math.isnan(worst) else worst
 
@@ -687,18 +584,21 @@ class Answer:
 
     @property
     def disturbed(self) -> list[int]:
-        """Fingers, by number, that would feel more of others' vibrations than they allow."""
+        """Fingers, by number, at which others' vibrations are stronger than they allow."""
         levels = enumerate(zip(self.tones.foreign_db_sl, self.asked, strict=True))
         return [finger for finger, (by, each) in levels if by[0] > each.max_foreign_db_sl]
 
     @property
     def stroke_factor(self) -> float:
-        """Of the requested levels what the ERAs' stroke allows, 1 for all."""
+        """Share of the requested levels that the ERAs' stroke allows, 1 for all."""
         return self.tones.stroke_factor
 
     @property
     def _contrast_to_plate_db(self) -> float | None:
-        """Level of the weakest target above that of the rest of the plate; None beside others."""
+        """Level of the weakest target above that of the rest of the plate [dB].
+
+        None if there are other fingers.
+        """
         background, tones = self.contents.background, self.tones
         if background is None:
             return None
@@ -713,12 +613,13 @@ class Answer:
         return level - float(decibels(math.sqrt(power)))
 
     def to_frame(self) -> Any:
-        """What each finger feels as a pandas DataFrame, a row a finger; needs pandas.
+        """Return what each finger feels as a pandas DataFrame, a row per finger; needs pandas.
 
-        worst_foreign_level_db_sl is `Sensation.foreign_level_db_sl`: what others' vibrations reach
-        at the loudest point of the fingertip, which nine of ten plates do not exceed, above the
-        lowest thresholds known. The finger's own level is above the rig's, up to 30 dB higher, so
-        that 20 dB SL of its own with 34 of others' is no contradiction: compare by the contrast.
+        worst_foreign_level_db_sl is `Sensation.foreign_level_db_sl`: the level of others'
+        vibrations at the loudest point of the fingertip, which nine of ten plates do not exceed,
+        above the lowest thresholds known. The finger's own level is above the rig's thresholds,
+        which are up to 30 dB higher, so 20 dB SL of its own beside 34 dB SL of others' is no
+        contradiction; compare by the contrast.
         """
         at, found = np.array([each.at for each in self.asked]), self.fingers
         frequencies = [layer.frequency or math.nan for layer in self.layers]
@@ -741,21 +642,22 @@ class Answer:
 def verdict_of(
     promised_contrast_db: float | None, foreign_level_db_sl: float | None, *, pauses: bool
 ) -> str:
-    """Return whether a vibration of a contrast is a finger's own or mixed with others.
+    """Return whether a vibration of some promised contrast is a finger's own or mixed with others.
 
-    A vibration masks what is weaker while it lasts: of one that pauses nothing foreign may be felt.
+    A vibration masks weaker ones while it lasts; beside one that pauses nothing foreign may be
+    felt.
     """
     is_own = promised_contrast_db is None or promised_contrast_db >= OWN_CONTRAST_DB
     return OWN if is_own and not (pauses and is_felt(foreign_level_db_sl)) else MIXED
 
 
 def is_felt(level_db_sl: float | None) -> bool:
-    """Return whether a level, None for none, is above the threshold."""
+    """Return whether a level is above the threshold; None is no level."""
     return level_db_sl is not None and level_db_sl > 0
 
 
 def verdict_shown(verdict: str | None, *, is_foreign_felt: bool) -> str | None:
-    """Return a verdict in words, with what a finger feels beside its own vibration."""
+    """Return a verdict in words, with a note if others' vibrations are felt beside it."""
     return f"{verdict}, others faintly felt" if verdict == OWN and is_foreign_felt else verdict
 
 

@@ -1,13 +1,12 @@
-"""What of an answer takes longer: its transients, and how concentrated it is over the plate.
+"""What of an answer is computed on request, and answers as JSON.
 
-Onset, ending and transient measures of layers.
-
-Exposure of fingers to vibration, weighted as ISO 5349-1 does for the hand.
-
-What a finger feels above its threshold says nothing of what harms it in the long run: that goes by
-acceleration, weighted by frequency (docs/concepts/people.md).
-
-Answers of a table as JSON: the lines of a batch in, one object each out.
+- `Timing` shapes onsets and endings of layers and rates them in time.
+- `measures`: transients and residual vibration of an answer's first layer, and how concentrated it
+  is over the plate.
+- `exposures`: vibration at each finger, weighted as ISO 5349-1 does for the hand. A level above the
+  threshold does not show what is harmful in the long run; that depends on acceleration, weighted by
+  frequency (docs/concepts/people.md).
+- `query_one`, `query_batch`: questions as JSON objects, and their answers.
 """
 
 import cmath
@@ -23,18 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.answer.answer import IMPERCEPTIBLE_DB_SL, QUIET, Answer, Layer
+from model.answer.answer import (
+    APART_HZ,
+    IMPERCEPTIBLE_DB_SL,
+    PROMISED_PERCENTILE,
+    QUIET,
+    Answer,
+    Layer,
+)
 from model.answer.plan import answer, prepare_answers
 from model.answer.promise import FingersOnPlate, loudest_power, promise
-from model.answer.stimulus import (
-    APART_HZ,
-    BY_NAME,
-    MUST,
-    PROMISED_PERCENTILE,
-    Finger,
-    Placement,
-    Stimulus,
-)
+from model.answer.stimulus import BY_NAME, MUST, Finger, Placement, Stimulus
 from model.arrays import FloatArray, Point, lattice, nullable
 from model.ensemble.draws import PROMISED_DRAWS
 from model.errors import InputError
@@ -54,7 +52,7 @@ from registry.wording import first_problem
 
 
 class Timing:
-    """Shapes and rates layers on the plate of a table in time.
+    """Shaping and rating of layers on the plate of a table in time.
 
     Takes about ten milliseconds to make, and one more at the first use of each frequency.
     """
@@ -67,14 +65,14 @@ class Timing:
         )
 
     def following(self, table: LocalizationTable) -> "Timing":
-        """The timing of a table that has followed its plate, with envelopes as shaped for this one.
+        """Return the timing of a table that was updated to its plate, with this one's shaper.
 
-        Nothing need be prepared anew.
+        Nothing has to be prepared again.
         """
         return Timing(table, shaper=self._shaper)
 
     def prepare(self, frequencies: Iterable[float]) -> None:
-        """Compute ahead what shaping needs at frequencies [Hz]."""
+        """Compute in advance what shaping needs at frequencies [Hz]."""
         for frequency in frequencies:
             self._shaper.prepare(frequency)
 
@@ -83,9 +81,9 @@ class Timing:
     ) -> Layer:
         """Add a shaped onset and ending, or one of them; takes some milliseconds.
 
-        Without other fingers the onset keeps the rest of the plate quiet. Envelopes are those of
-        the plate without fingers: solved with them they would win 1 to 1.5 dB of the contrast over
-        the first 100 ms, and take 6 ms longer.
+        Without other fingers the onset keeps the rest of the plate quiet. Envelopes are computed
+        for the plate without fingers: with them they would gain 1 to 1.5 dB of contrast over the
+        first 100 ms, and take 6 ms longer.
         """
         targets, quiet, tones = placement.targets, placement.quiet, layer.excitation
         if onset:
@@ -97,15 +95,15 @@ class Timing:
         return layer
 
     def shaped(self, found: Answer) -> Answer:
-        """Add onsets and endings to all layers of an answer that was asked for them."""
+        """Add onsets and endings to all layers of an answer that was made for shaped ones."""
         layers = [self.with_envelopes(each, found.placement(each)) for each in found.layers]
         both = [(each.onset, each.ending) for each in layers]
         return replace(found, envelopes=tuple(both))
 
     def transient_contrast_db(self, layer: Layer, placement: Placement) -> float | None:
-        """Contrast over the first 100 ms [dB], along the onset or the ramp; None without others.
+        """Contrast over the first 100 ms [dB] along the onset or the ramp, fingers on the plate.
 
-        The fingers are on the plate.
+        None without quiet fingers.
         """
         if not placement.quiet:
             return None
@@ -134,42 +132,38 @@ def _few_points(table: LocalizationTable, places: Sequence[Point]) -> tuple[Floa
     return tips.few_weights.astype(float), tips.few.astype(float)
 
 
-SPACING = 0.0025  # m; resolves the area of a circle of 50 mm to a percent
-PERCENTILE = 95
+_SPACING = 0.0025  # m; resolves the area of a circle of 50 mm to a percent
+_PERCENTILE = 95
 
 
 @dataclass(frozen=True)
 class Concentration:
-    """How much of a vibration is near its targets.
-
-    contrast_95_db: targets to the 95th percentile of the plate farther than 50 mm, by peak
-    acceleration; area_above_half [m²]: of the plate, targets included, that vibrates more than
-    half as strongly as they do; energy_share_near: share of kinetic energy within 50 mm of them.
-    """
+    """How much of a vibration is near its targets."""
 
     contrast_95_db: float
+    """Peak acceleration at the targets to the 95th percentile of the plate beyond 50 mm of them."""
     area_above_half: float
+    """Area [m²] of the plate, targets included, that vibrates more than half as much as they do."""
     energy_share_near: float
+    """Share of the kinetic energy within 50 mm of the targets."""
 
 
 @dataclass(frozen=True)
 class Measures:
-    """What takes some ten milliseconds to say of the first layer of an answer.
-
-    transient_contrast_db: over the first 100 ms, as accelerations; residual_db: residual vibration
-    in the 100 ms after the end, relative to the steady one. transient_contrast_db is None without
-    other fingers, concentration with them; is_imperceptible_to_quiet: whether every quiet finger
-    stays 10 dB below all sets of thresholds by which promises hold, on nine of ten plates.
-    """
+    """Measures of the first layer of an answer that take some ten milliseconds to compute."""
 
     transient_contrast_db: float | None
+    """Contrast of accelerations over the first 100 ms, None without other fingers."""
     residual_db: float
+    """Residual vibration in the 100 ms after the end, relative to the steady one."""
     concentration: Concentration | None
+    """None with other fingers."""
     is_imperceptible_to_quiet: bool | None
+    """Whether quiet fingers stay 10 dB below all sets of thresholds, on nine of ten plates."""
 
 
 def measures(table: LocalizationTable, answer: Answer, *, timing: Timing | None = None) -> Measures:
-    """Return the measures in time and over the whole plate of the first layer of an answer."""
+    """Compute the measures of the first layer of an answer, in time and over the whole plate."""
     layer, timing = answer.layers[0], timing or Timing(table)
     placement = answer.placement(layer)
     quiet = [each.foreign_level_db_sl for each in answer.fingers if each.verdict == QUIET]
@@ -183,7 +177,7 @@ def measures(table: LocalizationTable, answer: Answer, *, timing: Timing | None 
 
 
 def concentration(table: LocalizationTable, layer: Layer, placement: Placement) -> Concentration:
-    """Return the concentration of a layer for fingers without others; takes some milliseconds."""
+    """Compute the concentration of a layer without quiet fingers; takes some milliseconds."""
     contacts, loads, tones = placement.targets, placement.loads, layer.excitation
     felt = []
     for target in contacts:
@@ -197,8 +191,8 @@ def concentration(table: LocalizationTable, layer: Layer, placement: Placement) 
 
 
 def cell_centres(plate: Plate) -> FloatArray:
-    """Centres (p, 2) [m] of equal small cells that tile the plate."""
-    count_x, count_y = (max(1, round(side / SPACING)) for side in (plate.length, plate.width))
+    """Return the centres (p, 2) [m] of small equal cells that tile the plate."""
+    count_x, count_y = (max(1, round(side / _SPACING)) for side in (plate.length, plate.width))
     x = np.linspace(0, plate.length, 2 * count_x + 1)[1::2]
     y = np.linspace(0, plate.width, 2 * count_y + 1)[1::2]
     return lattice(x, y)
@@ -221,21 +215,22 @@ def concentration_of(
     around = peak if near.all() else peak[~near]
     energy = ((amplitudes.T / frequencies) ** 2).sum(axis=1)
     return Concentration(
-        contrast_95_db=float(decibels(felt / np.percentile(around, PERCENTILE))),
+        contrast_95_db=float(decibels(felt / np.percentile(around, _PERCENTILE))),
         area_above_half=float((peak > felt / 2).mean()) * plate.length * plate.width,
         energy_share_near=float(energy[near].sum() / energy.sum()),
     )
 
 
-# Hz; of the limits of the band, 10^0.8 and 10^3.1, and where the weighting begins to fall.
+# Hz; the limits of the band, 10^0.8 and 10^3.1, and where the weighting begins to fall.
 _LOW, _HIGH, _FALL = 10**0.8, 10**3.1, 100 / (2 * np.pi)
+
 _BAND_Q, _FALL_Q = 1 / np.sqrt(2), 0.64
 
 
 def hand_weighting(frequencies: FloatArray) -> FloatArray:
-    """Weighting Wh at frequencies [Hz], of the same shape: 0.96 at 12.5 Hz, 0.063 at 250 Hz.
+    """Return the weighting Wh at frequencies [Hz], of their shape: 0.96 at 12.5 Hz, 0.063 at 250.
 
-    Of a band from 6.3 to 1259 Hz, second-order Butterworth on both sides, and of a transition from
+    A band from 6.3 to 1259 Hz, second-order Butterworth on both sides, with a transition from
     acceleration to velocity at 15.9 Hz (ISO 5349-1:2001, annex A; ISO 8041).
     """
     s = 1j * np.asarray(frequencies)
@@ -246,11 +241,11 @@ def hand_weighting(frequencies: FloatArray) -> FloatArray:
 
 
 def exposures(table: LocalizationTable, found: Answer) -> list[float]:
-    """Weighted acceleration at each finger of an answer, root mean square [m/s²].
+    """Return the weighted acceleration at each finger of an answer, root mean square [m/s²].
 
-    Of all vibrations together, normal to the plate, at the loudest point of the fingertip, while
-    they are at their full strength; nine of ten plates do not exceed it. Beyond 1 kHz, where
-    thresholds end, harmonics do not count.
+    Normal to the plate, of all vibrations together at their full strength, at the loudest point of
+    the fingertip; nine of ten plates do not exceed it. Harmonics above 1 kHz, where thresholds end,
+    do not count.
     """
     tones, contents = found.tones, found.contents
     if not tones.rows:
@@ -271,11 +266,39 @@ def exposures(table: LocalizationTable, found: Answer) -> list[float]:
     ]
 
 
+def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Answer one question with the keys of a batch's line. Raises InputError."""
+    asked, timing = _parsed(values, {}), Timing(table)
+    prepare_answers(table, asked.mode)
+    timing.prepare(table.frequencies.tolist())
+    return answer_as_json(table, asked, timing)
+
+
+def query_batch(
+    table: LocalizationTable,
+    lines: Iterable[str],
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+) -> Iterator[dict[str, Any]]:
+    """Answer every line that is not empty; one without an answer yields an `error` and its `line`.
+
+    defaults: values of keys that lines leave out.
+    """
+    prepare_answers(table)
+    timing = Timing(table)
+    timing.prepare(table.frequencies.tolist())
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                yield answer_as_json(table, _parsed(line, defaults), timing)
+            except InputError as error:
+                yield {"error": str(error), "line": number}
+
+
 _Place = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class _Own(BaseModel):
-    """Schema of a finger with a vibration of its own: what `Stimulus` and `Finger` have."""
+    """Schema of a finger with a vibration of its own, by the fields of `Stimulus` and `Finger`."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -292,7 +315,7 @@ class _Own(BaseModel):
     is_protected: bool = True
 
     def finger(self, level_db_sl: float) -> Finger:
-        """The finger; level_db_sl: that of the line."""
+        """Make the finger; level_db_sl: the line's, if it has none of its own."""
         given = self.model_dump(exclude_none=True)
         at = _point(given.pop("at"))
         if self.band_hz is not None:
@@ -321,12 +344,13 @@ class _Line(BaseModel):
 
 
 _OF_TARGETS = {"target", "targets", "duration"}
+
 _OF_OWN = {"bands_may_swap", "apart_hz"}
-"""Keys of a line that only one of both kinds of questions has."""
+"""Keys of a line that only one of the two kinds of questions may have."""
 
 
 def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line:
-    """A question, as JSON or as its keys and values; raises InputError."""
+    """Validate a question, given as JSON or as keys and values; raises InputError."""
     try:
         if isinstance(line, str):
             asked = _Line.model_validate_json(line)
@@ -350,7 +374,7 @@ def _parsed(line: str | Mapping[str, Any], defaults: Mapping[str, Any]) -> _Line
 
 
 def answer_as_json(table: LocalizationTable, asked: _Line, timing: Timing) -> dict[str, Any]:
-    """Answer a line; with vibrations of their own its loads are those of the quiet fingers."""
+    """Answer a line; its loads are of the quiet fingers if others have their own vibrations."""
     if asked.own:
         fingers = [each.finger(asked.level_db_sl) for each in asked.own]
         loads = _loads(asked, len(asked.quiet), what="quiet finger")
@@ -388,7 +412,7 @@ def _point(pair: list[float]) -> Point:
 
 
 def _shown(table: LocalizationTable, found: Answer, more: Measures | None) -> dict[str, Any]:
-    """The JSON object of an answer; more: measures of a vibration that all targets share."""
+    """Return the JSON object of an answer; more: its measures, if all targets share a vibration."""
     shown: dict[str, Any] = {
         "fingers": [
             {
@@ -461,31 +485,3 @@ def _envelopes_as_json(
         }
         for name, envelope in envelopes.items()
     }
-
-
-def query_one(table: LocalizationTable, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Answer one question, of the keys of a batch's line. Raises InputError."""
-    asked, timing = _parsed(values, {}), Timing(table)
-    prepare_answers(table, asked.mode)
-    timing.prepare(table.frequencies.tolist())
-    return answer_as_json(table, asked, timing)
-
-
-def query_batch(
-    table: LocalizationTable,
-    lines: Iterable[str],
-    defaults: Mapping[str, Any] = MappingProxyType({}),
-) -> Iterator[dict[str, Any]]:
-    """Answer every line that is not empty; `{"error": ..., "line": n}` for one without answer.
-
-    defaults: of keys that lines leave out.
-    """
-    prepare_answers(table)
-    timing = Timing(table)
-    timing.prepare(table.frequencies.tolist())
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            try:
-                yield answer_as_json(table, _parsed(line, defaults), timing)
-            except InputError as error:
-                yield {"error": str(error), "line": number}

@@ -1,17 +1,18 @@
-"""One answer to all fingers, and what is done where not all can be served.
+"""The answer to all fingers at once, and who gives way where not all can be served.
 
-A promise below the least contrast at the worst finger is not served as requested. First fingers
-share, the nearest first and only where they allow it: two that could not be kept apart were they
-alone on the plate, then two that may share anyway. What still does not fit is served in turn, by
-priority and arrival: each vibration that those before it leave room for. What could not be kept
-from the finger beside its own anyway comes last. Where the first cannot be served either, the best
-tried is, but for bounds that fingers state themselves: these hold, if by silence.
+Fingers that ask for a vibration get one each, as long as the worst finger has the least contrast.
+Where it has not, fingers share: the nearest first, and only where they allow it. Two fingers that
+could not be kept apart even if they were alone on the plate come before two that merely may share.
+If that is not enough, vibrations are served in turn, by priority and arrival: each one for which
+those before it leave room. One that could not be kept from the finger beside it anyway comes last.
+Where not even the first can be served, the best answer that was tried is given, except that bounds
+set by fingers themselves always hold, by silence if need be.
 
-Contents whose strength beats 10 to 30 times a second: a carrier and two side bands.
-
-Of a full modulation each side band has half the amplitude of the carrier. At the carrier's weights
-side bands leak 3 to 12 dB more: each has weights of its own, found like those of a content of its
-frequency. The carrier is chosen for all three together, near the best steady one.
+Then follow modulation, by a carrier and two side bands, and the levels: as strong as quiet fingers
+allow, and within the amplifiers' limits. At full modulation each side band has half the amplitude
+of the carrier. With the carrier's weights side bands would leak 3 to 12 dB more, so each has
+weights of its own, found like those of a content at its frequency. The carrier is chosen for all
+three together, near the best steady one.
 """
 
 import math
@@ -24,26 +25,26 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.answer import MIN_CONTRAST_DB, NO_LIMITS, SAME_LEVEL, Answer, Limits
-from model.answer.promise import (
-    as_quiet_fingers_allow,
-    as_ramps_allow,
-    gains_within,
-    scaled,
-    share_stroke,
-    with_gains,
-    with_tones,
+from model.answer.answer import (
+    APART_HZ,
+    IMPERCEPTIBLE_DB_SL,
+    MIN_CONTRAST_DB,
+    NO_LIMITS,
+    SAME_LEVEL,
+    Answer,
+    Contents,
+    Limits,
+    Stream,
+    Tones,
+    amplitudes_of,
 )
+from model.answer.promise import share_stroke, with_tones
 from model.answer.stimulus import (
     ANY,
-    APART_HZ,
     MIN_LEVEL_DB_SL,
-    Contents,
     Finger,
     Placement,
     Stimulus,
-    Stream,
-    Tones,
     check_fingers,
     together,
 )
@@ -54,143 +55,21 @@ from model.errors import InputError
 from model.finger import FELT_DB_SL, STRONG_DB_SL, decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 
-_SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
-_ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # of all three above the carrier
-_NEAR = 2  # carriers tried on each side of the steady one, by frequencies of the table
-_SAME = 0.5  # Hz; by which both side bands may differ in distance from the carrier
-_ROUNDING_DB = 1e-3  # of a promise that stays the same
-
-
-def with_modulation(
-    table: LocalizationTable,
-    found: Answer,
-    *,
-    playable: tuple[float, float],
-) -> Answer:
-    """Return an answer modulated as its fingers ask, where that leaves all fingers served.
-
-    playable: lowest and highest frequency [Hz] of side bands. These are as far below as above the
-    carrier, where the table has a frequency nearest to the modulation, and APART_HZ from all tones
-    of other contents. A shared content is steady. Levels are lowered to what the stroke allows.
-    """
-    for number, stream in enumerate(found.contents.streams):
-        stimulus, tones = found.asked[stream.targets[0]].stimulus, found.tones
-        modulation = None if stimulus is None else stimulus.modulation_hz
-        if stimulus is None or modulation is None or len(stream.targets) > 1:
-            continue
-        alone = cache(_alone_at(table, found, number))
-        limits = max(playable[0], table.frequencies[0]), min(playable[1], table.frequencies[-1])
-        owners, rows = np.array(tones.owners), np.array(tones.rows)
-        taken = table.frequencies[rows[owners != number]]
-        tried = [
-            each
-            for each in _carriers(table, int(rows[owners == number][0]), modulation)
-            if _fits(table.frequencies[each], modulation, stimulus.band_hz, limits, taken)
-        ]
-        if not tried:
-            continue
-        best = tried[best_of([_contrast_db([alone(row) for row in each]) for each in tried])]
-        own, kept = [alone(row) for row in best], np.flatnonzero(owners != number)
-        shares = _SHARES * 10 ** (-_ALL_DB / 20) * [each.gains[0] for each in own]
-        modulated = with_tones(
-            table,
-            found,
-            np.append(rows[kept], best),
-            [*(tones.weights[each] for each in kept.tolist()), *(each.weights[0] for each in own)],
-            np.append(owners[kept], [number] * len(own)),
-            np.append(np.array(tones.gains)[kept], shares),
-        )
-        modulated = _within_stroke(table, modulated)
-        if is_served(modulated, found):
-            found = modulated
-    return found
-
-
-def is_served(found: Answer, steady: Answer) -> bool:
-    """Whether all fingers have what they require, and no less than 6 dB unless they had less."""
-    worst, before = found.promised_worst_db, steady.promised_worst_db
-    if (
-        worst is not None
-        and before is not None
-        and worst < min(MIN_CONTRAST_DB, before - _ROUNDING_DB)
-    ):
-        return False
-    return not (found.lacks_contrast or found.disturbed)
-
-
-def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:
-    """Rows of carriers near a steady one, and of the side bands nearest to a modulation [Hz]."""
-    frequencies = table.frequencies
-    for carrier in range(max(steady - _NEAR, 0), min(steady + _NEAR + 1, len(frequencies))):
-        f = frequencies[carrier]
-        above = int(np.argmin(np.abs(frequencies - f - modulation)))
-        yield [carrier, int(np.argmin(np.abs(frequencies - 2 * f + frequencies[above]))), above]
-
-
-def _fits(
-    tones: FloatArray,
-    modulation: float,
-    band: tuple[float, float],
-    limits: tuple[float, float],
-    taken: FloatArray,
-) -> bool:
-    """Whether carrier and side bands [Hz] are even, within the limits, and apart from others."""
-    f, below, above = tones
-    gap, reach = above - f, max(above - f, modulation)
-    is_even = gap > 0 and abs(f - below - gap) <= _SAME
-    is_within = band[0] <= f <= band[1] and limits[0] <= f - reach and f + reach <= limits[1]
-    is_apart = all(abs(tone - other) >= APART_HZ for tone in tones for other in taken)
-    return bool(is_even and is_within and is_apart)
-
-
-def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
-    """Finds a content's tone at a row of the table's frequencies, all other fingers quiet."""
-    stream, contents = found.contents.streams[number], found.contents
-    (finger,), course = stream.targets, stream.course
-    level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
-    others = tuple(n for n in range(len(contents.places)) if n != finger)
-    background = None if others else table.background([contents.places[finger]])
-
-    def alone(row: int) -> Tones:
-        one = Stream((finger,), level_db_sl, ((row, row + 1),))
-        asked = replace(contents, streams=(one,), quiet=others, background=background)
-        return choose_tones(table, asked)
-
-    return alone
-
-
-def _contrast_db(tones: Sequence[Tones]) -> float:
-    """Promised contrast of a carrier and side bands [dB]: what leaks adds up."""
-    own = np.array([each.worst_db for each in tones])
-    leaks = (_SHARES**2 * 10 ** (-own / 10))[np.isfinite(own)]
-    return _ALL_DB - float(decibels(np.sqrt(leaks.sum()))) if len(leaks) else math.inf
-
-
-def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
-    """The answer with contents lowered to what the stroke allows of all tones together."""
-    tones, streams = found.tones, found.contents.streams
-    rows, owners, gains = (np.array(each) for each in (tones.rows, tones.owners, tones.gains))
-    drives = np.zeros((len(streams), len(table.eras)))
-    np.add.at(drives, owners, gains[:, None] * np.abs(tones.weights))
-    reached = [min(tones.level_db_sl[finger][1] for finger in each.targets) for each in streams]
-    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # silent ones
-    priorities = [each.priority for each in streams]
-    factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
-    if factor < 1 - NEARLY:
-        found = with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
-    least_db = float(decibels(levels * factors / found.contents.levels).min())
-    of_all = 1.0 if least_db > -SAME_LEVEL else 10 ** (least_db / 20)
-    return replace(found, tones=replace(found.tones, stroke_factor=of_all))
-
-
 MAX_SEPARATE = 5
-"""Fingers that may share, up to which each has a vibration of its own at first.
+"""Number of fingers that may share up to which each gets a vibration of its own at first.
 
-Of more, one for all was the end in 34 of 36 sets with two quiet fingers.
+With more of them, 34 of 36 sets beside two quiet fingers ended with one vibration for all.
 """
 
 CONTENTS_A_STEP = 3
-"""Of so many vibrations one gives way before what is left is measured, at least one in all."""
+"""Of this many vibrations one is merged, at least one in all, before the rest is measured again."""
+
+_SHARES = np.array([1.0, 0.5, 0.5])  # amplitudes of carrier and side bands
+_ALL_DB = 20 * math.log10(float(np.linalg.norm(_SHARES)))  # all three, above the carrier
+_NEAR = 2  # carriers tried on each side of the steady one, in frequencies of the table
+_SAME = 0.5  # Hz; largest difference of the side bands' distances from the carrier
+_ROUNDING_DB = 1e-3  # difference of promises that count as equal
+_SILENT_DB = -60.0  # gain at which no content is felt
 
 
 def answer(
@@ -208,16 +87,25 @@ def answer(
 ) -> Answer:
     """Answer all fingers at once, each with a vibration of its own.
 
-    quiet: more fingers, which are to feel nothing; drive_mode: the table's own if None, which must
-    be `phased` for more than one vibration; shaped: whether the amplifiers play shaped onsets and
-    endings, which `Timing` adds; apart_hz: distance of the vibrations' frequencies, from each other
-    and from avoided_hz, which play already, where their bands allow it; bands_may_swap: whether a
-    finger may have the band of another one; min_contrast_db: below which the promise at the worst
-    finger is not served as requested; limits: of the amplifiers. A stimulus whose modulation would
-    leave a finger unserved, or whose side bands do not fit, is steady, as is a shared one, and all
-    where clocks are not held. Levels are lowered where stroke and limits do not allow all: of the
-    lower priorities first, of one priority the louder ones first.
-    Raises InputError for fingers that contradict each other, and a band without frequencies.
+    Args:
+        table: of the plate on which the fingers are.
+        fingers: with the stimulus that each is to feel.
+        quiet: more fingers, which are to feel nothing.
+        drive_mode: the table's own if None; must be `phased` for more than one vibration.
+        shaped: whether the amplifiers play shaped onsets and endings, which `Timing` adds.
+        apart_hz: least distance of the vibrations' frequencies from each other and from avoided_hz,
+            where their bands allow it.
+        avoided_hz: frequencies that play already.
+        bands_may_swap: whether a finger may have the band of another one.
+        min_contrast_db: promised contrast of the worst finger below which fingers give way.
+        limits: of the amplifiers.
+
+    A modulated stimulus is made steady if its modulation would leave a finger unserved, if its side
+    bands do not fit, if it is shared, or if clocks are not held together. Levels are lowered where
+    stroke and limits do not allow all of them: lower priorities first, and the louder ones first
+    among equal priorities.
+
+    Raises InputError for fingers that contradict each other, and for a band without frequencies.
     """
     if not 0 <= apart_hz < math.inf:  # False for NaN
         raise InputError(f"apart_hz must be a distance of frequencies in Hz, got {apart_hz}")
@@ -239,21 +127,29 @@ def query(
     drive_mode: str | None = None,
     **stimulus: Any,
 ) -> Answer:
-    """Answer fingers that feel one vibration, and others that feel nothing, as `answer`."""
+    """Answer fingers that feel one vibration and others that feel nothing, as `answer` does."""
     fingers = together(placed, Stimulus(level_db_sl, **stimulus))
     return answer(table, fingers, drive_mode=drive_mode)
 
 
 def prepare_answers(table: LocalizationTable, drive_mode: str | None = None) -> None:
-    """Compute ahead what the first answer of a table in a drive mode needs."""
+    """Compute in advance what the first answer of a table in a drive mode needs."""
     centre = (table.plate.length / 2, table.plate.width / 2)
     for quiet in ((), ((0.0, 0.0),)):
         placed = Placement((centre,), quiet)
         query(table, placed, MIN_LEVEL_DB_SL, drive_mode=drive_mode)
 
 
+def _avoided(
+    table: LocalizationTable, avoided_hz: Sequence[float], apart_hz: float
+) -> frozenset[int]:
+    """Rows of a table's frequencies that are too near to frequencies that play already."""
+    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
+    return frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
+
+
 def _changed(found: Answer) -> list[str]:
-    """What became of modulations and levels, in words."""
+    """List in words which vibrations are steady or lowered against what was asked."""
     steady, lowered = [], []
     for number, stream in enumerate(found.contents.streams):
         first = stream.targets[0]
@@ -277,13 +173,12 @@ def _changed(found: Answer) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which fingers, by index, feel which content; all others that are protected are quiet.
-
-    contents: the fingers of each, its own first; applied: what was changed, in words.
-    """
+    """Which fingers, by index, feel which content; all others that are protected are quiet."""
 
     contents: tuple[tuple[int, ...], ...]
+    """The fingers of each content, its own first."""
     applied: tuple[str, ...] = ()
+    """What was changed, in words."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +195,10 @@ class _Answering:
     limits: Limits
 
     def solve(self, min_contrast_db: float) -> Answer:
-        """Share and serve in turn until the worst finger has the contrast, else the best tried."""
+        """Let fingers share, then serve in turn, until the worst finger has the contrast.
+
+        Otherwise return the best answer that was tried.
+        """
         plan = _Plan(self._first_contents)
         if len(plan.contents) > MAX_SEPARATE:
             plan = self._many_joined(plan)
@@ -327,9 +225,9 @@ class _Answering:
         return as_quiet_fingers_allow(self.table, found) if is_limited else found
 
     def within_limits(self, found: Answer, min_contrast_db: float) -> Answer:
-        """The answer lowered to what the amplifiers' limits allow.
+        """Lower the answer to what the amplifiers' limits allow.
 
-        Where a finger would not be served any more, by the rule again at the lower levels.
+        If a finger would no longer be served, all are answered again at the lower levels.
         """
         found = as_ramps_allow(self.table, found, self.limits)
         if (factor := self.limits.factor_within(found.layers, self.table)) >= 1 - NEARLY:
@@ -348,7 +246,7 @@ class _Answering:
 
     @cached_property
     def _first_contents(self) -> tuple[tuple[int, ...], ...]:
-        """The fingers of each vibration at first: of one name where they must feel one."""
+        """The fingers of each vibration at first: together if they must feel one."""
         found: list[list[int]] = []
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:
@@ -362,7 +260,7 @@ class _Answering:
         return tuple(map(tuple, found))
 
     def _with_more_shared(self, plan: _Plan, min_contrast_db: float) -> _Plan:
-        """The plan in which the nearest two fingers share that cannot be apart, else that may."""
+        """Let the nearest two fingers share that cannot be apart, else the nearest that may."""
         for _ in range(max(1, len(plan.contents) // CONTENTS_A_STEP)):
             pair = self._nearest(plan, are_apart=False)
             if not pair or self._contrast_alone(*pair) >= min_contrast_db:
@@ -373,9 +271,9 @@ class _Answering:
         return plan
 
     def _nearest(self, plan: _Plan, *, are_apart: bool = True) -> tuple[tuple[int, ...], ...]:
-        """The nearest two contents that may be one, none without such.
+        """Return the nearest two contents that may be one, empty if there are none.
 
-        are_apart: whether each finger could be served by one of its own.
+        are_apart: whether each finger could be served with a vibration of its own.
         """
         fingers, pairs = self.fingers, dict[tuple[tuple[int, ...], ...], float]()
         for number, one in enumerate(plan.contents):
@@ -386,9 +284,9 @@ class _Answering:
         return best_by([*pairs], pairs.__getitem__) if pairs else ()
 
     def _contrast_alone(self, own: Sequence[int], others: Sequence[int]) -> float:
-        """Contrast of the nearest two of own and other fingers, were only these on the plate.
+        """Contrast [dB] of the nearest two of own and other fingers, if only these were touching.
 
-        Whatever they feel; infinite without others.
+        Regardless of their stimuli; infinite without others.
         """
         pairs = [(self.fingers[a], self.fingers[b]) for a in own for b in others]
         if not pairs:
@@ -399,7 +297,7 @@ class _Answering:
         return alone._measure(_Plan(((0,),))).tones.worst_db
 
     def _quiet_beside(self, felt: Sequence[int]) -> list[int]:
-        """The fingers that must not feel what these fingers feel."""
+        """Return the fingers that must not feel the vibration of these fingers."""
         return [
             number
             for number, each in enumerate(self.fingers)
@@ -407,11 +305,11 @@ class _Answering:
         ]
 
     def _in_turn(self, plan: _Plan, tried: Sequence[Answer], min_contrast_db: float) -> Answer:
-        """Serve each content that those served before it leave what all need.
+        """Serve contents one after the other, each if all served so far still have what they need.
 
-        A finger that others disturb first, then by priority, then who is protected, then the
-        earliest; last what could not be kept from the finger beside its own, were no other on the
-        plate. Where the first cannot be served, the best of tried is.
+        First come fingers that others disturb, then higher priorities, then protected fingers, then
+        earlier ones; last come contents that could not even be kept from the finger beside their
+        own. If the first cannot be served, the best of tried is returned.
         """
         every, served = tried[-1], list[tuple[int, ...]]()
         order = sorted(
@@ -456,7 +354,7 @@ class _Answering:
         )
 
     def _joined(self, plan: _Plan, contents: Sequence[tuple[int, ...]]) -> _Plan:
-        """The plan with some of its contents as one, that of the highest priority."""
+        """Return the plan with some of its contents joined to that of the highest priority."""
         one, *others = sorted(contents, key=lambda each: -self.fingers[each[0]].priority)
         fingers = sum(others, one)
         at = _at(self.fingers[one[0]])
@@ -472,7 +370,7 @@ class _Answering:
         )
 
     def _many_joined(self, plan: _Plan) -> _Plan:
-        """The plan with one content for more than MAX_SEPARATE fingers that may all share."""
+        """Return the plan with one content for more than MAX_SEPARATE fingers that may share."""
         groups = defaultdict[str | bool, list[tuple[int, ...]]](list)
         for content in plan.contents:
             finger = self.fingers[content[0]]
@@ -485,7 +383,7 @@ class _Answering:
 
     @cached_property
     def _bands(self) -> dict[int, tuple[int, int]]:
-        """The first of the rows that each finger may have, and one past the last."""
+        """First row that each finger may have of the table's frequencies, and one past the last."""
         frequencies, bands = self.table.frequencies.tolist(), {}
         for number, finger in enumerate(self.fingers):
             if finger.stimulus is None:
@@ -504,7 +402,7 @@ class _Answering:
         return bands
 
     def _contents(self, plan: _Plan) -> Contents:
-        """A plan for a kernel."""
+        """Return the contents of a plan."""
         bands, streams, background = self._bands, [], None
         for fingers in plan.contents:
             own = tuple(bands.values()) if self.bands_may_swap else (bands[fingers[0]],)
@@ -527,6 +425,8 @@ class _Answering:
         if len(streams) == 1 and not quiet:
             places = [self.fingers[finger].at for finger in streams[0].targets]
             background = self.table.background(places)
+        rows = [{*range(*band)} for stream in streams for band in stream.bands]
+        leaves_none = any(each <= self.avoided for each in rows)
         return Contents(
             tuple([each.at for each in self.fingers]),
             tuple([each.load for each in self.fingers]),
@@ -536,16 +436,11 @@ class _Answering:
             background=background,
             drive_mode=self.drive_mode,
             is_shaped=self.is_shaped,
-            avoided=self._avoided_by(streams),
+            avoided=() if leaves_none else tuple(self.avoided),
         )
 
-    def _avoided_by(self, streams: Sequence[Stream]) -> tuple[int, ...]:
-        """The rows to be avoided; none where a content would be left without any."""
-        bands = [{*range(*band)} for stream in streams for band in stream.bands]
-        return () if any(band <= self.avoided for band in bands) else tuple(self.avoided)
-
     def _measure(self, plan: _Plan) -> Answer:
-        """What fingers feel of a plan's contents."""
+        """Choose the tones of a plan's contents and compute what fingers feel of them."""
         table, contents, applied = self.table, self._contents(plan), plan.applied
         if contents.streams:
             tones = choose_tones(table, contents)
@@ -557,16 +452,8 @@ class _Answering:
         return Answer(*given, table.eras, table.frequencies, table.highest_drives, table.thresholds)
 
 
-def _avoided(
-    table: LocalizationTable, avoided_hz: Sequence[float], apart_hz: float
-) -> frozenset[int]:
-    """The rows of a table's frequencies that are too near to some that play already [Hz]."""
-    near = [np.abs(table.frequencies - each) < apart_hz - SAME_FREQUENCY for each in avoided_hz]
-    return frozenset(np.flatnonzero(np.any(near, axis=0)).tolist() if near else ())
-
-
 def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
-    """The fingers of an answer, each at the frequency of its layer and at a lower level."""
+    """Return the fingers of an answer, at the frequencies of their layers, with gains [dB]."""
     softer = list(found.asked)
     for layer, gain in zip(found.layers, gains_db, strict=True):
         for number in layer.fingers:
@@ -580,20 +467,237 @@ def _softer(found: Answer, gains_db: Sequence[float]) -> tuple[Finger, ...]:
 
 
 def _fails(found: Answer, min_contrast_db: float) -> bool:
-    """Whether a finger has less contrast than any must have, or than it asks for."""
+    """Whether a finger has less contrast than all must have, or than it asks for."""
     return _is_out_of_bounds(found) or found.tones.worst_db < min_contrast_db
 
 
 def _is_out_of_bounds(found: Answer) -> bool:
     """Whether a finger has less contrast, or more of others' contents, than it allows."""
-    is_one_of_many = len(found.contents.streams) > 1  # one alone cannot give way to others
+    is_one_of_many = len(found.contents.streams) > 1  # a single content cannot give way
     return (is_one_of_many and found.lacks_contrast) or bool(found.disturbed)
 
 
 def worst_of(found: Answer) -> float:
-    """Return the least contrast of all fingers that is promised; infinite for one alone."""
+    """Return the promised contrast [dB] of the worst finger, infinite for one finger alone."""
     return math.inf if found.promised_worst_db is None else found.promised_worst_db
+
+
+def is_served(found: Answer, steady: Answer) -> bool:
+    """Whether all fingers have what they require, and at least 6 dB unless they had less before."""
+    worst, before = found.promised_worst_db, steady.promised_worst_db
+    if (
+        worst is not None
+        and before is not None
+        and worst < min(MIN_CONTRAST_DB, before - _ROUNDING_DB)
+    ):
+        return False
+    return not (found.lacks_contrast or found.disturbed)
 
 
 def _at(finger: Finger) -> str:
     return f"({finger.at[0]:g}, {finger.at[1]:g}) m"
+
+
+def with_modulation(
+    table: LocalizationTable,
+    found: Answer,
+    *,
+    playable: tuple[float, float],
+) -> Answer:
+    """Modulate an answer as its fingers ask, where that leaves all fingers served.
+
+    playable: lowest and highest frequency [Hz] of side bands. These are equally far below and above
+    the carrier, at the table's frequencies nearest to the modulation, and APART_HZ from all tones
+    of other contents. A shared content is steady. Levels are lowered to what the stroke allows.
+    """
+    for number, stream in enumerate(found.contents.streams):
+        stimulus, tones = found.asked[stream.targets[0]].stimulus, found.tones
+        modulation = None if stimulus is None else stimulus.modulation_hz
+        if stimulus is None or modulation is None or len(stream.targets) > 1:
+            continue
+        alone = cache(_alone_at(table, found, number))
+        limits = max(playable[0], table.frequencies[0]), min(playable[1], table.frequencies[-1])
+        owners, rows = np.array(tones.owners), np.array(tones.rows)
+        taken = table.frequencies[rows[owners != number]]
+        tried = [
+            each
+            for each in _carriers(table, int(rows[owners == number][0]), modulation)
+            if _fits(table.frequencies[each], modulation, stimulus.band_hz, limits, taken)
+        ]
+        if not tried:
+            continue
+        best = tried[best_of([_contrast_db([alone(row) for row in each]) for each in tried])]
+        own, kept = [alone(row) for row in best], np.flatnonzero(owners != number)
+        shares = _SHARES * 10 ** (-_ALL_DB / 20) * [each.gains[0] for each in own]
+        modulated = with_tones(
+            table,
+            found,
+            np.append(rows[kept], best),
+            [*(tones.weights[each] for each in kept.tolist()), *(each.weights[0] for each in own)],
+            np.append(owners[kept], [number] * len(own)),
+            np.append(np.array(tones.gains)[kept], shares),
+        )
+        modulated = _within_stroke(table, modulated)
+        if is_served(modulated, found):
+            found = modulated
+    return found
+
+
+def _carriers(table: LocalizationTable, steady: int, modulation: float) -> Iterator[list[int]]:
+    """Yield rows of a carrier near a steady one and of the side bands nearest to a modulation."""
+    frequencies = table.frequencies
+    for carrier in range(max(steady - _NEAR, 0), min(steady + _NEAR + 1, len(frequencies))):
+        f = frequencies[carrier]
+        above = int(np.argmin(np.abs(frequencies - f - modulation)))
+        yield [carrier, int(np.argmin(np.abs(frequencies - 2 * f + frequencies[above]))), above]
+
+
+def _fits(
+    tones: FloatArray,
+    modulation: float,
+    band: tuple[float, float],
+    limits: tuple[float, float],
+    taken: FloatArray,
+) -> bool:
+    """Whether carrier and side bands [Hz] are symmetric, within limits, and apart from others."""
+    f, below, above = tones
+    gap, reach = above - f, max(above - f, modulation)
+    is_even = gap > 0 and abs(f - below - gap) <= _SAME
+    is_within = band[0] <= f <= band[1] and limits[0] <= f - reach and f + reach <= limits[1]
+    is_apart = all(abs(tone - other) >= APART_HZ for tone in tones for other in taken)
+    return bool(is_even and is_within and is_apart)
+
+
+def _alone_at(table: LocalizationTable, found: Answer, number: int) -> Callable[[int], Tones]:
+    """Return a function that finds a content's tone at a row, all other fingers being quiet."""
+    stream, contents = found.contents.streams[number], found.contents
+    (finger,), course = stream.targets, stream.course
+    level_db_sl = stream.level_db_sl - (0.0 if course is None else course.strongest_db)
+    others = tuple(n for n in range(len(contents.places)) if n != finger)
+    background = None if others else table.background([contents.places[finger]])
+
+    def alone(row: int) -> Tones:
+        one = Stream((finger,), level_db_sl, ((row, row + 1),))
+        asked = replace(contents, streams=(one,), quiet=others, background=background)
+        return choose_tones(table, asked)
+
+    return alone
+
+
+def _contrast_db(tones: Sequence[Tones]) -> float:
+    """Promised contrast [dB] of a carrier and its side bands, whose leaks add up."""
+    own = np.array([each.worst_db for each in tones])
+    leaks = (_SHARES**2 * 10 ** (-own / 10))[np.isfinite(own)]
+    return _ALL_DB - float(decibels(np.sqrt(leaks.sum()))) if len(leaks) else math.inf
+
+
+def _within_stroke(table: LocalizationTable, found: Answer) -> Answer:
+    """Lower the contents of an answer to what the stroke allows of all tones together."""
+    tones, streams = found.tones, found.contents.streams
+    rows, owners, gains = (np.array(each) for each in (tones.rows, tones.owners, tones.gains))
+    drives = np.zeros((len(streams), len(table.eras)))
+    np.add.at(drives, owners, gains[:, None] * np.abs(tones.weights))
+    reached = [min(tones.level_db_sl[finger][1] for finger in each.targets) for each in streams]
+    levels = np.maximum(10 ** (np.array(reached) / 20), 1e-9)  # above 0 for silent ones
+    priorities = [each.priority for each in streams]
+    factors, factor = share_stroke(np.ones(len(streams)), drives, levels, priorities)
+    if factor < 1 - NEARLY:
+        found = with_tones(table, found, rows, tones.weights, owners, gains * factors[owners])
+    least_db = float(decibels(levels * factors / found.contents.levels).min())
+    of_all = 1.0 if least_db > -SAME_LEVEL else 10 ** (least_db / 20)
+    return replace(found, tones=replace(found.tones, stroke_factor=of_all))
+
+
+def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
+    """Set the levels of stimuli that are limits to what the other fingers allow.
+
+    All of them together reach at most IMPERCEPTIBLE_DB_SL at quiet fingers, by the rig's own
+    thresholds, on nine of ten plates. For the sake of fingers with a vibration of their own, none
+    is raised above that level, but none is lowered either.
+    """
+    streams, tones = found.contents.streams, found.tones
+    limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
+    heard = tones.foreign_db_sl
+    if len(limited) < len(streams):  # what is heard of the limited ones alone
+        alone = np.full(len(streams), _SILENT_DB)
+        alone[limited] = 0.0
+        heard = with_gains(table, found, alone).tones.foreign_db_sl
+    gains_db = np.zeros(len(streams))
+    for number in limited:
+        stream = streams[number]
+        level = min(tones.level_db_sl[finger][0] for finger in stream.targets)
+        highest = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
+        quiet, others = found.contents.quiet, found.contents.others(number)
+        allowed = highest - max([heard[finger][0] for finger in quiet], default=-math.inf)
+        raised = highest - max([heard[finger][0] for finger in others], default=-math.inf)
+        gains_db[number] = min((stream.limit_db_sl or 0.0) - level, allowed, max(raised, 0.0))
+    return with_gains(table, found, gains_db)
+
+
+def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> Answer:
+    """Lengthen the ramps of short stimuli to what the amplifiers' slew allows.
+
+    Levels are raised in turn, unless a stimulus is a limit, whose level is set by other fingers.
+    """
+    contents, tones, strokes = found.contents, found.tones, table.full_levels
+    if contents.is_shaped or all(stream.duration is None for stream in contents.streams):
+        return found
+    ramp = max([tone / strokes[name] for name, tone in found.amplitudes.items()]) / limits.slew
+    if ramp <= min([layer.ramp for layer in found.layers]):
+        return found
+    longer = replace(found, contents=replace(contents, least_ramp=ramp))
+    rows, owners = np.array(tones.rows, dtype=int), np.array(tones.owners, dtype=int)
+    is_free = all(stream.limit_db_sl is None for stream in contents.streams)
+    gains = None if is_free else np.array(tones.gains)
+    return with_tones(table, longer, rows, tones.weights, owners, gains)
+
+
+def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> FloatArray:
+    """Compute gains [dB] on the layers of an answer that bring them within the amplifiers' limits.
+
+    Limits are shared like the stroke: lower priorities are lowered first, and the louder ones among
+    equal priorities. Power counts as each layer's share of that of all together.
+    """
+    strokes = table.full_levels
+    each_layer = [amplitudes_of(layer.excitations) for layer in found.layers]
+    amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
+    levels = amplitudes / [*strokes.values()]
+    norms = np.linalg.norm(levels, axis=1)
+    power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
+    highest = limits.amplitudes or strokes
+    full = amplitudes / [highest[name] for name in strokes]
+    ways = np.array([table.excursion_of(layer.drives) for layer in found.layers])
+    limited = np.column_stack([full, power / math.sqrt(limits.power), ways / limits.excursion])
+    streams = found.contents.streams
+    promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])
+    factors, _ = share_stroke(
+        np.ones(len(streams)),
+        limited.astype(np.complex64),
+        10 ** (promised / 20),
+        [found.asked[each.targets[0]].priority for each in streams],
+    )
+    return np.maximum(decibels(np.maximum(factors, 1e-9)), _SILENT_DB)
+
+
+def with_gains(table: LocalizationTable, found: Answer, gains_db: FloatArray) -> Answer:
+    """Apply a gain [dB] to each layer of an answer, within the stroke."""
+    tones = found.tones
+    gains = 10 ** (gains_db / 20)
+    owners = np.array(tones.owners, dtype=int)
+    by_tone = gains[owners] * tones.gains
+    stroke = float((by_tone[:, None] * np.abs(np.array(tones.weights))).sum(axis=0).max(initial=0))
+    every = np.array(tones.rows, dtype=int), tones.weights, owners, by_tone / max(stroke, 1.0)
+    return with_tones(table, found, *every)
+
+
+def scaled(found: Answer, gain_db: float) -> Answer:
+    """Apply one gain [dB] to all of an answer: contrasts stay."""
+    tones, factor = found.tones, 10 ** (gain_db / 20)
+    louder = replace(
+        tones,
+        gains=[factor * each for each in tones.gains],
+        level_db_sl=[[each + gain_db for each in levels] for levels in tones.level_db_sl],
+        foreign_db_sl=[[each + gain_db for each in by_set] for by_set in tones.foreign_db_sl],
+        stroke_factor=tones.stroke_factor * factor,
+    )
+    return replace(found, tones=louder)

@@ -1,13 +1,14 @@
-"""Fingers on a table's plate: their forms to search, and what they feel on drawn plates.
+"""What fingers feel of tones on the nominal plate and on drawn ones, and what is promised.
 
-What fingers feel of the tones of all contents on drawn plates, and what is promised of it.
-
-How strongly vibrations are played: within the amplifiers' limits, and as quiet fingers allow.
+`FingersOnPlate` puts fingers on a table's plate; its forms are what a search for tones needs
+(`FingerForms`, and `RingingUnderFingers` for drives of limited duration). `promised` then computes
+from the tones of all contents together levels, contrasts and the gains to the contents' levels.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
 
 import numpy as np
@@ -15,16 +16,22 @@ from numpy.typing import NDArray
 
 from model.answer.answer import (
     IMPERCEPTIBLE_DB_SL,
+    PROMISED_PERCENTILE,
     Answer,
-    Limits,
-    RingingUnderFingers,
-    amplitudes_of,
-    on_drawn_plates,
-    shaped_gain,
+    Contents,
+    Tones,
 )
-from model.answer.stimulus import PROMISED_PERCENTILE, Contents, Tones
-from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
-from model.drive_modes import Forms
+from model.answer.stimulus import DriveEnvelope, OverDuration, pulse_ramp, shaped_gain
+from model.arrays import (
+    NEARLY,
+    Complex64Array,
+    ComplexArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    Point,
+)
+from model.drive_modes import Drive, Forms
 from model.ensemble.attached_plate import PlateOnEras
 from model.ensemble.draws import PROMISED_DRAWS, Drawing, over_fingertips, percentile
 from model.ensemble.touched_plate import (
@@ -34,30 +41,42 @@ from model.ensemble.touched_plate import (
     outer,
     touch,
 )
-from model.finger import decibels
+from model.finger import decibels, detection_threshold
+from model.structure.attachments import fingertip_loads
 from model.table.table import FingertipShapes, LocalizationTable, read_fingertips
-
-MAX_FINGERS_BY_POINT = 4
-"""Quiet fingers up to which the points of each are looked at one by one in a search."""
+from model.transients.time_response import enveloped_accelerations
 
 CENTRE_AND_RIM, CENTRE_AND_FOUR = np.array([0, *range(9, 21)]), np.array([0, 9, 12, 15, 18])
-"""Of the fine points of a fingertip, those between which no null hides, and a few of them."""
+"""Fine points of a fingertip between which no null can hide, and a few of them, by index."""
+
+MAX_FINGERS_BY_POINT = 4
+"""Number of quiet fingers up to which a search considers the points of each one by one."""
 
 MAX_VARIANCE_FINE = 0.005
 """Variance of an ERA's gain up to which nulls are so deep that few points do not show them."""
 
+_BESIDE_HZ, _LEAST_SHARE = 60.0, 1e-3
+"""Distance of the frequencies beside its own that count of a drive, and the least share of one in
+the power of its strongest moments."""
+
+_LEAST_PERIODS = 1.7  # beyond that by the reciprocal of a pulse's duration is 1.4 % of its energy
+
+MIN_RAISED_CONTRAST_DB = 6.0
+"""Contrast [dB] down to which the drive of a short stimulus is raised: others feel half of it."""
+
+_TINY = 1e-20
+
 
 @dataclass(frozen=True, eq=False)
 class FingersOnPlate:
-    """The plate of a table with k fingers on it, and the shapes under these.
-
-    at_harmonics: the same at twice the table's frequencies; None where ERAs have no harmonics.
-    """
+    """The plate of a table with k fingers on it."""
 
     table: LocalizationTable
     tips: FingertipShapes
+    """Mode shapes under the fingers."""
     touched: TouchedPlate
     at_harmonics: TouchedPlate | None
+    """The plate at twice the table's frequencies, None where ERAs have no harmonics."""
 
     @classmethod
     def of(
@@ -70,7 +89,8 @@ class FingersOnPlate:
     ) -> "FingersOnPlate":
         """Put fingers at places [m] on a table's plate.
 
-        loads: of each relative to the rig's fingertip, empty for 1.
+        loads: relative to the rig's fingertip, empty for 1 each; by_kernel: whether kernels in C
+        may be used.
         """
         if by_kernel:
             tips = read_fingertips(table, places)
@@ -89,9 +109,9 @@ class FingersOnPlate:
         return cls(table, tips, touched(table.on_eras), twice)
 
     def forms(self, rows: IntArray, *, with_fine: bool) -> "FingerForms":
-        """What the fingers have of the ERAs at rows (f,) of the table's frequencies.
+        """Compute fields and expected powers at rows (f,) of the table's frequencies.
 
-        with_fine: at their fine points, too.
+        with_fine: at the fine points of fingertips, too.
         """
         tips, fine = self.tips, self.tips.fine if with_fine else None
         power = self.table.search_error_power
@@ -102,7 +122,10 @@ class FingersOnPlate:
     def drawn(
         self, by: Drawing, rows: IntArray, weights: Complex64Array, *, with_powers: bool = False
     ) -> FingertipAmplitudes:
-        """What tones at rows (m,) of weights (m, n) do at all fine points on drawn plates."""
+        """Compute amplitudes at all fine points on drawn plates, of tones at rows (m,).
+
+        weights (m, n): of the ERAs.
+        """
         points, table = self.tips.fine.reshape(-1, self.tips.fine.shape[2]), self.table
         given = points, self.tips.fine_weights, table.error_power, table.thresholds
         return self.touched.drawn(by, rows, weights, *given, with_powers=with_powers)
@@ -110,11 +133,10 @@ class FingersOnPlate:
     def felt(
         self, by: Drawing, rows: IntArray, weights: Complex64Array, owners: IntArray
     ) -> tuple[Float32Array, Float32Array]:
-        """Mean amplitude over each fingertip, and power at its loudest point, of c drives.
+        """Return mean amplitude over fingertips and power at the loudest points, of c drives.
 
-        With the second harmonics in the latter.
-
-        owners (m,): the drive of each tone, ascending; both (c, k, 1 + d).
+        Both (c, k, 1 + d) to threshold; the power includes second harmonics. owners (m,): the drive
+        of each tone, ascending.
         """
         starts = np.flatnonzero(np.diff(owners, prepend=-1))
         harmonics = np.add.reduceat(self.harmonics(by, rows, weights), starts)
@@ -126,9 +148,9 @@ class FingersOnPlate:
         return means, loudest + harmonics
 
     def harmonics(self, by: Drawing, rows: IntArray, weights: Complex64Array) -> Float32Array:
-        """Squared amplitude to threshold of second harmonics at fingers, (m, k, 1 + d).
+        """Squared amplitude of second harmonics at fingers, (m, k, 1 + d).
 
-        To `compared_harmonic_thresholds`.
+        To the table's `compared_harmonic_thresholds`.
         """
         if self.at_harmonics is None:
             return np.zeros((len(rows), len(self.tips.few), 1 + by.count), dtype=np.float32)
@@ -150,17 +172,6 @@ class FingerForms:
     rows: IntArray
     contacts: LoadedContacts
 
-    def at(self, some: IntArray) -> "FingerForms":
-        """Select some of the frequencies, by index (n,)."""
-        of, fine = self.contacts, self.contacts.fine_fields
-        contacts = LoadedContacts(
-            of.fields[some],
-            None if fine is None else fine[some],
-            of.power[some],
-            of.uncertain[some],
-        )
-        return replace(self, rows=self.rows[some], contacts=contacts)
-
     def of(
         self,
         targets: Sequence[int],
@@ -168,15 +179,15 @@ class FingerForms:
         level_db_sl: float,
         background: Complex64Array | None = None,
     ) -> Forms:
-        """Forms to search for fingers, by index, that are targets and others that are not.
+        """Return the forms of a search for targets and other fingers, both by index.
 
-        background (f, n, n): form of the rest of the plate, for no other finger.
+        background (f, n, n): form of the rest of the plate, if there are no other fingers.
         """
         targets, others = [*targets], [*others]
         contacts, tips, table = self.contacts, self.fingers.tips, self.fingers.table
         weights = tips.few_weights[targets]
         mean = (weights[:, None] @ contacts.fields[:, targets])[:, :, 0]
-        # What the field differs over a target is no uncertainty of its level.
+        # Differences of the field over a target are no uncertainty of its level.
         expected = contacts.uncertain[:, targets] + outer(mean)
         found = Forms(
             mean.swapaxes(0, 1),
@@ -199,9 +210,9 @@ class FingerForms:
     def by_point(
         self, forms: Forms, others: Sequence[int], points: IntArray = CENTRE_AND_RIM
     ) -> Forms:
-        """Forms by point of every finger that is no target; points (p,): of the fine ones.
+        """Return forms in which each point of every other finger counts by itself.
 
-        What is uncertain counts by the fingertip's mean.
+        points (p,): indices of fine points. Uncertainty counts by the mean over the fingertip.
         """
         fine, n = np.asarray(self.contacts.fine_fields), forms.era_count
         quiet = self.contacts.uncertain[:, others, None] + outer(fine[:, others][:, :, points])
@@ -209,31 +220,150 @@ class FingerForms:
         return found if forms.driven is None else found.among(forms.driven)
 
 
-MIN_RAISED_CONTRAST_DB = 6.0
-"""Contrast over an effect down to which its drive is raised: quiet fingers feel half of it."""
+@dataclass(frozen=True, eq=False)
+class RingingUnderFingers:
+    """Drives along an envelope on a table's plate with fingers.
 
-_TINY = 1e-20
-
-
-def with_tones(
-    table: LocalizationTable,
-    found: Answer,
-    rows: IntArray,
-    weights: Sequence[Sequence[complex]],
-    owners: IntArray,
-    gains: FloatArray | None,
-) -> Answer:
-    """The answer with other tones, and what these promise together, on the same plates.
-
-    gains: None for those to the contents' levels.
+    Tones at the table's frequencies near that of a drive stand for its envelope, whatever it is:
+    weights are searched and drawn plates judged with these tones (`DriveEnvelope.shares_at`).
     """
-    contents = found.contents
-    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
-    of_tones = rows, np.array(weights, dtype=np.complex64), owners
-    ringing = RingingUnderFingers.of_streams(table, contents)
-    tones = promised(fingers, contents, *of_tones, gains=gains, ringing=ringing)
-    factor = tones.stroke_factor if gains is None else found.stroke_factor
-    return replace(found, tones=replace(tones, stroke_factor=factor))
+
+    table: LocalizationTable
+    places: tuple[Point, ...]
+    """Places of the fingers [m]."""
+    loads: tuple[float, ...]
+    """Loads relative to the rig's fingertip, empty for 1 each."""
+    envelope: DriveEnvelope
+    _solved: dict[tuple[tuple[int, bytes], ...], OverDuration] = field(default_factory=dict)
+
+    @classmethod
+    def of_streams(
+        cls, table: LocalizationTable, contents: Contents
+    ) -> list["RingingUnderFingers | None"]:
+        """Make one for each content with a duration; None for those that last or are shaped."""
+        found: list[RingingUnderFingers | None] = []
+        for stream in contents.streams:
+            envelope: DriveEnvelope | None = None
+            if stream.course is not None:
+                envelope = DriveEnvelope.of_course(stream.course)
+            elif stream.duration is not None and not contents.is_shaped:
+                ramp = max(pulse_ramp(stream.duration), contents.least_ramp)
+                envelope = DriveEnvelope.of_pulse(stream.duration, ramp)
+            fingers = table, contents.places, contents.loads
+            found.append(None if envelope is None else cls(*fingers, envelope))
+        return found
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """Shares (f, f) of a drive's steady power, of tones at each of the table's frequencies.
+
+        A row for each of these that the drive may have.
+        """
+        hertz, known = self.table.frequencies, dict[tuple[float, ...], FloatArray]()
+        ends = (hertz <= hertz[0] + _BESIDE_HZ).sum(), (hertz >= hertz[-1] - _BESIDE_HZ).sum()
+        beyond = int(max(ends)) - 1
+        wide = np.pad(hertz, beyond, mode="reflect", reflect_type="odd")
+        # Tones beyond the table's ends count as tones as far inside.
+        rows = np.pad(np.arange(len(hertz)), beyond, mode="reflect")
+        found = np.zeros((len(hertz), len(hertz)))
+        for own, at in enumerate(hertz.tolist()):
+            off = np.round(wide - at, 6)
+            near = np.abs(off) <= _BESIDE_HZ
+            key = tuple(off[near].tolist())
+            if key not in known:
+                known[key] = self.envelope.shares_at(off[near])
+            np.add.at(found[own], rows[near], known[key])
+        strongest = self.envelope.moments(self.envelope.values**2).max()
+        found[found < _LEAST_SHARE * strongest] = 0.0
+        return found
+
+    def spectrum(self, drive: Drive) -> Drive:
+        """Return steady tones with the energy of a drive along the envelope, on any plate.
+
+        By Parseval's theorem, except for what the drive excites far beside its frequencies.
+        Amplitudes count by the threshold at the drive's own frequency.
+        """
+        found, thresholds = [], self.table.thresholds
+        for own, weights in drive:
+            for row in np.flatnonzero(self.shares[own]).tolist():
+                factor = math.sqrt(self.shares[own, row]) * thresholds[row] / thresholds[own]
+                found.append((row, np.asarray(factor * weights, dtype=np.complex64)))
+        return found
+
+    def forms(self, steady: Forms, some: IntArray) -> Forms:
+        """Return forms over the envelope at some rows, from steady forms at all frequencies."""
+        shares, own = self.shares[some].astype(np.float32), np.sqrt(self.shares[some, some])
+        size = (np.abs(steady.targets) ** 2).sum(axis=(0, 2))
+        gain = np.sqrt(shares @ size / np.maximum(size[some], 1e-30))
+        found, by_carrier = steady.at(some), own.astype(np.float32)[:, None, None, None]
+        return replace(
+            found,
+            targets=found.targets * gain[:, None],
+            quiet=(shares @ steady.quiet.reshape(len(steady.quiet), -1)).reshape(found.quiet.shape),
+            level_margin=0.0,
+            few=None if found.few is None else found.few * by_carrier,
+            fine=None if found.fine is None else found.fine * by_carrier,
+        )
+
+    def lasting_long_enough(self, some: IntArray) -> IntArray:
+        """Return the rows whose spectrum does not reach down to 0 Hz; all if there are none.
+
+        A drive of fewer periods moves the plate as a whole, which no frequency of a table shows.
+        """
+        hertz, envelope = self.table.frequencies[some], self.envelope
+        long = (
+            some
+            if envelope.is_course
+            else some[hertz * envelope.within * envelope.step >= _LEAST_PERIODS]
+        )
+        return long if len(long) else some
+
+    def over_drive(self, drive: Drive) -> OverDuration:
+        """Return what fingers feel of a drive; each is solved once."""
+        hertz, drives = self.table.frequencies, self.table.highest_drives
+        key = tuple([(row, weights.tobytes()) for row, weights in drive])
+        if key not in self._solved:
+            self._solved[key] = self.over(
+                [
+                    (float(hertz[row]), np.multiply(weights, drives[row], dtype=complex))
+                    for row, weights in drive
+                ]
+            )
+        return self._solved[key]
+
+    def over(self, tones: Iterable[tuple[float, ComplexArray]]) -> OverDuration:
+        """Solve what fingers feel of tones together: frequency [Hz], base motions (eras,) [m]."""
+        table, tips = self.table, read_fingertips(self.table, self.places)
+        k, p, r = tips.fine.shape
+        loads = fingertip_loads(table.fingertip, self.places, self.loads)
+        centres = tips.fine[: len(loads), 0].astype(float)
+        fingers = [(at, load.fingertip) for at, load in zip(centres, loads, strict=True)]
+        squares = np.zeros(())
+        for frequency, bases in tones:
+            found = enveloped_accelerations(
+                table.in_time,
+                bases,
+                float(frequency),
+                points=tips.fine.reshape(-1, r).astype(float),
+                fingers=fingers,
+                envelope=self.envelope.values,
+                step=self.envelope.step,
+            )
+            threshold = detection_threshold(np.array(frequency), table.threshold)
+            squares = squares + (found.real**2 + found.imag**2) / threshold**2
+        return self.envelope.felt(squares.reshape(-1, k, p), tips.fine_weights.astype(float))
+
+
+def on_drawn_plates(
+    energies: FloatArray, heard: FloatArray, factor: FloatArray | float
+) -> FloatArray:
+    """Return the power over a duration on drawn plates (..., 1 + d), nominal first, from energies.
+
+    heard (...): power over the duration on the nominal plate; factor: ratio of this power to the
+    energy at the target, by which the energy that other plates add counts.
+    """
+    added = factor * (energies - energies[..., :1])
+    return np.asarray(np.maximum(heard[..., None] + added, 0.0))
 
 
 def promised(
@@ -247,10 +377,10 @@ def promised(
     gains: FloatArray | None = None,
     ringing: Sequence[RingingUnderFingers | None] = (),
 ) -> Tones:
-    """What fingers feel of tones at rows (m,) of weights (m, n), at gains (m,).
+    """Compute what fingers feel of tones at rows (m,), of weights (m, n).
 
-    owners (m,): the content of each tone; gains: None for those to the contents' levels; ringing:
-    of the contents that have a duration.
+    owners (m,): the content of each tone; gains (m,): None for those to the contents' levels;
+    ringing: of each content, None for those that last or are shaped.
     """
     shares, streams = fingers.tips.fine_weights, contents.streams
     steady = power = fingers.powers(PROMISED_DRAWS, rows, weights)
@@ -293,6 +423,27 @@ def promised(
     )
 
 
+def with_tones(
+    table: LocalizationTable,
+    found: Answer,
+    rows: IntArray,
+    weights: Sequence[Sequence[complex]],
+    owners: IntArray,
+    gains: FloatArray | None,
+) -> Answer:
+    """Return the answer with other tones and what these promise together.
+
+    gains: of the tones, None for those to the contents' levels.
+    """
+    contents = found.contents
+    fingers = FingersOnPlate.of(table, contents.places, contents.loads)
+    of_tones = rows, np.array(weights, dtype=np.complex64), owners
+    ringing = RingingUnderFingers.of_streams(table, contents)
+    tones = promised(fingers, contents, *of_tones, gains=gains, ringing=ringing)
+    factor = tones.stroke_factor if gains is None else found.stroke_factor
+    return replace(found, tones=replace(tones, stroke_factor=factor))
+
+
 def _compared(
     contents: Contents,
     power: Float32Array,
@@ -301,10 +452,10 @@ def _compared(
     rows: IntArray,
     owners: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Level (k, 2), contrast (k, 3), what is felt of others (k,), and promised of all fingers.
+    """Return level (k, 2), contrast (k, 3), foreign level (k,), and the worst promise.
 
-    By one set of thresholds, to which power (m, k, p, d) and that of harmonics (m, k, d) are; NaN
-    where there is nothing to compare.
+    As amplitude ratios, by one set of thresholds: the one by which power (m, k, p, d) and that of
+    harmonics (m, k, d) are given. NaN where there is nothing to compare.
     """
     streams, k = contents.streams, len(contents.places)
     level, contrast, of_others = (np.full(size, np.nan) for size in ((k, 2), (k, 3), k))
@@ -341,9 +492,9 @@ def _over_durations(
     owners: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Float32Array, Float32Array]:
-    """Power (m, k, p, d) of tones over the durations of their contents, and of harmonics (m, k, d).
+    """Return power (m, k, p, d) over the contents' durations, and that of harmonics (m, k, d).
 
-    By the energy of the tones in their spectrum, on each plate.
+    From the energy of the tones in the drives' spectra, on each plate.
     """
     power, harmonics = steady.copy(), harmonics.copy()
     shares = fingers.tips.fine_weights
@@ -380,9 +531,14 @@ def _gains_to_levels(
     weights: Complex64Array,
     owners: IntArray,
 ) -> tuple[FloatArray, float]:
-    """Gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`."""
+    """Return gains (K,) of contents to their levels on nine of ten plates, as `share_stroke`.
+
+    A short stimulus reaches its level on the nominal plate. It is raised for that only as far as
+    others feel half of it, or nothing.
+    """
     streams, levels = contents.streams, contents.levels.astype(float)
     alone = np.arange(len(owners))  # as if each had a frequency of its own
+    imperceptible = 10 ** (IMPERCEPTIBLE_DB_SL / 20)
     gains = np.empty(len(streams))
     for j, stream in enumerate(streams):
         felt = felt_amplitudes(power, shares, alone, owners == j, stream.targets)
@@ -396,21 +552,13 @@ def _gains_to_levels(
             of_own = power[own], harmonics[own], rows[own]
             at = [loudest_power(*of_own, each) for each in others]
             contrast = promise(felt / np.sqrt(np.maximum(np.max(at, axis=0), _TINY)))
-            allowed = _allowed_gain(levels[j], float(felt[0]), contrast)
+            highest = max(levels[j] * 10 ** (-MIN_RAISED_CONTRAST_DB / 20), imperceptible)
+            allowed = highest * contrast / max(float(felt[0]), 1e-30)
             gains[j] = min(gains[j], max(allowed, levels[j] / max(promise(lasting), 1e-30)))
     drives = np.zeros((len(streams), weights.shape[1]))
     np.add.at(drives, owners, np.abs(weights))
     priorities = [stream.priority for stream in streams]
     return share_stroke(gains, drives, levels, priorities)
-
-
-def _allowed_gain(level: float, felt: float, contrast: float) -> float:
-    """Gain up to which quiet fingers allow a short stimulus: they feel half of it at most.
-
-    Or nothing. level: of it, felt: of its drive, as amplitudes to threshold, contrast: promised.
-    """
-    highest = max(level * 10 ** (-MIN_RAISED_CONTRAST_DB / 20), 10 ** (IMPERCEPTIBLE_DB_SL / 20))
-    return highest * contrast / max(felt, 1e-30)
 
 
 def share_stroke(
@@ -419,10 +567,10 @@ def share_stroke(
     levels: FloatArray,
     priorities: Sequence[int],
 ) -> tuple[FloatArray, float]:
-    """Gains (K,) to levels (K,) within the stroke, and the least factor on them.
+    """Lower gains (K,) to levels (K,) until they fit the stroke; also return the least factor.
 
-    Of each priority the louder contents are lowered first, to one level (max-min), until all fit
-    into what is left by the higher ones.
+    Among contents of one priority the louder ones are lowered first, to one level (max-min
+    fairness), until all fit into what higher priorities leave.
     """
     amplitudes = gains[:, None] * np.abs(weights)
     factors, left = np.zeros(len(gains)), np.ones(amplitudes.shape[1])
@@ -449,10 +597,10 @@ def felt_amplitudes(
     is_own: NDArray[np.bool_],
     targets: Sequence[int],
 ) -> Float32Array:
-    """The least that a content's fingertips feel of its own tones, (d,), of power (m, k, p, d).
+    """Return the least amplitude that a content's targets feel of its own tones, (d,).
 
-    shares (k, p): of the points in the mean. Tones of other contents at its frequencies, by rows
-    (m,), may cancel part of it.
+    power (m, k, p, d): of all tones; shares (k, p): of the points in the mean over a fingertip.
+    Tones of other contents at the same row (m,) may cancel part of it.
     """
     squares = np.zeros(power.shape[1:], dtype=power.dtype)
     for tone in np.flatnonzero(is_own).tolist():
@@ -466,10 +614,10 @@ def felt_amplitudes(
 def loudest_power(
     power: Float32Array, harmonics: Float32Array, rows: IntArray, finger: int
 ) -> Float32Array:
-    """Power (d,) of contents at the loudest point of a finger, of power (j, k, p, d).
+    """Return the power (d,) of j tones at the loudest point of a finger.
 
-    Of contents of one frequency, by rows (j,), the amplitudes add. With that of their second
-    harmonics over the fingertip, (j, k, d), of any phase.
+    power (j, k, p, d): amplitudes of tones at the same row (j,) add; harmonics (j, k, d): power of
+    second harmonics over each fingertip, of any phase.
     """
     at = power[:, finger]
     total = np.zeros(at.shape[1:], dtype=at.dtype)
@@ -480,108 +628,10 @@ def loudest_power(
 
 
 def promise(values: Float32Array, percent: float = PROMISED_PERCENTILE) -> float:
-    """Percentile of the drawn plates, without the first, the nominal one."""
+    """Return a percentile over the drawn plates of values (1 + d,), the first of them nominal."""
     return float(percentile(values[1:].astype(float), percent))
 
 
 def figures(ratio: Float32Array) -> tuple[float, float, float]:
-    """Of ratios (1 + d,): nominal, of half of the drawn plates, of nine of ten."""
+    """Return of ratios (1 + d,) the nominal one, the median of the drawn plates and the promise."""
     return float(ratio[0]), promise(ratio, 50), promise(ratio)
-
-
-_SILENT_DB = -60.0  # a gain by which a content is not felt
-
-
-def as_quiet_fingers_allow(table: LocalizationTable, found: Answer) -> Answer:
-    """Return an answer whose stimuli that are limits are as strong as the others allow.
-
-    Quiet fingers have IMPERCEPTIBLE_DB_SL, by the rig's own thresholds, of all of them together at
-    most, on nine of ten plates. For those that feel a vibration of their own none is raised above
-    that, nor lowered.
-    """
-    streams, tones = found.contents.streams, found.tones
-    limited = [n for n, each in enumerate(streams) if each.limit_db_sl is not None]
-    heard = tones.foreign_db_sl
-    if len(limited) < len(streams):  # of these alone
-        alone = np.full(len(streams), _SILENT_DB)
-        alone[limited] = 0.0
-        heard = with_gains(table, found, alone).tones.foreign_db_sl
-    gains_db = np.zeros(len(streams))
-    for number in limited:
-        stream = streams[number]
-        level = min(tones.level_db_sl[finger][0] for finger in stream.targets)
-        highest = IMPERCEPTIBLE_DB_SL - float(decibels(math.sqrt(len(limited))))
-        quiet, others = found.contents.quiet, found.contents.others(number)
-        allowed = highest - max([heard[finger][0] for finger in quiet], default=-math.inf)
-        raised = highest - max([heard[finger][0] for finger in others], default=-math.inf)
-        gains_db[number] = min((stream.limit_db_sl or 0.0) - level, allowed, max(raised, 0.0))
-    return with_gains(table, found, gains_db)
-
-
-def scaled(found: Answer, gain_db: float) -> Answer:
-    """Return an answer louder by so much [dB]: contrasts stay."""
-    tones, factor = found.tones, 10 ** (gain_db / 20)
-    louder = replace(
-        tones,
-        gains=[factor * each for each in tones.gains],
-        level_db_sl=[[each + gain_db for each in levels] for levels in tones.level_db_sl],
-        foreign_db_sl=[[each + gain_db for each in by_set] for by_set in tones.foreign_db_sl],
-        stroke_factor=tones.stroke_factor * factor,
-    )
-    return replace(found, tones=louder)
-
-
-def with_gains(table: LocalizationTable, found: Answer, gains_db: FloatArray) -> Answer:
-    """Return an answer with a gain on each layer, within the stroke."""
-    tones = found.tones
-    gains = 10 ** (gains_db / 20)
-    owners = np.array(tones.owners, dtype=int)
-    by_tone = gains[owners] * tones.gains
-    stroke = float((by_tone[:, None] * np.abs(np.array(tones.weights))).sum(axis=0).max(initial=0))
-    every = np.array(tones.rows, dtype=int), tones.weights, owners, by_tone / max(stroke, 1.0)
-    return with_tones(table, found, *every)
-
-
-def gains_within(table: LocalizationTable, found: Answer, limits: Limits) -> FloatArray:
-    """Gains [dB] on the layers of an answer by which they are within the amplifiers' limits.
-
-    As the stroke is shared: those of lower priority are lowered first, of equal ones the louder.
-    Power counts in shares of what all together would have.
-    """
-    strokes = table.full_levels
-    each_layer = [amplitudes_of(layer.excitations) for layer in found.layers]
-    amplitudes = np.array([[each[name] for name in strokes] for each in each_layer])
-    levels = amplitudes / [*strokes.values()]
-    norms = np.linalg.norm(levels, axis=1)
-    power = norms * np.linalg.norm(levels.sum(axis=0)) / norms.sum()
-    highest = limits.amplitudes or strokes
-    full = amplitudes / [highest[name] for name in strokes]
-    ways = np.array([table.excursion_of(layer.drives) for layer in found.layers])
-    limited = np.column_stack([full, power / math.sqrt(limits.power), ways / limits.excursion])
-    streams = found.contents.streams
-    promised = np.array([found.fingers[each.targets[0]].promised_level_db_sl for each in streams])
-    factors, _ = share_stroke(
-        np.ones(len(streams)),
-        limited.astype(np.complex64),
-        10 ** (promised / 20),
-        [found.asked[each.targets[0]].priority for each in streams],
-    )
-    return np.maximum(decibels(np.maximum(factors, 1e-9)), _SILENT_DB)
-
-
-def as_ramps_allow(table: LocalizationTable, found: Answer, limits: Limits) -> Answer:
-    """Return an answer whose short stimuli are raised along ramps that the slew allows.
-
-    None is raised where one is as strong as the others allow, which they feel as long.
-    """
-    contents, tones, strokes = found.contents, found.tones, table.full_levels
-    if contents.is_shaped or all(stream.duration is None for stream in contents.streams):
-        return found
-    ramp = max([tone / strokes[name] for name, tone in found.amplitudes.items()]) / limits.slew
-    if ramp <= min([layer.ramp for layer in found.layers]):
-        return found
-    longer = replace(found, contents=replace(contents, least_ramp=ramp))
-    rows, owners = np.array(tones.rows, dtype=int), np.array(tones.owners, dtype=int)
-    is_free = all(stream.limit_db_sl is None for stream in contents.streams)
-    gains = None if is_free else np.array(tones.gains)
-    return with_tones(table, longer, rows, tones.weights, owners, gains)

@@ -1,150 +1,53 @@
-"""Fingers on a plate, and the stimulus that each is to feel.
+"""Fingers on a plate, the stimulus that each is to feel, and the envelope along which it is driven.
 
-Courses: how strongly a stimulus is felt over its duration, as an envelope of its amplitude.
-
-Contents for fingers on a plate, and the tones that are found for them.
-
-Content j for its fingers is the question "these are targets, all others quiet", and K contents are
-K searches over one load of the plate: weights that share the prices of the fingers gain 0.3 dB at
-most. Tones of different frequencies add in power. The combination of a few candidates each is
-chosen by the worst finger on drawn plates; the promise is of other draws, the same for all tones.
-
-    C_k = g_k own_k / sqrt(max_p sum_j g_j^2 power_j(p)),  j other contents, p points of finger k
-
-and for a quiet finger the weakest content counts, over all contents. An only content has the tone
-of the highest contrast at its level. Contents differ in frequency, so that this depends on whose
-thresholds their amplitudes are above: the least over the table's sets of thresholds counts, of
-combinations as of the promise. Weights of a content, of one frequency, do not depend on the set;
-its second harmonics do, and candidates are judged by the set to which these are loudest.
-
-`model.answer.tone_search` finds them in C, `model.answer.tone_search` in numpy.
+A stimulus lasts, or has a duration, over which it is even or follows a course. The plate follows
+its drive late: over 40 ms the root mean square at a finger is several decibels below that of the
+steady vibration, ten decibels on a sharp resonance, and the plate rings on after the end. A finger
+therefore feels the mean of its demodulated acceleration over the duration; any other fingertip
+counts by its power, ringing included; both by the strongest moments where there is a course
+(`DriveEnvelope`).
 """
 
-import cmath
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from numbers import Real
 
 import numpy as np
+from scipy import fft
 
-from model.arrays import NEARLY, Complex64Array, Float32Array, FloatArray, IntArray, Point
+from model.arrays import FloatArray, Point
 from model.config.fields import in_metres
-from model.drive_modes import UNRESTRICTED
 from model.errors import InputError, expect_number, shown
 from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS, STRONG_DB_SL
-from model.structure.attachments import Source, check_loads
+from model.structure.attachments import check_loads
 from model.structure.plate import Plate
-from model.transients.excursions import DECAYED, Swing
-from model.vibration import Excitation, Tone
-
-MAX_POINTS = 20_000
-
-KNOT_STEP = 0.010
-"""Time [s] between the knots along which amplifiers play a course, where wires carry as many."""
-
-STRONGEST = 0.040
-"""Time [s] of the strongest moments of a course, by which it is felt."""
-
-_STEP, _SHORT = 0.005, 1.0  # s; between samples of courses, half as much of short ones
-
-SILENCE = 1e-6
-"""Share that stands for 0: of a silence levels are finite."""
-
-
-@dataclass(frozen=True)
-class Course:
-    """Shares of the highest amplitude of a stimulus over its duration.
-
-    times [s]: ascending, the first is 0, the last its duration; shares: 0 to 1, along straight
-    lines between.
-    """
-
-    times: tuple[float, ...]
-    shares: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        """Check everything."""
-        if not 2 <= len(self.times) == len(self.shares) <= MAX_POINTS:
-            raise InputError(
-                f"a course must have 2 to {MAX_POINTS} times and as many shares, got "
-                f"{len(self.times)} and {len(self.shares)}"
-            )
-        if self.times[0] != 0 or not (np.diff(self.times) > 0).all():
-            raise InputError("times of a course must ascend from 0")
-        shares = np.array(self.shares)
-        if not ((shares >= 0) & (shares <= 1)).all():  # False for NaN
-            raise InputError(
-                f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
-                f"{max(self.shares):g}"
-            )
-
-    @property
-    def duration(self) -> float:
-        """Its last time [s]."""
-        return self.times[-1]
-
-    @property
-    def step(self) -> float:
-        """Time [s] between its samples."""
-        return _STEP if self.duration > _SHORT else _STEP / 2
-
-    @cached_property
-    def strongest_db(self) -> float:
-        """Root mean square of its strongest moments [dB], relative to a share of 1."""
-        times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
-        samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
-        return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
-
-    @cached_property
-    def swings(self) -> tuple[Swing, ...]:
-        """It as amplifiers may play it from knot to knot: once, then over and over.
-
-        Where wires carry fewer knots, these are further apart.
-        """
-        return tuple([self._swing(factor * KNOT_STEP) for factor in (1, 2, 4)])
-
-    def _swing(self, step: float) -> Swing:
-        count, rest = (math.ceil(each / step) for each in (self.duration, DECAYED))
-        times = np.asarray(step * np.arange(1, count + rest + 1), dtype=float)
-        once = np.where(times < self.duration, self.at(times), 0.0)
-        anew = self.at(np.mod(times, self.duration))
-        return Swing((0.0, *once.tolist(), *anew.tolist()), step)
-
-    def at(self, times: FloatArray) -> FloatArray:
-        """Shares at times [s] (n,), 0 outside."""
-        return np.asarray(np.interp(times, *self._line, left=0.0, right=0.0))
-
-    @cached_property
-    def _line(self) -> tuple[FloatArray, FloatArray]:
-        """Times and shares as arrays, made once: it is read for every piece that is played."""
-        return np.array(self.times), np.array(self.shares)
-
+from model.transients.base_motion import rise
+from model.transients.excursions import CLICKS_APART, DECAYED, Swing
+from model.transients.knots import RISE
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
-"""Below the smallest amplitude of a channel, and the most that layouts and programs may ask for.
+"""Bounds of a stimulus's level [dB SL].
 
-In dB SL; what exposure that is: docs/concepts/people.md.
+The lower one is below the smallest amplitude of a channel. The exposure at the upper one is
+discussed in docs/concepts/people.md.
 """
 
 MIN_DURATION, MAX_DURATION = 0.001, 1e6
-"""Durations of a stimulus that has an end [s]: no time step of a plate is nearly as long or short.
-"""
-
-MAX_PRIORITY = (1 << 31) - 1
-"""Highest priority of a finger, and the lowest with a minus."""
-
-SHAPED_FROM = 0.2
-"""Shortest duration [s] of a stimulus with a shaped onset, which settles in half of it."""
+"""Bounds of a stimulus's duration [s]: no time step of a plate is nearly as short or as long."""
 
 MIN_MODULATION, MAX_MODULATION = 10.0, 30.0
-"""Modulations that side bands play [Hz]; slower ones are changes of level."""
+"""Bounds of a modulation [Hz] that is played by side bands; slower ones are changes of level."""
+
+MAX_PRIORITY = (1 << 31) - 1
+"""Highest priority of a finger; the lowest is its negative."""
 
 ANY_BAND = (0.0, math.inf)
+"""The band [Hz] of a stimulus that may have any frequency."""
 
 NEVER, BY_NAME, ANY, MUST = SHARING = ("never", "by name", "any", "must")
-"""Whether a finger may feel the vibration of another one."""
+"""Rules by which a finger may feel the vibration of another one (`Finger.sharing`)."""
 
 _UNITS = {
     "load": "the load of the rig's fingertip",
@@ -155,27 +58,32 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Stimulus:
-    """What a finger is to feel.
-
-    level_db_sl: over its duration, onset included, on the plate as modelled; of a stimulus that
-    lasts what nine of ten plates give; band_hz: lowest and highest frequency; duration [s]: None
-    for one that lasts, a click has 0.04; modulation_hz: how often a second the strength of one that
-    lasts, or has a course, comes and goes, MIN_MODULATION to MAX_MODULATION, None for a steady one;
-    is_limit: whether it is as strong as the quiet fingers allow, up to that level; name: fingers of
-    one name may be given one vibration; course: how strongly it is felt over its duration, which is
-    that of the course, level_db_sl at a share of 1.
-    """
+    """What a finger is to feel."""
 
     level_db_sl: float = STRONG_DB_SL
+    """Level over its duration, onset included, on the plate as modelled.
+
+    Of a stimulus that lasts: the level that nine of ten plates give. With a course: at a share
+    of 1.
+    """
     band_hz: tuple[float, float] = ANY_BAND
+    """Lowest and highest frequency."""
     duration: float | None = None
+    """Duration [s], None for a stimulus that lasts; a click has 0.04 s."""
     modulation_hz: float | None = None
+    """How often per second its strength comes and goes, None for a steady one.
+
+    From MIN_MODULATION to MAX_MODULATION, of a stimulus that lasts or has a course.
+    """
     is_limit: bool = False
+    """Whether the level is an upper limit, up to which it is as strong as quiet fingers allow."""
     name: str | None = None
-    course: Course | None = field(default=None, hash=False, repr=False)  # long
+    """Fingers whose stimuli have the same name may be given one vibration."""
+    course: "Course | None" = field(default=None, hash=False, repr=False)
+    """How strongly it is felt over its duration, which is that of the course."""
 
     def __post_init__(self) -> None:
-        """Check everything that does not depend on the table."""
+        """Check everything that does not depend on the table; raises InputError."""
         if type(self.band_hz) is not tuple or [*map(type, self.band_hz)] != [float, float]:
             _check_pair(self.band_hz, what="band_hz", such_as="(40, 120), lowest and highest in Hz")
         if type(self.level_db_sl) is not float:
@@ -223,30 +131,36 @@ class Stimulus:
 
 @dataclass(frozen=True)
 class Finger:
-    """A finger at a place [m], and what it asks.
-
-    stimulus: what it is to feel, None for nothing; load: relative to the rig's fingertip; priority:
-    lower ones give way first; sharing: whether it may feel the vibration of another finger:
-    `never`, that of one of the same name (`by name`), of the nearest that may have `any`, or it
-    `must` feel one with all of its name; all but `never` also that of a finger so near that no
-    vibration could be kept from either; is_protected: whether it keeps the others' vibrations away
-    where its own is given up; min_contrast_db: promised contrast to the vibrations of others below
-    which these or its own give way; max_foreign_db_sl: level of others' vibrations here, by the
-    rig's own thresholds, that nine of ten plates do not exceed, else they are held back.
-    """
+    """A finger on the plate and what it asks for."""
 
     at: Point
+    """Its place [m]."""
     stimulus: Stimulus | None = None
+    """What it is to feel, None for nothing."""
     load: float = 1.0
+    """Its load on the plate, relative to the rig's fingertip."""
     priority: int = 0
+    """Vibrations of lower priority are given up or lowered first."""
     sharing: str = BY_NAME
+    """Whether it may feel the vibration of another finger.
+
+    `never`; that of a finger of the same name (`by name`); that of the nearest finger that may
+    have `any`; or it `must` feel one with all fingers of its name. In all cases but `never` it may
+    also feel that of a finger so near that no vibration could be kept from either.
+    """
     is_protected: bool = True
+    """Whether others' vibrations are kept from it even where its own is given up."""
     min_contrast_db: float = -math.inf
+    """Least promised contrast to others' vibrations; below it these or its own are given up."""
     max_foreign_db_sl: float = math.inf
+    """Largest level of others' vibrations here, else they are held back.
+
+    By the rig's own thresholds, on nine of ten plates.
+    """
 
     def __post_init__(self) -> None:
-        """Check everything that does not depend on the table."""
-        # Without a call for each of the many fingers that are as they should be.
+        """Check everything that does not depend on the table; raises InputError."""
+        # The types are tested first: most fingers pass, and calls would take longer.
         if type(self.at) is not tuple or [*map(type, self.at)] != [float, float]:
             _check_pair(
                 self.at, what="place of a finger", such_as="(0.08, 0.06), x and y in metres"
@@ -277,11 +191,14 @@ class Finger:
 
     @property
     def name(self) -> str | None:
-        """Of its stimulus."""
+        """The name of its stimulus, None without one."""
         return None if self.stimulus is None else self.stimulus.name
 
     def may_feel_one_with(self, other: "Finger", *, are_apart: bool = True) -> bool:
-        """Whether both fingers may feel one vibration; are_apart: whether each could its own."""
+        """Whether both fingers may feel one vibration.
+
+        are_apart: whether each could be given a vibration of its own.
+        """
         one, two = self.stimulus, other.stimulus
         if one is None or two is None or NEVER in (self.sharing, other.sharing):
             return False
@@ -292,21 +209,19 @@ class Finger:
         return self.name is not None and self.name == other.name
 
     def must_feel_one_with(self, other: "Finger") -> bool:
-        """Whether both fingers feel one vibration from the start."""
+        """Whether both fingers must feel one vibration."""
         are_felt = self.stimulus is not None and other.stimulus is not None
         return are_felt and self.name == other.name and self.sharing == other.sharing == MUST
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Places [m] of the fingers that are to feel a vibration, and of all others.
-
-    loads: of each relative to the rig's fingertip, targets first; empty for 1.
-    """
+    """Places [m] of the fingers that are to feel a vibration, and of all others."""
 
     targets: tuple[Point, ...]
     quiet: tuple[Point, ...] = ()
     loads: tuple[float, ...] = ()
+    """Load of each finger relative to the rig's fingertip, targets first; empty for 1 each."""
 
     @property
     def contacts(self) -> tuple[Point, ...]:
@@ -315,7 +230,7 @@ class Placement:
 
 
 def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
-    """Return fingers that must feel one stimulus, and the others."""
+    """Make fingers of a placement: targets that must feel one stimulus together, and quiet ones."""
     loads = placed.loads or (1.0,) * len(placed.contacts)
     if len(loads) != len(placed.contacts):
         raise InputError(
@@ -329,7 +244,7 @@ def together(placed: Placement, stimulus: Stimulus) -> list[Finger]:
 
 
 def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
-    """Raise InputError for places [m] off the plate; what: the name of what is there."""
+    """Raise InputError for places [m] off the plate; what: their name in the message."""
     length, width = plate.length, plate.width
     for x, y in places:
         if not (0 <= x <= length and 0 <= y <= width):  # False for NaN
@@ -341,18 +256,14 @@ def check_on_plate(what: str, places: Iterable[Point], plate: Plate) -> None:
 
 def check_fingers(fingers: Sequence[Finger], plate: Plate) -> None:
     """Raise InputError for fingers that contradict each other or are not on the plate."""
-    loads, places, is_asked = [], [], False
-    for finger in fingers:  # without a call for each
-        loads.append(finger.load)
-        places.append(finger.at)
-        is_asked = is_asked or finger.stimulus is not None
-    if not is_asked:
+    loads = [finger.load for finger in fingers]
+    if all(finger.stimulus is None for finger in fingers):
         raise InputError("an answer must have at least one finger with a stimulus, got none")
     if len(fingers) > MAX_CONTACTS:
         raise InputError(f"an answer must have up to {MAX_CONTACTS} fingers, got {len(fingers)}")
     if loads.count(1.0) < len(loads):
         check_loads(loads)
-    check_on_plate("finger", places, plate)
+    check_on_plate("finger", [finger.at for finger in fingers], plate)
     for number, finger in enumerate(fingers):
         x, y = finger.at
         for other in fingers[:number]:
@@ -384,175 +295,237 @@ def _check_pair(given: object, *, what: str, such_as: str) -> None:
         raise InputError(f"{what} must be two numbers such as {such_as}, got {shown(given)}")
 
 
-PROMISED_PERCENTILE = 9
-"""Percentile of the draws that is promised.
+MAX_POINTS = 20_000
+"""Most times of a course."""
 
-It is about the tenth of plates solved exactly: what is beyond the first order in other parameters
-than the thickness costs some tenths of a decibel.
-"""
+KNOT_STEP = 0.010
+"""Time [s] between the knots along which amplifiers play a course, if the wires carry so many."""
 
-KEPT, MISSING = 16, 4
-"""Frequencies that are searched for an only content, a multiple of what kernels take at once, and
-how many of them may miss the level.
+STRONGEST = 0.040
+"""Time [s] of the strongest moments of a course, by which it is felt."""
 
-Those of the highest bounds |c^H w| / sqrt(w^H R w) of w = R^-1 c, R the mean over the quiet
-fingers: one system of equations where a search takes several.
-"""
+_STEP, _SHORT = 0.005, 1.0  # s; between samples of a course; courses up to _SHORT have half of it
 
-MIN_CANDIDATES, MAX_CANDIDATES = 4, 32
-"""Candidates of a content by the mean over fingertips, and as many by their points: of an only
-content, and of any in all its bands."""
-
-MAX_COMBINATIONS, PRUNING_STEP = 200, 4
-"""Combinations of candidates that are kept for the next content and the choice, by some draws; of
-more than four contents fewer, so that time grows with the square of their number."""
-
-APART_HZ = 30.0
-"""Distance of the frequencies of two contents: nearer ones would be felt to beat."""
-
-REACHED = 1 - 1e-5
-"""Of a level, what counts as reached."""
-
-_ROUNDING = 1e-6  # of single precision
+SILENCE = 1e-6
+"""Share in place of 0, for which levels are finite."""
 
 
 @dataclass(frozen=True)
-class Stream:
-    """A content for fingers, by index, at a level; higher priorities take the stroke first.
+class Course:
+    """Shares of the highest amplitude of a stimulus over its duration."""
 
-    bands: of the table's frequencies that it may have the first and one past the last, by row, for
-    each band (one unless bands may be exchanged); duration [s]: over which the level is felt, None
-    for one that lasts; limit_db_sl: up to which it is as strong as the others allow, None for the
-    level itself; course: over the duration, whose highest share has the level.
-    """
+    times: tuple[float, ...]
+    """Times [s], ascending from 0 to the duration."""
+    shares: tuple[float, ...]
+    """Share at each time, 0 to 1; linear in between."""
 
-    targets: tuple[int, ...]
-    level_db_sl: float
-    bands: tuple[tuple[int, int], ...]
-    priority: int = 0
-    duration: float | None = None
-    limit_db_sl: float | None = None
-    course: Course | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Contents:
-    """K contents for k fingers on a plate, some of which are quiet; all others are not protected.
-
-    places: of the fingers [m]; loads: of each relative to the rig's fingertip, empty for 1; quiet:
-    by index; apart_hz: distance of the contents' frequencies where bands allow it; background: form
-    of the rest of the plate at all of the table's frequencies, for no other finger; drive_mode: any
-    but UNRESTRICTED has one content; is_shaped: whether onsets are shaped, along which nothing
-    rings; least_ramp [s]: of short ones, which are a quarter of their duration else; avoided: rows
-    of the table's frequencies that no content may have.
-    """
-
-    places: tuple[Point, ...]
-    loads: tuple[float, ...]
-    streams: tuple[Stream, ...]
-    quiet: tuple[int, ...]
-    apart_hz: float = 0.0
-    background: Complex64Array | None = None
-    drive_mode: str = UNRESTRICTED
-    is_shaped: bool = False
-    least_ramp: float = 0.0
-    avoided: tuple[int, ...] = ()
+    def __post_init__(self) -> None:
+        """Check times and shares; raises InputError."""
+        if not 2 <= len(self.times) == len(self.shares) <= MAX_POINTS:
+            raise InputError(
+                f"a course must have 2 to {MAX_POINTS} times and as many shares, got "
+                f"{len(self.times)} and {len(self.shares)}"
+            )
+        if self.times[0] != 0 or not (np.diff(self.times) > 0).all():
+            raise InputError("times of a course must ascend from 0")
+        shares = np.array(self.shares)
+        if not ((shares >= 0) & (shares <= 1)).all():  # False for NaN
+            raise InputError(
+                f"shares of a course must be 0 to 1, got {min(self.shares):g} to "
+                f"{max(self.shares):g}"
+            )
 
     @property
-    def is_ranked(self) -> bool:
-        """Whether the KEPT frequencies are searched first: of one content for one finger."""
-        first = self.streams[0]
-        return len(self.streams) == len(first.targets) == len(first.bands) == 1 <= len(self.quiet)
+    def duration(self) -> float:
+        """Its last time [s]."""
+        return self.times[-1]
 
     @property
-    def candidates(self) -> int:
-        """Candidates of each content in each of its bands, and as many by points."""
-        count, bands = len(self.streams), len(self.streams[0].bands)
-        return max(1, min(MIN_CANDIDATES + count // 2, MAX_CANDIDATES // bands))
+    def step(self) -> float:
+        """Time [s] between its samples."""
+        return _STEP if self.duration > _SHORT else _STEP / 2
 
-    @property
-    def combinations(self) -> int:
-        """Combinations of candidates that are kept."""
-        return min(MAX_COMBINATIONS, 4 * MAX_COMBINATIONS // len(self.streams))
+    @cached_property
+    def strongest_db(self) -> float:
+        """Root mean square of its strongest moments [dB], relative to a share of 1."""
+        times = np.asarray(self.step * np.arange(self.duration / self.step + 1), dtype=float)
+        samples, count = np.maximum(self.at(times), SILENCE), round(STRONGEST / self.step)
+        return float(10 * np.log10(np.convolve(samples**2, np.full(count, 1 / count)).max()))
 
-    @property
-    def rows(self) -> IntArray:
-        """Rows of the table's frequencies that contents may have, ascending, (f,)."""
-        bands = [np.arange(*band) for stream in self.streams for band in stream.bands]
-        return np.setdiff1d(np.concatenate(bands), self.avoided)
+    @cached_property
+    def swings(self) -> tuple[Swing, ...]:
+        """The course as amplifiers may play it from knot to knot: once, then over and over.
 
-    def others(self, number: int) -> list[int]:
-        """Fingers that a content, by its number, is kept from."""
-        every = {*self.quiet}.union(*(stream.targets for stream in self.streams))
-        return sorted(every - {*self.streams[number].targets})
-
-    @property
-    def levels(self) -> Float32Array:
-        """Amplitude to threshold of each content, (K,)."""
-        levels = [10 ** (stream.level_db_sl / 20) for stream in self.streams]
-        return np.array(levels, dtype=np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Tones:
-    """Tones of K contents, one of each or more, and what k fingers feel of them.
-
-    rows (m,): of the table's frequencies; weights (m, n): up to full stroke; gains (m,): to the
-    levels, within the stroke; owners (m,): the content of each tone; contrast_db (k, 3): nominal,
-    of half of the drawn plates and promised, the least over the sets of thresholds, NaN without
-    other contents or fingers; level_db_sl (k, 2): of a finger's own content, nominal and promised,
-    by the rig's own set; foreign_db_sl (k, s): of other contents by each set, the rig's own first,
-    which nine of ten plates do not exceed, NaN at fingers that are neither felt nor quiet;
-    worst_db: contrast of all fingers that is promised, NaN for one alone; stroke_factor: least
-    factor on the gains for the stroke; is_apart: whether the frequencies are.
-    """
-
-    rows: list[int]
-    weights: Sequence[Sequence[complex]]
-    gains: list[float]
-    owners: Sequence[int]
-    contrast_db: Sequence[Sequence[float]]
-    level_db_sl: Sequence[Sequence[float]]
-    foreign_db_sl: Sequence[Sequence[float]]
-    worst_db: float
-    stroke_factor: float
-    is_apart: bool
-
-    def excitations(
-        self,
-        content: int,
-        eras: Sequence[Source],
-        frequencies: FloatArray,
-        highest_drives: FloatArray,
-    ) -> list[Excitation]:
-        """What plays a content, a tone of each ERA for each of its tones, its carrier first.
-
-        frequencies [Hz], highest_drives (f, eras): of the table. The strongest ERA, the first of
-        those nearly as strong, has phase zero.
+        One for each distance of the knots: wires that carry fewer have them further apart.
         """
-        found = list[Excitation]()
-        every = zip(self.rows, self.weights, self.gains, self.owners, strict=True)
-        for row, values, gain, owner in every:
-            if owner != content:
-                continue
-            frequency, tones = float(frequencies[row]), dict[str, Tone]()
-            # Python's numbers: numpy's take ten times as long, one by one.
-            enough = (1 - NEARLY) * max(map(abs, values))
-            (strongest, *_) = [value for value in values if abs(value) >= enough]
-            factor = strongest.conjugate() / abs(strongest)
-            for era, highest, value in zip(eras, highest_drives[row].tolist(), values, strict=True):
-                if value != 0:
-                    w = value * factor
-                    if w.real > 0 and abs(w.imag) < _ROUNDING * w.real:
-                        w = w.real
-                    amplitude = gain * min(abs(w), 1.0) * highest
-                    tones[era.name] = Tone(frequency, amplitude, cmath.phase(w))
-            found.append(tones)
-        return found
+        found = []
+        for step in (KNOT_STEP, 2 * KNOT_STEP, 4 * KNOT_STEP):
+            count, rest = (math.ceil(each / step) for each in (self.duration, DECAYED))
+            times = np.asarray(step * np.arange(1, count + rest + 1), dtype=float)
+            once = np.where(times < self.duration, self.at(times), 0.0)
+            again = self.at(np.mod(times, self.duration))
+            found.append(Swing((0.0, *once.tolist(), *again.tolist()), step))
+        return tuple(found)
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Shares at times [s] (n,), 0 outside."""
+        return np.asarray(np.interp(times, *self._line, left=0.0, right=0.0))
+
+    @cached_property
+    def _line(self) -> tuple[FloatArray, FloatArray]:
+        """Times and shares as arrays, made once: they are read for every piece that is played."""
+        return np.array(self.times), np.array(self.shares)
+
+
+ONSET_RAMP = 0.040
+"""Duration of a plain ramp [s].
+
+Twice what just avoids a click: the slower start gains 4 dB of contrast over the first 100 ms, and
+at 20 dB SL the target still feels it after a fifth of it (docs/concepts/transients.md).
+"""
+
+FADE_RAMP = 0.020
+"""Duration of the fade [s] under fingers that stay on the plate; a shorter one feels like a tap."""
+
+RINGING = 0.100
+"""Time [s] after a short effect over which the ringing at other fingers counts.
+
+Weights keep it down for that time and no longer: with 20 ms it was up to 7 dB stronger afterwards
+on four ERAs, and 18 dB on a large table.
+"""
+
+SHAPED_FROM = 0.2
+"""Shortest duration [s] of a stimulus with a shaped onset, which settles in half of it."""
+
+_PULSE_STEP, _MAX_PULSE_STEPS = 0.001, 48
+"""Steps [s] of pulses, and how many one has at most within its duration."""
+
+_RESOLUTION = 1.0  # Hz, at least; of the spectrum of an envelope
+
+
+def pulse_ramp(duration: float) -> float:
+    """Return the plain ramp [s] of a vibration of some duration [s]: a quarter of it.
+
+    The vibration is then even over its duration: no 40 ms of a click of 40 ms are more than 0.8 dB
+    (median) stronger than the first 40 ms; with a ramp of half the duration 1.5 dB, of all of it
+    3 dB.
+    """
+    return min(ONSET_RAMP, duration / 4)
+
+
+def shaped_gain(duration: float) -> float:
+    """Return the mean amplitude over a duration [s] with a shaped onset, 1 for steady.
+
+    The target follows a raised cosine, whose square has a mean of 3/8.
+    """
+    return math.sqrt(1 - 5 / 8 * min(RISE, duration) / duration)
+
+
+@lru_cache
+def swings_of_pulse(duration: float, ramp: float) -> tuple[Swing, Swing]:
+    """Return the swings of pulses of a duration [s] one after the other, along plain ramps [s].
+
+    The first swing ends along the pulse's ramp, the second along FADE_RAMP. A pulse longer than
+    SHAPED_FROM counts by that much: by then its onset has decayed as far as its end will.
+    """
+    length = min(duration, SHAPED_FROM)
+    count = math.ceil((length + DECAYED) / _PULSE_STEP)
+    times = np.asarray(_PULSE_STEP * np.arange(count), dtype=float)
+    again = max(duration, CLICKS_APART)
+    onset, after = rise(times, ramp), np.asarray(times - length)
+    plain, faded = (
+        Swing(tuple((onset - rise(after, end)).tolist()), _PULSE_STEP, again)
+        for end in (ramp, FADE_RAMP)
+    )
+    return plain, faded
+
+
+@dataclass(frozen=True, eq=False)
+class OverDuration:
+    """What k fingers feel of a drive over its duration, on the nominal plate."""
+
+    gains: FloatArray
+    """Mean amplitude (k,) relative to the steady one."""
+    heard: FloatArray
+    """Squared amplitude to threshold (k, p) at each point, mean over the strongest such time."""
+
+
+@dataclass(frozen=True, eq=False)
+class DriveEnvelope:
+    """Envelope of a drive, up to RINGING after its end or until it is steady."""
+
+    values: FloatArray
+    """Envelope (n,) at even steps."""
+    step: float
+    """Time [s] between values."""
+    within: int
+    """Number of steps over which it is felt: the strongest ones of a course, else the first."""
+    share: float = 1.0
+    """Share of these steps in the duration, the rest of which is steady."""
+    is_course: bool = False
 
     @classmethod
-    def none(cls, fingers: int, sets: int) -> "Tones":
-        """Nothing that plays at so many fingers; sets: of thresholds."""
-        contrast, level = [(math.inf,) * 3] * fingers, [(-math.inf,) * 2] * fingers
-        heard = [(-math.inf,) * sets] * fingers
-        return cls([], [], [], [], contrast, level, heard, math.nan, 1.0, is_apart=True)
+    def of_pulse(cls, duration: float, ramp: float) -> "DriveEnvelope":
+        """Make the envelope of a pulse of a duration along plain ramps [s].
+
+        It includes the ringing after the end, where a quiet finger may feel most.
+        """
+        length = min(duration, SHAPED_FROM)  # the rest is steady
+        count = min(_MAX_PULSE_STEPS, max(1, math.ceil(length / _PULSE_STEP)))
+        step = length / count
+        every = count + math.ceil(RINGING / step)
+        times = np.asarray(step * (np.arange(every) + 0.5), dtype=float)
+        values = rise(times, ramp) - rise(np.asarray(times - length), ramp)
+        return cls(np.asarray(values), step, count, length / duration)
+
+    @classmethod
+    def of_course(cls, course: Course) -> "DriveEnvelope":
+        """Make the envelope along a course, with a plain ramp where it starts or ends above 0."""
+        count = math.ceil((course.duration + RINGING) / course.step)
+        times = np.asarray(course.step * np.arange(count), dtype=float)
+        after, (first, *_, last) = np.asarray(times - course.duration), course.shares
+        values = course.at(times) - first * (1 - rise(times, ONSET_RAMP))
+        values += np.where(after > 0, last * (1 - rise(after, ONSET_RAMP)), 0.0)
+        within = round(STRONGEST / course.step)
+        return cls(np.maximum(values, SILENCE), course.step, within, is_course=True)
+
+    def moments(self, squares: FloatArray) -> FloatArray:
+        """Means of squares (n, ...) over the time that is felt, from each step on, (n', ...)."""
+        sums = np.cumsum(squares, axis=0, dtype=float)
+        sums[self.within :] -= sums[: -self.within].copy()
+        return np.asarray(sums[self.within - 1 :] / self.within)
+
+    def felt(self, squares: FloatArray, weights: FloatArray) -> OverDuration:
+        """Return what k fingers feel, from squared amplitudes to threshold (n + 1, k, p).
+
+        The last of the squares is that of the steady vibration; weights (k, p): of the points in
+        the mean over a fingertip.
+        """
+        power = self.share * self.moments(squares[:-1]) + (1 - self.share) * squares[-1]
+        own = power if self.is_course else power[:1]
+        felt = (np.sqrt(own) * weights).sum(axis=2).max(axis=0)
+        steady = (np.sqrt(squares[-1]) * weights).sum(axis=1)
+        return OverDuration(felt / np.maximum(steady, 1e-30), power.max(axis=0))
+
+    def shares_at(self, off: FloatArray) -> FloatArray:
+        """Shares (b,) of the steady power, of tones at distances off (b,) [Hz] from the drive's.
+
+        Together the tones have the energy of the drive on any plate (Parseval); for a course, the
+        energy of the strongest moments of each. What lies between two tones is split in proportion
+        to nearness; beside the drive's own frequency, which may be in a null, by its square.
+        """
+        count = max(len(self.values), math.ceil(1 / _RESOLUTION / self.step))
+        count = fft.next_fast_len(count)
+        transform, nu = fft.fft(self.values, count), fft.fftfreq(count, self.step)
+        near = np.array([np.interp(nu, off, each) for each in np.eye(len(off))])
+        own = int(np.argmin(np.abs(off)))
+        is_beside = near[own] > 0
+        near[:, is_beside] **= 2
+        near[own, is_beside] += 1 - near[:, is_beside].sum(axis=0)
+        squares = np.abs(fft.ifft((transform * np.sqrt(near)).astype(np.complex64))) ** 2
+        if self.is_course:
+            power, all_ = self.moments(squares.T).max(axis=0), self.moments(self.values**2).max()
+            return np.asarray(power * (all_ / power.sum()))
+        power = self.share * squares.sum(axis=1) / self.within
+        power[own] += 1 - self.share
+        return np.asarray(power)

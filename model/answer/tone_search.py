@@ -1,6 +1,9 @@
-"""Tones of contents by one call of a kernel in C, or in numpy where there is no compiler.
+"""The search for the tones of contents: a kernel in C, and the same in numpy.
 
-Tones of contents in numpy: where there is no compiler, and what the kernel in C must find.
+`choose_tones` packs a question for the kernel. What the kernel does not cover (durations, courses,
+avoided frequencies, the drive mode `switched`) and machines without a compiler take
+`choose_by_numpy`, which must find what the kernel finds: candidates of each content by
+`model.drive_modes`, judged on drawn plates, of which the best combination is promised.
 """
 
 from array import array
@@ -15,16 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model import drive_modes
-from model.answer.answer import RingingUnderFingers, on_drawn_plates
-from model.answer.promise import (
-    CENTRE_AND_FOUR,
-    CENTRE_AND_RIM,
-    MAX_FINGERS_BY_POINT,
-    MAX_VARIANCE_FINE,
-    FingersOnPlate,
-    promised,
-)
-from model.answer.stimulus import (
+from model.answer.answer import (
     KEPT,
     MISSING,
     PROMISED_PERCENTILE,
@@ -33,6 +27,16 @@ from model.answer.stimulus import (
     Contents,
     Stream,
     Tones,
+)
+from model.answer.promise import (
+    CENTRE_AND_FOUR,
+    CENTRE_AND_RIM,
+    MAX_FINGERS_BY_POINT,
+    MAX_VARIANCE_FINE,
+    FingersOnPlate,
+    RingingUnderFingers,
+    on_drawn_plates,
+    promised,
 )
 from model.arrays import (
     Complex64Array,
@@ -73,36 +77,195 @@ from model.finger import decibels
 from model.table.table import SAME_FREQUENCY, LocalizationTable, given_raster
 
 MAX_BY_POINT = 8
-"""Frequencies at which weights over a duration are searched by the points of fingertips, too."""
+"""Frequencies at which weights over a duration are also searched by the points of fingertips."""
 
 IN_TIME = 3
-"""Candidates of a pulse that are solved in time, the best by their energy."""
+"""Number of candidates of a pulse that are solved in time: the best by their energy."""
 
 _TINY, _TOO_LOUD = 1e-20, 1e12  # powers; of candidates that are out
+
 _BATCH = 64  # candidates that are judged at once
+
+
+def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
+    """Choose tones for each content and compute what they promise."""
+    streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
+    starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
+    is_here = contents.drive_mode == UNRESTRICTED and not contents.avoided
+    for stream in streams:
+        targets += stream.targets
+        starts.append(len(targets))
+        for band in stream.bands:
+            bands += band
+        priorities.append(stream.priority)
+        levels.append(10 ** (stream.level_db_sl / 20))
+        is_here = is_here and stream.duration is None
+    if by is None or not is_here:
+        return choose_by_numpy(table, contents, by_kernel=by is not None)
+    count, n, k = len(streams), len(table.eras), len(places)
+    kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
+    plates, raster, rules, by_count = kept
+    judging, promise, *stiffness = by_count.get(k) or by_count.setdefault(
+        k, _with_fingers(table, k)
+    )
+    if contents.loads.count(1.0) < len(contents.loads):
+        stiffness = [*_stiffness(table, k, contents.loads)]
+    # Arrays of numpy would take as long to make and to read, each, as all of these together.
+    numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
+    at = array("d", [coordinate for place in places for coordinate in place])
+    background = contents.background
+    given = GivenQuestion(
+        contents=count,
+        bands=len(streams[0].bands),
+        fingers=k,
+        quiet_count=len(quiet),
+        candidates=contents.candidates,
+        combinations=contents.combinations,
+        apart=contents.apart_hz,
+        numbers=numbers.buffer_info()[0],
+        level=levels.buffer_info()[0],
+        places=at.buffer_info()[0],
+        stiffness=stiffness[0].ctypes.data,
+        at_harmonics=stiffness[1].ctypes.data,
+        background=None if background is None else background.ctypes.data,
+        judging=addressof(judging),
+        promise=addressof(promise),
+    )
+    size = 2 * n * count
+    of_fingers = k * (3 + 2 + rules.sets)
+    rows = array("i", bytes(4 * count))
+    figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
+    to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
+    status = run(by.library.answer, to, plates, raster, rules, given)
+    if status != FOUND:
+        raise AssertionError("contents must have tones")
+    found = figures.tolist()
+    weights = map(complex, found[:size:2], found[1:size:2])
+    contrast = size + count
+    level, of_others = contrast + 3 * k, contrast + 5 * k
+    worst, factor = found[-2:]
+    return Tones(
+        rows=rows.tolist(),
+        weights=list(zip(*[weights] * n, strict=True)),
+        gains=found[size:contrast],
+        owners=range(count),
+        contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
+        level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
+        foreign_db_sl=list(zip(*[iter(found[of_others:-2])] * rules.sets, strict=True)),
+        worst_db=worst,
+        stroke_factor=factor,
+        is_apart=bool(to.is_apart),
+    )
+
+
+_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array, Complex64Array]
+"""Draws that judge and that promise; stiffness of fingers of load 1, also for harmonics."""
+
+_Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
+"""Structures of a table: plate, raster, rules, and those for each number of fingers."""
+
+_kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
+
+
+def _kept_of(table: LocalizationTable) -> _Kept:
+    """Pack a table's plate and raster, and the rules by which tones are chosen, for kernels."""
+    uncertainty, groups = table.uncertainty, table.clocks.groups
+    variance = uncertainty.gain_variance
+    rules = Rules(
+        kept=KEPT,
+        missing=MISSING,
+        max_by_point=MAX_FINGERS_BY_POINT,
+        pruning_step=PRUNING_STEP,
+        rim_count=len(CENTRE_AND_RIM),
+        is_deep=variance < MAX_VARIANCE_FINE,
+        others=uncertainty.frequency > 0,
+        gain_variance=variance,
+        ridge=RIDGE,
+        margin=LEVEL_MARGIN,
+        highest=drive_modes.NEARLY_HIGHEST,
+        reached=REACHED,
+        judged=PERCENTILE,
+        promised=PROMISED_PERCENTILE,
+        starts=drive_modes.TARGET_STARTS,
+        iterations=drive_modes.ALIGNMENTS,
+        again=drive_modes.REALIGNMENTS,
+        one_finger=_method(drive_modes.ONE_FINGER),
+        several=_method(drive_modes.SEVERAL),
+        within=(WeightSearch * 3)(*map(_method, drive_modes.WITHIN_STROKE)),
+        groups=1 + max(groups, default=0),
+        sets=len(table.threshold_sets),
+    )
+    rules.point(
+        rim=CENTRE_AND_RIM,
+        group=np.array(groups, dtype=np.int32) if groups else None,
+        threshold=table.thresholds,
+        error=table.error_power,
+        shares=table.power_shares,
+        frequencies=table.frequencies,
+        sensitivities=table.sensitivities.T,
+        search_error=table.search_error_power,
+        harmonic_threshold=table.compared_harmonic_thresholds,
+        harmonic_sensitivities=table.harmonic_sensitivities.T,
+    )
+    if uncertainty.harmonic > 0:
+        rules.at_harmonics = addressof(plates_structure(table.at_harmonics))
+    return plates_structure(table.on_eras), given_raster(table), rules, {}
+
+
+def _with_fingers(table: LocalizationTable, fingers: int) -> _Fingers:
+    """Draw the plates of a table with a number of fingers, as kernels read them."""
+    judging, promise = (
+        draws_structure(table.on_eras, table.clocks, fingers, by)
+        for by in (JUDGING_DRAWS, PROMISED_DRAWS)
+    )
+    return judging, promise, *_stiffness(table, fingers)
+
+
+def _stiffness(
+    table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()
+) -> tuple[Complex64Array, Complex64Array]:
+    """Return the stiffness of fingers at a table's frequencies, and for harmonics at twice."""
+    stiffness = table.attached.finger_stiffness(fingers, loads)
+    if not table.uncertainty.harmonic:
+        return stiffness, stiffness
+    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads)
+
+
+def _method(of: drive_modes.LawsonMethod) -> WeightSearch:
+    return WeightSearch(
+        steps=of.steps,
+        limited=of.is_limited,
+        variance=of.variance,
+        gain=of.gain,
+        reserve=drive_modes.LEVEL_RESERVE,
+        growth=drive_modes.MAX_GROWTH,
+        most=drive_modes.MAX_MULTIPLIER,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidates (m,) of all contents: of which stream and band, score, and the tones of each."""
+    """m candidates of all contents."""
 
     streams: IntArray
+    """Content of each (m,)."""
     bands: IntArray
+    """Band of each (m,), by number within its content."""
     scores: FloatArray
     drives: Sequence[Drive]
 
     @property
     def rows(self) -> IntArray:
-        """The row of the first tone of each."""
+        """Row of the first tone of each (m,)."""
         return np.array([drive[0][0] for drive in self.drives], dtype=int)
 
 
 def choose_by_numpy(
     table: LocalizationTable, contents: Contents, *, by_kernel: bool = False
 ) -> Tones:
-    """Choose tones for each content, and find what they promise.
+    """Choose tones for each content and compute what they promise, in numpy.
 
-    by_kernel: whether the fingers' weight on the plate is solved in C.
+    by_kernel: whether the plate under its fingers is solved in C.
     """
     fingers = FingersOnPlate.of(table, contents.places, contents.loads, by_kernel=by_kernel)
     ringing, rows = RingingUnderFingers.of_streams(table, contents), contents.rows
@@ -126,15 +289,11 @@ def choose_by_numpy(
     return promised(fingers, contents, *tones, is_apart=is_apart, ringing=ringing)
 
 
-def tones_of(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]:
-    """Rows (m,), weights (m, n) of the tones of drives, and the number of each one's drive (m,)."""
-    tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
-    rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
-    return rows, weights, owners
-
-
 def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
-    """The rows most worth a search for one target, ascending; by one form of all other fingers."""
+    """Return the rows most worth a search for one target, ascending.
+
+    By one form of all other fingers together.
+    """
     table, tips, touched = fingers.table, fingers.tips, fingers.touched
     rows, target, others = contents.rows, contents.streams[0].targets[0], contents.others(0)
     points, weights = tips.few, tips.few_weights
@@ -151,7 +310,7 @@ def ranked(fingers: FingersOnPlate, contents: Contents) -> IntArray:
     searched = search_all(Forms(mean, power, found.power, threshold, level, 0.0))
     order = best_first(searched.bound)
     reaches = searched.score[order] > 0
-    # Those that would be better than the best, were they loud enough.
+    # Rows that would be better than the best, were they loud enough.
     first = int(reaches.argmax()) if reaches.any() else len(order)
     missing = order[:first][:MISSING]
     reaching = order[reaches][: KEPT - len(missing)]
@@ -164,9 +323,9 @@ def _candidates(
     rows: IntArray,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[Candidates, bool]:
-    """The best tones of each content in each band, and whether a level was hard to reach.
+    """Find the best tones of each content in each band, and whether a level was hard to reach.
 
-    Of all ERAs together, or of each group whose clocks are held together.
+    With all ERAs together, or with each group whose clocks are held together.
     """
     count, hertz = len(contents.streams), fingers.table.frequencies
     every = np.arange(len(hertz)) if any(ringing) else rows
@@ -176,7 +335,7 @@ def _candidates(
     is_limited = False
     for number, stream in enumerate(contents.streams):
         others = contents.others(number)
-        over = ringing[number] if others else None  # alone it may be as what lasts
+        over = ringing[number] if others else None  # alone, its ringing disturbs no finger
         level = stream.level_db_sl + float(decibels(count))
         rest = None if contents.background is None or others else contents.background[every]
         lasting = formed.of(stream.targets, others, level, rest)
@@ -206,23 +365,12 @@ def _candidates(
     return Candidates(np.array(streams), np.array(bands), np.array(scores), drives), is_limited
 
 
-def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> Forms:
-    """Forms at some frequencies, by index, of a stimulus that lasts or goes over a duration."""
-    return lasting.at(some) if over is None else over.forms(lasting, some)
-
-
-def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
-    """Which ERAs may play one content together (n,), for each group of them."""
-    groups = np.array(table.clocks.groups or [0] * len(table.eras))
-    return [groups == each for each in np.unique(groups)]
-
-
 def _switched_candidates(
     fingers: FingersOnPlate, contents: Contents, over: RingingUnderFingers | None
 ) -> Candidates:
-    """The best patterns of the mode `switched` for an only content.
+    """Find the best patterns of the drive mode `switched` for a single content.
 
-    Near the highest level where none reaches it; each of ERAs that may play one content together.
+    Each with ERAs of one group; near the highest level if none reaches the wanted one.
     """
     (stream,), quiet, rows = contents.streams, contents.quiet, contents.rows
     rows = rows if over is None or not quiet else over.lasting_long_enough(rows)
@@ -255,8 +403,19 @@ def _switched_candidates(
     return Candidates(none, none, np.array([score for score, _ in found]), drives)
 
 
+def _at(some: IntArray, lasting: Forms, over: RingingUnderFingers | None) -> Forms:
+    """Select forms at some frequencies, by index, over the envelope if the stimulus has one."""
+    return lasting.at(some) if over is None else over.forms(lasting, some)
+
+
+def _groups(table: LocalizationTable) -> list[NDArray[np.bool_]]:
+    """Return masks (n,) of the ERAs that may play one content together, one per group."""
+    groups = np.array(table.clocks.groups or [0] * len(table.eras))
+    return [groups == each for each in np.unique(groups)]
+
+
 def _apart(score: Float32Array, frequencies: FloatArray, count: int, apart_hz: float) -> list[int]:
-    """Indices of the two best scores, and of the best ones that are apart from all of these."""
+    """Return indices of the two best scores, and of the next best whose frequencies are apart."""
     found: list[int] = []
     for at in best_first(score).tolist():
         if score[at] <= 0 or len(found) == count:
@@ -273,10 +432,11 @@ def _judged(
     found: Candidates,
     ringing: Sequence[RingingUnderFingers | None],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Level (m,) of each candidate as an amplitude, on nine of ten plates.
+    """Judge m candidates on d drawn plates: level (m,) on nine of ten, as an amplitude.
 
-    Over a duration that on the nominal plate. Also the amplitude (m, d) at its targets, and the
-    squared one (m, k, d) at loudest points, those of several contents at the contents' levels.
+    Over a duration, the level is nominal. Also returns the amplitude (m, d) at the targets and the
+    squared one (m, k, d) at the loudest points, scaled to the contents' levels if there are several
+    contents.
     """
     drives = [
         drive if (over := ringing[stream]) is None else over.spectrum(drive)
@@ -312,12 +472,19 @@ def _judged(
     return least, own[:, 1:], loudest[:, :, 1:]
 
 
+def tones_of(drives: Sequence[Drive]) -> tuple[IntArray, Complex64Array, IntArray]:
+    """Return rows (m,) and weights (m, n) of the tones of drives, and each one's drive (m,)."""
+    tones = [(row, weights, number) for number, each in enumerate(drives) for row, weights in each]
+    rows, weights, owners = (np.array(each) for each in zip(*tones, strict=True))
+    return rows, weights, owners
+
+
 def best_tone(
     wanted: float, scores: FloatArray, own: FloatArray, quiet: FloatArray, least: FloatArray
 ) -> int:
-    """The candidate of an only content: level first, then contrast.
+    """Choose the candidate of a single content: level first, then contrast.
 
-    Without other fingers the score counts, and as much a level that is much the same on all plates.
+    Without other fingers the score counts, and equally a level that varies little among plates.
     wanted: amplitude to threshold; scores (m,); own (m, d), quiet (m, q, d), least (m,) as of
     `_judged`.
     """
@@ -337,9 +504,10 @@ def best_combination(
     own: FloatArray,
     loudest: FloatArray,
 ) -> tuple[IntArray, bool]:
-    """A candidate of each content (K,), and whether their frequencies are apart.
+    """Choose a candidate of each content (K,); also return whether their frequencies are apart.
 
-    Of all that exchange bands and are apart, else of all that exchange bands.
+    Contents exchange bands if they have several. Combinations whose frequencies are apart come
+    first, all others only if there are none.
     """
     streams, hertz = contents.streams, table.frequencies[found.rows]
     sensitivities = table.sensitivities[:, found.rows]
@@ -374,165 +542,21 @@ def worst_ratios(
 ) -> FloatArray:
     """Power ratio at the worst finger on nine of ten plates, of combinations (c, j): (c,).
 
-    The least over the sets of thresholds, by sensitivities (s, m). Of the first j contents alone;
+    The least over the sets of thresholds, by sensitivities (s, m). Only the first j contents play;
     own (m, d), loudest (m, k, d) as of `_judged`.
     """
-    by_set = [
-        _worst_ratios(
-            combinations,
-            streams,
-            quiet,
-            own * factors[:, None],
-            loudest * np.square(factors)[:, None, None],
-        )
-        for factors in sensitivities.astype(float)
-    ]
-    return np.asarray(np.min(by_set, axis=0))
-
-
-def _worst_ratios(
-    combinations: IntArray,
-    streams: Sequence[Stream],
-    quiet: Sequence[int],
-    own: FloatArray,
-    loudest: FloatArray,
-) -> FloatArray:
-    """The ratios by one set of thresholds."""
-    levels, total = own[combinations] ** 2, loudest[combinations].sum(axis=1)
-    worst = np.full((len(combinations), own.shape[1]), np.inf)
-    for j, at in enumerate(combinations.T):
-        if combinations.shape[1] > 1:
-            for finger in streams[j].targets:
-                others_power = np.maximum(total[:, finger] - loudest[at, finger], _TINY)
-                worst = np.minimum(worst, levels[:, j] / others_power)
-    for finger in quiet:
-        worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
-    return percentile(worst)
-
-
-def choose_tones(table: LocalizationTable, contents: Contents) -> Tones:
-    """Choose a tone for each content, and find what it promises."""
-    streams, places, quiet, by = contents.streams, contents.places, contents.quiet, kernels()
-    starts, targets, bands, priorities, levels = [0], list[int](), list[int](), [], array("f")
-    is_here = contents.drive_mode == UNRESTRICTED and not contents.avoided
-    for stream in streams:
-        targets += stream.targets
-        starts.append(len(targets))
-        for band in stream.bands:
-            bands += band
-        priorities.append(stream.priority)
-        levels.append(10 ** (stream.level_db_sl / 20))
-        is_here = is_here and stream.duration is None
-    if by is None or not is_here:
-        return choose_by_numpy(table, contents, by_kernel=by is not None)
-    count, n, k = len(streams), len(table.eras), len(places)
-    kept = _kept.get(table) or _kept.setdefault(table, _kept_of(table))
-    plates, raster, rules, by_count = kept
-    judging, promise, *stiffness = by_count.get(k) or by_count.setdefault(k, _with(table, k))
-    if contents.loads.count(1.0) < len(contents.loads):
-        stiffness = [*_stiffness(table, k, contents.loads)]
-    # Not arrays of numpy, of which each takes as long to make and to read as all of these.
-    numbers = array("i", [*starts, *targets, *quiet, *priorities, *bands])
-    at = array("d", [coordinate for place in places for coordinate in place])
-    background = contents.background
-    given = GivenQuestion(
-        *(count, len(streams[0].bands), k, len(quiet)),
-        *(contents.candidates, contents.combinations),
-        *(contents.apart_hz, numbers.buffer_info()[0], levels.buffer_info()[0]),
-        at.buffer_info()[0],
-        *(each.ctypes.data for each in stiffness),
-        None if background is None else background.ctypes.data,
-        *(addressof(judging), addressof(promise)),
-    )
-    size = 2 * n * count
-    of_fingers = k * (3 + 2 + rules.sets)
-    rows = array("i", bytes(4 * count))
-    figures = array("f", bytes(4 * (size + count + of_fingers + 2)))
-    to = FoundTones(0, rows.buffer_info()[0], figures.buffer_info()[0])
-    status = run(by.library.answer, to, plates, raster, rules, given)
-    if status != FOUND:
-        raise AssertionError("contents must have tones")
-    found = figures.tolist()
-    weights = map(complex, found[:size:2], found[1:size:2])
-    contrast = size + count
-    level, of_others = contrast + 3 * k, contrast + 5 * k
-    worst, factor = found[-2:]
-    return Tones(
-        rows=rows.tolist(),
-        weights=list(zip(*[weights] * n, strict=True)),
-        gains=found[size:contrast],
-        owners=range(count),
-        contrast_db=list(zip(*[iter(found[contrast:level])] * 3, strict=True)),
-        level_db_sl=list(zip(*[iter(found[level:of_others])] * 2, strict=True)),
-        foreign_db_sl=list(zip(*[iter(found[of_others:-2])] * rules.sets, strict=True)),
-        worst_db=worst,
-        stroke_factor=factor,
-        is_apart=bool(to.is_apart),
-    )
-
-
-_Fingers: TypeAlias = tuple[PlateDraws, PlateDraws, Complex64Array, Complex64Array]
-"""Plates that judge and those of the promise, and the stiffness of fingers that press lightly, also
-at twice the frequencies."""
-
-_Kept: TypeAlias = tuple[TouchedPlates, GivenRaster, Rules, dict[int, _Fingers]]
-"""What kernels read of a table; and of so many fingers."""
-
-_kept: WeakKeyDictionary[LocalizationTable, _Kept] = WeakKeyDictionary()
-
-
-def _with(table: LocalizationTable, fingers: int) -> _Fingers:
-    judging, promise = (
-        draws_structure(table.on_eras, table.clocks, fingers, by)
-        for by in (JUDGING_DRAWS, PROMISED_DRAWS)
-    )
-    return judging, promise, *_stiffness(table, fingers)
-
-
-def _stiffness(
-    table: LocalizationTable, fingers: int, loads: tuple[float, ...] = ()
-) -> tuple[Complex64Array, Complex64Array]:
-    """Stiffness of fingers at a table's frequencies, and at twice these where harmonics count."""
-    stiffness = table.attached.finger_stiffness(fingers, loads)
-    if not table.uncertainty.harmonic:
-        return stiffness, stiffness
-    return stiffness, table.at_harmonics.plate.finger_stiffness(fingers, loads)
-
-
-def _kept_of(table: LocalizationTable) -> _Kept:
-    """The plate, its raster, and how tones are chosen on a table, as kernels read them."""
-    uncertainty, groups = table.uncertainty, table.clocks.groups
-    variance = uncertainty.gain_variance
-    rules = Rules(
-        *(KEPT, MISSING, MAX_FINGERS_BY_POINT, PRUNING_STEP),
-        *(len(CENTRE_AND_RIM), variance < MAX_VARIANCE_FINE, uncertainty.frequency > 0),
-        *(variance, RIDGE, LEVEL_MARGIN, drive_modes.NEARLY_HIGHEST, REACHED),
-        *(PERCENTILE, PROMISED_PERCENTILE),
-        *(drive_modes.TARGET_STARTS, drive_modes.ALIGNMENTS, drive_modes.REALIGNMENTS),
-        *(_method(drive_modes.ONE_FINGER), _method(drive_modes.SEVERAL)),
-        (WeightSearch * 3)(*map(_method, drive_modes.WITHIN_STROKE)),
-        1 + max(groups, default=0),
-        len(table.threshold_sets),
-    )
-    rules.point(
-        rim=CENTRE_AND_RIM,
-        group=np.array(groups, dtype=np.int32) if groups else None,
-        threshold=table.thresholds,
-        error=table.error_power,
-        shares=table.power_shares,
-        frequencies=table.frequencies,
-        sensitivities=table.sensitivities.T,
-        search_error=table.search_error_power,
-        harmonic_threshold=table.compared_harmonic_thresholds,
-        harmonic_sensitivities=table.harmonic_sensitivities.T,
-    )
-    if uncertainty.harmonic > 0:
-        rules.at_harmonics = addressof(plates_structure(table.at_harmonics))
-    return plates_structure(table.on_eras), given_raster(table), rules, {}
-
-
-def _method(of: drive_modes.LawsonMethod) -> WeightSearch:
-    return WeightSearch(
-        *(of.steps, of.is_limited, of.variance, of.gain),
-        *(drive_modes.LEVEL_RESERVE, drive_modes.MAX_GROWTH, drive_modes.MAX_MULTIPLIER),
-    )
+    least = np.full(len(combinations), np.inf)
+    for factors in sensitivities.astype(float):
+        power = loudest * np.square(factors)[:, None, None]
+        levels = (own * factors[:, None])[combinations] ** 2
+        total = power[combinations].sum(axis=1)
+        worst = np.full((len(combinations), own.shape[1]), np.inf)
+        for j, at in enumerate(combinations.T):
+            if combinations.shape[1] > 1:
+                for finger in streams[j].targets:
+                    others_power = np.maximum(total[:, finger] - power[at, finger], _TINY)
+                    worst = np.minimum(worst, levels[:, j] / others_power)
+        for finger in quiet:
+            worst = np.minimum(worst, levels.min(axis=1) / np.maximum(total[:, finger], _TINY))
+        least = np.minimum(least, percentile(worst))
+    return least

@@ -19,21 +19,9 @@ import numpy as np
 from controller.play import joint_answers, planner
 from controller.play.intent import NO_CONTACTS, HapticIntent, Target
 from controller.sources.touch import Contact, ContactKey
-from model.answer.answer import NO_LIMITS, Answer, Layer, Limits, Sensation
-from model.answer.plan import answer, prepare_answers, query
-from model.answer.promise import scaled
-from model.answer.stimulus import (
-    ANY,
-    ANY_BAND,
-    BY_NAME,
-    Contents,
-    Finger,
-    Placement,
-    Stimulus,
-    Stream,
-    Tones,
-    together,
-)
+from model.answer.answer import NO_LIMITS, Answer, Contents, Layer, Limits, Sensation, Stream, Tones
+from model.answer.plan import answer, prepare_answers, query, scaled
+from model.answer.stimulus import ANY, ANY_BAND, BY_NAME, Finger, Placement, Stimulus, together
 from model.arrays import FloatArray, Point
 from model.ensemble.draws import ClockErrors
 from model.fem import Mesh

@@ -16,8 +16,8 @@ import era_haptics
 from model.answer.answer import Limits
 from model.answer.answer_report import query_one
 from model.answer.plan import answer as answer_by_table
-from model.answer.plan import prepare_answers
-from model.answer.promise import felt_amplitudes, loudest_power, with_gains
+from model.answer.plan import prepare_answers, with_gains
+from model.answer.promise import felt_amplitudes, loudest_power
 from model.answer.stimulus import NEVER, Finger, Placement, Stimulus
 from model.answer.tone_search import choose_tones
 from model.cli import app

@@ -14,23 +14,22 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.clicks import clicks_on, given
-from model.answer.answer import (
-    MIN_CONTRAST_DB,
-    MIXED,
-    OWN,
+from model.answer.answer import MIN_CONTRAST_DB, MIXED, OWN, Limits, verdict_of, verdict_shown
+from model.answer.plan import answer, query
+from model.answer.promise import FingersOnPlate, RingingUnderFingers, on_drawn_plates
+from model.answer.stimulus import (
+    ANY,
+    BY_NAME,
+    MUST,
+    NEVER,
     DriveEnvelope,
-    Limits,
+    Finger,
     OverDuration,
-    RingingUnderFingers,
-    on_drawn_plates,
+    Placement,
+    Stimulus,
     pulse_ramp,
     shaped_gain,
-    verdict_of,
-    verdict_shown,
 )
-from model.answer.plan import answer, query
-from model.answer.promise import FingersOnPlate
-from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, Finger, Placement, Stimulus
 from model.ensemble.draws import JUDGING_DRAWS
 from model.finger import THRESHOLDS, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Uncertainty

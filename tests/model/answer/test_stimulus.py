@@ -17,19 +17,17 @@ from scipy.linalg import eigh
 
 from benchmarks.promise.clicks import given
 from model.answer import tone_search
-from model.answer.answer import DriveEnvelope, Limits, RingingUnderFingers, pulse_ramp
+from model.answer.answer import KEPT, MISSING, Contents, Limits, Stream
 from model.answer.plan import answer, query
-from model.answer.promise import FingersOnPlate, share_stroke
+from model.answer.promise import FingersOnPlate, RingingUnderFingers, share_stroke
 from model.answer.stimulus import (
-    KEPT,
-    MISSING,
-    Contents,
     Course,
+    DriveEnvelope,
     Finger,
     Placement,
     Stimulus,
-    Stream,
     check_fingers,
+    pulse_ramp,
     together,
 )
 from model.answer.tone_search import choose_by_numpy, choose_tones, ranked, worst_ratios

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
-from model.answer.answer import swings_of_pulse
-from model.answer.stimulus import Course
+from model.answer.stimulus import Course, swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import (
     modal_matrices,

@@ -1,16 +1,17 @@
-"""Blocking client of the daemon's API: an `AsyncClient` on a thread of its own.
+"""The two Python clients of the daemon's API: `AsyncClient` for asyncio, and the blocking `Client`.
 
-with Client.connect() as era:
-    print(era.status().state)
-    with era.armed("my study"):
-        era.touch([(0.10, 0.05)])
+    with Client.connect() as era:
+        print(era.status().state)
+        with era.armed("my study"):
+            era.touch([(0.10, 0.05)])
 
-asyncio client of the daemon's API; `controller.api.client` is the blocking one.
+    async with await AsyncClient.connect() as era:
+        await era.subscribe("pattern")
+        async for event in era.events():
+            print(event.data)
 
-async with await AsyncClient.connect() as era:
-    await era.subscribe("pattern")
-    async for event in era.events():
-        print(event.data)
+`Client` runs an `AsyncClient` in an event loop on a thread of its own. Methods that are one request
+each are written by `make pages` from their registration in `controller/daemon/methods.py`.
 """
 
 import asyncio
@@ -23,7 +24,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
-from controller.api.calls import AsyncCalls, Calls
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import (
     RESPONSE_TIMEOUT,
@@ -38,9 +38,23 @@ from controller.api.link import (
     read_result,
     touches_at,
 )
-from controller.api.methods import DEFAULT_LEASE, ArmResult, ClearParams, HelloParams
-from controller.api.registered import METHODS, SILENCING
-from controller.api.schema import Empty, Message, Topic, headline
+from controller.api.methods import (
+    DEFAULT_LEASE,
+    METHODS,
+    SILENCING,
+    ArmResult,
+    ClearParams,
+    EffectsResult,
+    HelloParams,
+    HelloResult,
+    LayoutResult,
+    ReloadResult,
+    RenewResult,
+    StatusResult,
+    StopResult,
+    StrengthResult,
+)
+from controller.api.schema import ApiMessage, Empty, Topic, headline
 from registry.threads import LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
@@ -49,17 +63,17 @@ _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
 
 _T = TypeVar("_T")
-_ResultT = TypeVar("_ResultT", bound=Message)
+_ResultT = TypeVar("_ResultT", bound=ApiMessage)
 
 
-class AsyncClient(AsyncCalls):
+class AsyncClient:
     """A client of the daemon, made by `connect`; any number of calls may be pending.
 
-    Without that its first call connects. A lost connection, and one without a response in time, is
-    made again by the next call, with all subscriptions. Every method ends
-    within the timeout and raises RpcError for an error of the daemon, Unreachable (a LinkError)
-    without a response, and LeaseLost, except for `stop` and `disarm`, once the lease of `armed` is
-    lost.
+    One that is constructed directly connects with its first call. After a lost connection, or one
+    without a response in time, the next call connects again and restores all subscriptions. Every
+    method returns within the timeout and raises RpcError for an error of the daemon, Unreachable
+    (a LinkError) without a response, and LeaseLost, except for `stop` and `disarm`, once the lease
+    of `armed` is lost.
     """
 
     def __init__(self, path: Path, *, name: str, timeout: float) -> None:
@@ -112,6 +126,81 @@ class AsyncClient(AsyncCalls):
         if self._link is not None:
             self._link.abort()
         await asyncio.sleep(0)
+
+    # begin: written by docs/generators/client_stub.py methods
+
+    async def hello(self, client: str) -> HelloResult:
+        """Introduce the client; returns what the daemon drives."""
+        return await self._call(HelloResult, "hello", client=client)
+
+    async def status(self) -> StatusResult:
+        """Show daemon, amplifiers and contacts."""
+        return await self._call(StatusResult, "status")
+
+    async def arm(self, owner: str, *, lease_s: float = 10.0) -> ArmResult:
+        """Switch the high voltage on.
+
+        Touches are felt until the lease expires.
+        """
+        return await self._call(ArmResult, "arm", owner=owner, lease_s=lease_s)
+
+    async def renew(self, lease: str) -> RenewResult:
+        """Extend the lease."""
+        return await self._call(RenewResult, "renew", lease=lease)
+
+    async def disarm(self, *, client: str | None = None, lease: str | None = None) -> None:
+        """Ramp to silence, then switch the high voltage off.
+
+        Any client may. While a link is lost it stops all amplifiers.
+        """
+        await self._call(Empty, "disarm", client=client, lease=lease)
+
+    async def stop(self, *, client: str | None = None) -> StopResult:
+        """Quick-stop all amplifiers, latched until clear.
+
+        Not an emergency stop. Any client may, at any time; error 1006 unless every amplifier is
+        confirmed silent.
+        """
+        return await self._call(StopResult, "stop", client=client)
+
+    async def clear(self, *, client: str | None = None, epoch: int | None = None) -> None:
+        """Acknowledge a stop, or a fault whose cause has gone.
+
+        Stays disarmed.
+        """
+        await self._call(Empty, "clear", client=client, epoch=epoch)
+
+    async def forget(self, *, client: str | None = None) -> None:
+        """Discard what was learned of the plate, and learn anew.
+
+        Answers are those of the table at once.
+        """
+        await self._call(Empty, "forget", client=client)
+
+    async def layout(self, name: str) -> LayoutResult:
+        """Use one of the daemon's layouts.
+
+        Of resting fingers, what ends by itself and what a program plays goes on to its end; what
+        lasts follows the new layout at once.
+        """
+        return await self._call(LayoutResult, "layout", name=name)
+
+    async def reload(self) -> ReloadResult:
+        """Read the daemon's files again, and apply their layouts if nothing else has changed."""
+        return await self._call(ReloadResult, "reload")
+
+    async def effects(self) -> EffectsResult:
+        """List the effects."""
+        return await self._call(EffectsResult, "effects")
+
+    async def strength(self, name: str, gain_db: float | None = None) -> StrengthResult:
+        """Set the strength of a touch source, client or region, or show it; the status shows all.
+
+        What plays is led there within 100 ms.
+        """
+        return await self._call(StrengthResult, "strength", name=name, gain_db=gain_db)
+
+    # end
 
     async def touch(
         self, positions: Sequence[tuple[float, float]], *, source: str = "python"
@@ -231,7 +320,7 @@ class AsyncClient(AsyncCalls):
         lost, self._lost = self._lost, 0
         return replace(event, lost=event.lost + lost)
 
-    async def call(self, method: str, params: Message, result: type[_ResultT]) -> _ResultT:
+    async def call(self, method: str, params: ApiMessage, result: type[_ResultT]) -> _ResultT:
         """Call any method and return its result.
 
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
@@ -256,7 +345,7 @@ class AsyncClient(AsyncCalls):
         """Call a method with these parameters."""
         return await self.call(method, make_params(method, **values), result)
 
-    async def _send(self, method: str, params: Message) -> Any:
+    async def _send(self, method: str, params: ApiMessage) -> Any:
         """Send a request, again over new connections if that is harmless."""
 
         async def attempt() -> Any:
@@ -398,7 +487,7 @@ def _blocking(
     return call
 
 
-class Client(Calls):
+class Client:
     """A client of the daemon, made by `connect`, for any thread; see `AsyncClient`."""
 
     def __init__(self, client: AsyncClient, loop: LoopThread) -> None:
@@ -439,10 +528,26 @@ class Client(Calls):
             self._loop.run(self._client.close())
             self._loop.close()
 
+    # begin: written by docs/generators/client_stub.py blocking
+
+    hello = _blocking(AsyncClient.hello)
+    status = _blocking(AsyncClient.status)
+    arm = _blocking(AsyncClient.arm)
+    renew = _blocking(AsyncClient.renew)
+    disarm = _blocking(AsyncClient.disarm)
+    stop = _blocking(AsyncClient.stop)
+    clear = _blocking(AsyncClient.clear)
+    forget = _blocking(AsyncClient.forget)
     touch = _blocking(AsyncClient.touch)
+    layout = _blocking(AsyncClient.layout)
+    reload = _blocking(AsyncClient.reload)
+    effects = _blocking(AsyncClient.effects)
     play = _blocking(AsyncClient.play)
+    strength = _blocking(AsyncClient.strength)
     subscribe = _blocking(AsyncClient.subscribe)
     unsubscribe = _blocking(AsyncClient.unsubscribe)
+
+    # end
 
     @contextmanager
     def armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> Iterator[ArmResult]:
@@ -471,8 +576,3 @@ class Client(Calls):
             work.close()
             raise Unreachable(f"this client of the daemon at {self.path} is closed")
         return self._loop.run(work)
-
-
-for _name in METHODS:
-    if not hasattr(Client, _name):
-        setattr(Client, _name, _blocking(getattr(AsyncClient, _name)))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from controller.api.schema import AmplifierSilence, Message
+from controller.api.schema import AmplifierSilence, ApiMessage
 from registry.wording import reworded
 
 MAX_LINE_LENGTH = 1 << 16  # bytes, with the line feed
@@ -22,7 +22,7 @@ MAX_SEPARATORS = 2100  # : and , of a request: 500 points have up to 2015
 _MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None
-_MessageT = TypeVar("_MessageT", bound=Message)
+_MessageT = TypeVar("_MessageT", bound=ApiMessage)
 
 
 class ErrorCode(IntEnum):
@@ -57,7 +57,7 @@ ERROR_MEANINGS = {
 """Meaning of each error code."""
 
 
-class ErrorData(Message):
+class ErrorData(ApiMessage):
     """Place and remedy of an error; after a stop, the silence of every amplifier."""
 
     what: str

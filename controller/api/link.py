@@ -26,15 +26,15 @@ from typing import Any, Self, TypeVar, cast
 from pydantic import ValidationError
 
 from controller.api.jsonrpc import ErrorCode, RpcError, read_error, request_line
-from controller.api.registered import METHODS
-from controller.api.schema import API_VERSION, Message, TouchPoint
+from controller.api.methods import METHODS
+from controller.api.schema import API_VERSION, ApiMessage, TouchPoint
 from drivers.errors import LinkError
 from model.errors import InputError, expect_path, shown
 from registry.wording import first_problem
 
 RESPONSE_TIMEOUT = 5.0  # s; arming takes longest, some tenths of a second
 
-_MessageT = TypeVar("_MessageT", bound=Message)
+_MessageT = TypeVar("_MessageT", bound=ApiMessage)
 
 
 class Unreachable(LinkError):
@@ -105,7 +105,7 @@ def result_of(response: Any) -> Any:
     raise error
 
 
-def make_params(method: str, **values: object) -> Message:
+def make_params(method: str, **values: object) -> ApiMessage:
     """The parameters of a method; raises InputError with the key and the value that is wrong."""
     try:
         return METHODS[method].params(**values)
@@ -348,7 +348,7 @@ class DaemonLink:
         line, _, self._received = self._received.partition(b"\n")
         return line
 
-    async def call(self, method: str, params: Message) -> Any:
+    async def call(self, method: str, params: ApiMessage) -> Any:
         """Call a method and return its result as parsed JSON, while it is followed.
 
         Raises RpcError and Unreachable.

@@ -1,33 +1,36 @@
-"""The parameters and results of the API's methods, and how a method is registered.
+"""The methods and topics of the API: their messages, and how requests and events are treated.
 
 A method is registered by `api_method` where it is handled (`controller/daemon/methods.py`). From
-that `make pages` writes what clients, gateway and pages read, so that they start without the
-daemon: `registered.py`, `summaries.py`, `calls.pyi` and docs/reference/api.md.
+its registration `make pages` writes what clients, gateway and pages read without loading the
+daemon: `METHODS` below, the methods of the clients, `summaries.py` and docs/reference/api.md.
+A topic is a row of `TOPICS`.
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
 
 from pydantic import FailFast, Field
 
-from controller.api.amplifier_status import AmplifierStatus
 from controller.api.schema import (
-    BY_PLACE,
     MAX_LEASE,
     MAX_RATE,
     MIN_LEASE,
     STATE_WORDS,
     AmplifierSilence,
+    AmplifierStatus,
+    ApiMessage,
     CauseAndRemedy,
+    ContactStatus,
     Count,
     DaemonStateName,
     EffectDescription,
+    Empty,
     Epoch,
     LatencySummary,
     LearningSummary,
-    Message,
     Name,
     PatternFields,
+    PlateEvent,
     RigSummary,
     TableSummary,
     Topic,
@@ -40,14 +43,17 @@ from controller.effects.player import GainDb, SourceName
 DEFAULT_LEASE = 10.0  # s
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more
 
+BY_PLACE = "by place"
+"""Mark of an optional parameter that the Python clients accept by position, too."""
 
-class HelloParams(Message):
+
+class HelloParams(ApiMessage):
     """Name of the client, for the log."""
 
     client: Name
 
 
-class HelloResult(Message):
+class HelloResult(ApiMessage):
     """Rig, table and layout of the daemon; constant while it runs, except for the layout."""
 
     api_version: str = Field(description="major.minor; major versions are incompatible")
@@ -62,7 +68,7 @@ class HelloResult(Message):
     )
 
 
-class StrengthResult(Message):
+class StrengthResult(ApiMessage):
     """The strengths of touch sources, clients and regions that are known."""
 
     strengths: dict[str, float] = Field(
@@ -123,20 +129,20 @@ class StatusResult(StrengthResult, PatternFields, CauseAndRemedy):
     uptime_s: float
 
 
-class ArmParams(Message):
+class ArmParams(ApiMessage):
     """Who arms, and how long the lease lasts without renewal."""
 
     owner: Name
     lease_s: Annotated[float, Field(ge=MIN_LEASE, le=MAX_LEASE)] = DEFAULT_LEASE
 
 
-class RenewParams(Message):
+class RenewParams(ApiMessage):
     """The lease that `arm` returned."""
 
     lease: Annotated[str, Field(min_length=1, max_length=80)]
 
 
-class RenewResult(Message):
+class RenewResult(ApiMessage):
     """Time until the lease expires."""
 
     lease_s: float
@@ -148,7 +154,7 @@ class ArmResult(RenewResult):
     lease: str
 
 
-class RequestedBy(Message):
+class RequestedBy(ApiMessage):
     """Who requests it, for the log, if it is not the connection's own client."""
 
     client: Name | None = None
@@ -162,7 +168,7 @@ class DisarmParams(RequestedBy):
     )
 
 
-class StopResult(Message):
+class StopResult(ApiMessage):
     """Every amplifier is confirmed silent."""
 
     epoch: Epoch
@@ -177,34 +183,34 @@ class ClearParams(RequestedBy):
     )
 
 
-class TouchParams(Message):
+class TouchParams(ApiMessage):
     """All fingers of one source of this client; valid for 150 ms, to be repeated."""
 
     source: Name
     touches: Annotated[list[TouchPoint], Field(max_length=MAX_TOUCHES), FailFast()]
 
 
-class LayoutParams(Message):
+class LayoutParams(ApiMessage):
     """The layout to use."""
 
     name: Name = Field(description="one of `layouts` in the status")
 
 
-class LayoutResult(Message):
+class LayoutResult(ApiMessage):
     """The layout in use, and all that may be used."""
 
     layout: str
     layouts: list[str]
 
 
-class ReloadResult(Message):
+class ReloadResult(ApiMessage):
     """What came of reading the daemon's files again."""
 
     reloaded: bool = Field(description="whether they are in use now; else all is as before")
     reasons: list[str] = Field(description="what has changed; if refused, why")
 
 
-class EffectsResult(Message):
+class EffectsResult(ApiMessage):
     """The effects that `play` accepts."""
 
     effects: list[EffectDescription]
@@ -214,7 +220,7 @@ _Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 _Points = Annotated[list[_Point], Field(max_length=MAX_GIVEN), FailFast()]
 
 
-class PlayParams(Message):
+class PlayParams(ApiMessage):
     """Play an effect, or points, at the finger nearest to a position; they end when it lifts."""
 
     effect: Name | None = Field(
@@ -236,7 +242,7 @@ class PlayParams(Message):
     loop: bool = Field(False, description="whether points or a file begin anew at their end")
 
 
-class StrengthParams(Message):
+class StrengthParams(ApiMessage):
     """A touch source, client or region and its gain; without a gain nothing is set."""
 
     name: SourceName = Field(
@@ -247,7 +253,7 @@ class StrengthParams(Message):
     )
 
 
-class UnsubscribeParams(Message):
+class UnsubscribeParams(ApiMessage):
     """Topics to receive no longer."""
 
     topics: Annotated[list[Topic], Field(min_length=1, max_length=16)]
@@ -261,6 +267,134 @@ class SubscribeParams(UnsubscribeParams):
     )
 
 
+class StateEvent(CauseAndRemedy):
+    """The daemon changed its state."""
+
+    old: DaemonStateName
+    new: DaemonStateName
+    word: str = Field(
+        default_factory=lambda known: STATE_WORDS[known["new"]],
+        description="the new state in a word for people",
+    )
+    epoch: Epoch
+
+
+class ContactsEvent(ApiMessage):
+    """All contacts after a change, before a pattern is selected for them."""
+
+    contacts: list[ContactStatus]
+
+
+class PatternEvent(PatternFields):
+    """A pattern that the amplifiers confirmed."""
+
+    latency_ms: float | None = Field(
+        description="from the touch to the last byte of the command; null if none was needed"
+    )
+
+
+class SilenceEvent(ApiMessage):
+    """No channel is driven; if a link is lost (see the state), as far as known."""
+
+    contacts: list[ContactStatus]
+    reason: str
+    latency_ms: float | None = Field(description="null if no command was needed")
+
+
+class AmplifiersEvent(ApiMessage):
+    """All amplifiers, at the subscribed rate."""
+
+    amplifiers: list[AmplifierStatus]
+
+
+class LatencyEvent(ApiMessage):
+    """Latencies, at the subscribed rate."""
+
+    latency_ms: LatencySummary
+
+
+class LogEvent(ApiMessage):
+    """A record of the daemon's log."""
+
+    level: Literal["info", "warning", "error"]
+    message: str
+    cause: str | None
+    remedy: str | None
+
+
+class LinkEvent(ApiMessage):
+    """The link to amplifiers was lost, could not be reopened, or was reopened.
+
+    Degraded: an amplifier does not reply but may still play; nothing new is played until it replies
+    (restored) or is lost.
+    """
+
+    event: Literal["degraded", "restored", "lost", "retry", "reopened"]
+    amplifier: str | None = Field(description="its name, if known")
+    message: str
+    remedy: str | None
+
+
+class LayoutEvent(ApiMessage):
+    """Another surface layout is in use, or it was replaced; `effects` may have changed with it."""
+
+    name: str | None = Field(None, description="of the layout in use; null without one")
+    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
+
+
+class InputsEvent(ApiMessage):
+    """A touch input was opened, fell silent or was lost, or touches were rejected."""
+
+    inputs: list[TouchInputStatus] = Field(description="all of the configuration")
+    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
+
+
+class TopicData(NamedTuple):
+    """A topic: its data, its summary, and when it is sent.
+
+    At every change; or the newest of several changes, at most 60 times per second; or at the rate
+    that a client has subscribed with.
+    """
+
+    data: type[ApiMessage]
+    summary: str
+    sent: Literal["always", "newest", "periodically"] = "always"
+
+
+TOPICS: dict[Topic, TopicData] = {
+    "state": TopicData(StateEvent, "every change of state or epoch, with its cause"),
+    "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted", "newest"),
+    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it", "newest"),
+    "silence": TopicData(SilenceEvent, "nothing plays now, and why", "newest"),
+    "amplifiers": TopicData(
+        AmplifiersEvent, "status of the amplifiers, at rate_hz", "periodically"
+    ),
+    "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
+    "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
+    "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
+    "layout": TopicData(LayoutEvent, "another surface layout is in use, or it was replaced"),
+    "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
+    "inputs": TopicData(
+        InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
+    ),
+    "strength": TopicData(
+        StrengthResult, "strengths of sources, clients and regions, at rate_hz", "periodically"
+    ),
+}
+"""Every topic, by name."""
+
+
+class EventParams(ApiMessage):
+    """Parameters of an `event` notification."""
+
+    topic: Topic
+    time_s: float = Field(description="on CLOCK_MONOTONIC")
+    lost: Count = Field(
+        description="notifications dropped before this one because the client reads too slowly"
+    )
+    data: dict[str, object]
+
+
 class Method(NamedTuple):
     """A method of the API, and how its requests are treated.
 
@@ -271,8 +405,8 @@ class Method(NamedTuple):
     lasting connection.
     """
 
-    params: type[Message]
-    result: type[Message]
+    params: type[ApiMessage]
+    result: type[ApiMessage]
     is_limited: bool = True
     silences: bool = False
     in_reserve: bool = False
@@ -297,3 +431,31 @@ def api_method(**treatment: bool) -> Callable[[_HandlerT], _HandlerT]:
         return handler
 
     return register
+
+
+# begin: written by docs/generators/client_stub.py table
+
+METHODS: dict[str, Method] = {
+    "hello": Method(HelloParams, HelloResult, in_reserve=True),
+    "status": Method(Empty, StatusResult, in_reserve=True),
+    "arm": Method(ArmParams, ArmResult, needs_reply=True, is_repeated=False),
+    "renew": Method(RenewParams, RenewResult),
+    "disarm": Method(DisarmParams, Empty, silences=True, in_reserve=True),
+    "stop": Method(RequestedBy, StopResult, is_limited=False, silences=True, in_reserve=True),
+    "clear": Method(ClearParams, Empty, is_repeated=False),
+    "forget": Method(RequestedBy, Empty),
+    "touch": Method(TouchParams, Empty, is_limited=False),
+    "layout": Method(LayoutParams, LayoutResult),
+    "reload": Method(Empty, ReloadResult),
+    "effects": Method(Empty, EffectsResult),
+    "play": Method(PlayParams, Empty, is_repeated=False),
+    "strength": Method(StrengthParams, StrengthResult),
+    "subscribe": Method(SubscribeParams, Empty, over_http=False),
+    "unsubscribe": Method(UnsubscribeParams, Empty, over_http=False),
+}
+"""Every method, by name."""
+
+# end
+
+SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)
+"""Names of the methods that end what plays."""

@@ -94,28 +94,24 @@ Epoch: TypeAlias = Annotated[
 ]
 
 
-BY_PLACE = "by place"
-"""Marks a parameter that may be left out, and that clients in Python take by place all the same."""
-
-
-class Message(BaseModel):
+class ApiMessage(BaseModel):
     """Part of a message: no unknown keys, no implicit conversion, no NaN."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-class Empty(Message):
+class Empty(ApiMessage):
     """An empty object: no parameters, or no result."""
 
 
-class CauseAndRemedy(Message):
+class CauseAndRemedy(ApiMessage):
     """A state, and why."""
 
     cause: str = Field(description="why it is so")
     remedy: str | None = Field(description="what to do about it; null if nothing")
 
 
-class EraPosition(Message):
+class EraPosition(ApiMessage):
     """Position of an ERA under the plate, from the south-west corner, and its wiring."""
 
     name: str
@@ -125,7 +121,7 @@ class EraPosition(Message):
     channel: Count
 
 
-class RigSummary(Message):
+class RigSummary(ApiMessage):
     """The rig, as far as drawing it needs."""
 
     length_m: float
@@ -135,7 +131,7 @@ class RigSummary(Message):
     frequency_hz: list[float] = Field(description="lowest and highest that the rig allows")
 
 
-class TableSummary(Message):
+class TableSummary(ApiMessage):
     """The localization table in use."""
 
     fingerprint: str = Field(description="of the plate and ERAs that it was built for")
@@ -145,7 +141,7 @@ class TableSummary(Message):
     cells_y: Count
 
 
-class TouchPoint(Message):
+class TouchPoint(ApiMessage):
     """One finger of a touch frame."""
 
     id: Annotated[int, Field(ge=-(2**31), lt=2**31)] = Field(
@@ -155,7 +151,7 @@ class TouchPoint(Message):
     y_m: float = Field(description="from the plate's south-west corner, upwards")
 
 
-class TouchInputStatus(Message):
+class TouchInputStatus(ApiMessage):
     """A touch input of the configuration: whether touches can come from it."""
 
     name: str
@@ -169,7 +165,7 @@ class TouchInputStatus(Message):
     )
 
 
-class ContactStatus(Message):
+class ContactStatus(ApiMessage):
     """A finger on the plate and its predicted sensation."""
 
     source: str
@@ -226,7 +222,7 @@ class ContactStatus(Message):
     )
 
 
-class PlayedTone(Message):
+class PlayedTone(ApiMessage):
     """Tone of one ERA as confirmed by its amplifier."""
 
     frequency_hz: float
@@ -234,7 +230,7 @@ class PlayedTone(Message):
     phase_deg: float
 
 
-class PatternFields(Message):
+class PatternFields(ApiMessage):
     """The contacts, and what plays for them."""
 
     contacts: list[ContactStatus] = Field(description="in order of arrival, newest last")
@@ -250,7 +246,7 @@ class PatternFields(Message):
     predicted_level_db_sl: float | None
 
 
-class LinkCounters(Message):
+class LinkCounters(ApiMessage):
     """Counters of the link to an amplifier since it was opened; see the wire protocol."""
 
     frames_out: Count
@@ -266,7 +262,7 @@ class LinkCounters(Message):
     round_trip_ms: float | None = Field(description="of the last request")
 
 
-class AmplifierSilence(Message):
+class AmplifierSilence(ApiMessage):
     """What an amplifier may play, after a stop or where it does not reply."""
 
     silence: Literal["confirmed_silent", "may_play", "watchdog_elapsed"] = Field(
@@ -298,8 +294,8 @@ class AmplifierReport(CauseAndRemedy):
     kind: ReportKind
 
 
-class AmplifierState(Message):
-    """One amplifier according to its last reply, but for its readings; null where unknown."""
+class AmplifierStatus(ApiMessage):
+    """One amplifier according to its last reply; null where unknown."""
 
     name: str
     url: str
@@ -335,8 +331,15 @@ class AmplifierState(Message):
     )
     statistics: LinkCounters
 
+    # begin: written by docs/generators/client_stub.py readings
 
-class LatencySummary(Message):
+    temperature_c: float | None = Field(description="of the amplifier")
+    high_voltage_v: float | None = Field(description="of the supply; 0: not measured")
+
+    # end
+
+
+class LatencySummary(ApiMessage):
     """Latency from a touch frame's arrival to the last byte of the resulting command, all in ms.
 
     Over the last patterns; median and percentiles are null before the first.
@@ -403,7 +406,7 @@ class LearningSummary(LearningStatus):
     )
 
 
-class EffectDescription(Message):
+class EffectDescription(ApiMessage):
     """An effect that `play` accepts."""
 
     name: str

@@ -17,11 +17,8 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
-from pydantic import Field
-
-from controller.api.amplifier_status import AmplifierStatus
 from controller.api.connection import STOP, Acceptor, Admission, Connection, Turns
 from controller.api.jsonrpc import (
     ErrorCode,
@@ -35,23 +32,12 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
-from controller.api.methods import StrengthResult, TouchParams
-from controller.api.registered import METHODS
+from controller.api.methods import METHODS, TOPICS, TouchParams
 from controller.api.schema import (
     MAX_RATE,
-    STATE_WORDS,
-    CauseAndRemedy,
-    ContactStatus,
-    Count,
-    DaemonStateName,
+    ApiMessage,
     Empty,
-    Epoch,
-    LatencySummary,
-    Message,
-    PatternFields,
-    PlateEvent,
     Topic,
-    TouchInputStatus,
 )
 from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
@@ -61,7 +47,7 @@ from registry import threads
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
 _RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
 
-Handler: TypeAlias = Callable[[Connection, Any], Message | Awaitable[Message]]
+Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessage]]
 
 # Made anew each time: an exception that is raised again and again keeps all its tracebacks.
 _busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
@@ -76,7 +62,7 @@ class _Call:
     id: Id
     expects_response: bool
     method: str = ""
-    params: Message | None = None
+    params: ApiMessage | None = None
     error: Exception | None = None
     record: dict[str, Any] = field(default_factory=dict)
 
@@ -197,7 +183,7 @@ class ApiServer:
                 result = _for_one_who_stays(connection, connection.silenced, work)
             else:
                 result = Empty()
-            if isinstance(result, Message):
+            if isinstance(result, ApiMessage):
                 self._respond(connection, call, result)
                 return
         except Exception as error:
@@ -271,15 +257,17 @@ class ApiServer:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
 
     async def _finish(
-        self, connection: Connection, call: _Call, result: Awaitable[Message]
+        self, connection: Connection, call: _Call, result: Awaitable[ApiMessage]
     ) -> None:
         try:
             self._respond(connection, call, await result)
         except Exception as error:
             self._respond(connection, call, error)
 
-    def _respond(self, connection: Connection, call: _Call, outcome: Message | Exception) -> None:
-        if isinstance(outcome, Message):
+    def _respond(
+        self, connection: Connection, call: _Call, outcome: ApiMessage | Exception
+    ) -> None:
+        if isinstance(outcome, ApiMessage):
             call.record["outcome"] = "done"
             if call.expects_response:
                 connection.respond(result_line(call.id, outcome.model_dump_json()))
@@ -291,8 +279,8 @@ class ApiServer:
 
 
 async def _for_one_who_stays(
-    connection: Connection, silenced: int, handle: Callable[[], Message | Awaitable[Message]]
-) -> Message:
+    connection: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
+) -> ApiMessage:
     """Handle a request of a client that has not left, or silenced all, with the same bytes.
 
     silenced: its stops and disarms before the request.
@@ -304,7 +292,7 @@ async def _for_one_who_stays(
     if connection.has_left:
         raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
     result = handle()
-    return result if isinstance(result, Message) else await result
+    return result if isinstance(result, ApiMessage) else await result
 
 
 def _rpc_error(error: Exception) -> RpcError:
@@ -328,134 +316,6 @@ def _rpc_error(error: Exception) -> RpcError:
     )
 
 
-class StateEvent(CauseAndRemedy):
-    """The daemon changed its state."""
-
-    old: DaemonStateName
-    new: DaemonStateName
-    word: str = Field(
-        default_factory=lambda known: STATE_WORDS[known["new"]],
-        description="the new state in a word for people",
-    )
-    epoch: Epoch
-
-
-class ContactsEvent(Message):
-    """All contacts after a change, before a pattern is selected for them."""
-
-    contacts: list[ContactStatus]
-
-
-class PatternEvent(PatternFields):
-    """A pattern that the amplifiers confirmed."""
-
-    latency_ms: float | None = Field(
-        description="from the touch to the last byte of the command; null if none was needed"
-    )
-
-
-class SilenceEvent(Message):
-    """No channel is driven; if a link is lost (see the state), as far as known."""
-
-    contacts: list[ContactStatus]
-    reason: str
-    latency_ms: float | None = Field(description="null if no command was needed")
-
-
-class AmplifiersEvent(Message):
-    """All amplifiers, at the subscribed rate."""
-
-    amplifiers: list[AmplifierStatus]
-
-
-class LatencyEvent(Message):
-    """Latencies, at the subscribed rate."""
-
-    latency_ms: LatencySummary
-
-
-class LogEvent(Message):
-    """A record of the daemon's log."""
-
-    level: Literal["info", "warning", "error"]
-    message: str
-    cause: str | None
-    remedy: str | None
-
-
-class LinkEvent(Message):
-    """The link to amplifiers was lost, could not be reopened, or was reopened.
-
-    Degraded: an amplifier does not reply but may still play; nothing new is played until it replies
-    (restored) or is lost.
-    """
-
-    event: Literal["degraded", "restored", "lost", "retry", "reopened"]
-    amplifier: str | None = Field(description="its name, if known")
-    message: str
-    remedy: str | None
-
-
-class LayoutEvent(Message):
-    """Another surface layout is in use, or it was replaced; `effects` may have changed with it."""
-
-    name: str | None = Field(None, description="of the layout in use; null without one")
-    layout: dict[str, Any] | None = Field(description="the surface layout; null without one")
-
-
-class InputsEvent(Message):
-    """A touch input was opened, fell silent or was lost, or touches were rejected."""
-
-    inputs: list[TouchInputStatus] = Field(description="all of the configuration")
-    rejected_touches: dict[str, Count] = Field(description="number by reason, of all sources")
-
-
-class TopicData(NamedTuple):
-    """A topic: its data, its summary, and when it is sent.
-
-    At every change; or the newest of several changes, at most 60 times per second; or at the rate
-    that a client has subscribed with.
-    """
-
-    data: type[Message]
-    summary: str
-    sent: Literal["always", "newest", "periodically"] = "always"
-
-
-TOPICS: dict[Topic, TopicData] = {
-    "state": TopicData(StateEvent, "every change of state or epoch, with its cause"),
-    "contacts": TopicData(ContactsEvent, "fingers touched, moved or lifted", "newest"),
-    "pattern": TopicData(PatternEvent, "what plays now, as the amplifiers confirmed it", "newest"),
-    "silence": TopicData(SilenceEvent, "nothing plays now, and why", "newest"),
-    "amplifiers": TopicData(
-        AmplifiersEvent, "status of the amplifiers, at rate_hz", "periodically"
-    ),
-    "latency": TopicData(LatencyEvent, "latency from touch to command, at rate_hz", "periodically"),
-    "log": TopicData(LogEvent, "log records from level info, without those of `state` and `link`"),
-    "link": TopicData(LinkEvent, "links to amplifiers that were degraded, lost or reopened"),
-    "layout": TopicData(LayoutEvent, "another surface layout is in use, or it was replaced"),
-    "plate": TopicData(PlateEvent, "the plate has changed, or is followed otherwise"),
-    "inputs": TopicData(
-        InputsEvent, "touch inputs that are missing, mute or back; rejected touches, each second"
-    ),
-    "strength": TopicData(
-        StrengthResult, "strengths of sources, clients and regions, at rate_hz", "periodically"
-    ),
-}
-"""Every topic, by name."""
-
-
-class EventParams(Message):
-    """Parameters of an `event` notification."""
-
-    topic: Topic
-    time_s: float = Field(description="on CLOCK_MONOTONIC")
-    lost: Count = Field(
-        description="notifications dropped before this one because the client reads too slowly"
-    )
-    data: dict[str, object]
-
-
 DEFAULT_RATE = 10.0  # Hz
 
 
@@ -464,14 +324,14 @@ class Hub:
 
     def __init__(
         self,
-        current: Mapping[Topic, Callable[[], Message | None]],
+        current: Mapping[Topic, Callable[[], ApiMessage | None]],
         *,
         clock: Callable[[], float],
     ) -> None:
         self._current = current
         self._clock = clock
         self._subscribers: dict[Connection, None] = {}  # in the order of their first subscription
-        self._newest: dict[Topic, Callable[[], Message | None]] = {}
+        self._newest: dict[Topic, Callable[[], ApiMessage | None]] = {}
         self._flush: asyncio.TimerHandle | None = None
         self._flushed_at = -1.0
         self._failing: set[Topic] = set()
@@ -504,7 +364,7 @@ class Hub:
         self.unsubscribe(connection, [*connection.topics])
         self._subscribers.pop(connection, None)
 
-    def publish(self, topic: Topic, make_data: Callable[[], Message | None]) -> None:
+    def publish(self, topic: Topic, make_data: Callable[[], ApiMessage | None]) -> None:
         """Send to all subscribers; make_data is called only if there are any.
 
         Nothing is sent if it returns None, for outdated data.
@@ -541,7 +401,7 @@ class Hub:
         self,
         subscribers: Sequence[Connection],
         topic: Topic,
-        make_data: Callable[[], Message | None],
+        make_data: Callable[[], ApiMessage | None],
     ) -> None:
         if not subscribers:
             return

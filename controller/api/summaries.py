@@ -2,7 +2,7 @@
 # ruff: noqa: E501
 """What every method of the API does: in reference, OpenAPI, and the help of `era`.
 
-Apart from what messages are made of, which would double the time of help.
+Apart from the messages, whose import would double the time of help.
 """
 
 SUMMARIES = {

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from controller.api.amplifier_status import AmplifierStatus
 from controller.api.link import Notification
 from controller.api.methods import StatusResult
-from controller.api.schema import ContactStatus, LearningSummary, headline
+from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
 from drivers.by_hand.cli import EXIT_STATUS, in_words
 from drivers.errors import CommandRefused, LinkError
 from drivers.protocol.definition import READINGS
@@ -237,8 +236,8 @@ def watch(
     """Print events until Ctrl-C."""
     from typing import cast
 
+    from controller.api.methods import TOPICS
     from controller.api.schema import Topic
-    from controller.api.server import TOPICS
 
     selected = topics or _DEFAULT_TOPICS
     unknown = [topic for topic in selected if topic not in TOPICS]

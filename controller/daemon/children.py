@@ -94,10 +94,8 @@ class _Pieces(io.BytesIO):
 def read_in_child(file: Path, frequencies: FloatArray) -> DaemonConfig:
     """Read a configuration in a child process, for the frequencies of a table [Hz]; blocks.
 
-    Raises InputError with all problems.
-
-    A plug-in that this process cannot load since it started is a problem, too. Raises OSError if
-    the child cannot be started or fails.
+    Raises InputError with all problems, of which a plug-in that was installed or changed after
+    this process started is one, and OSError if the child cannot be started or fails.
     """
     try:
         done = subprocess.run(  # noqa: S603  our own module

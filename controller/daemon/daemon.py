@@ -236,9 +236,8 @@ class Daemon:
     async def _reload_now(self) -> ReloadResult:
         is_done = False
         try:
-            change = await in_thread(
-                partial(read_again, self._config, self._frequencies), name="reload"
-            )
+            read = partial(read_again, self._config, self._frequencies)
+            change = await in_thread(read, name="reload")
             is_armed = self._supervisor.operation.state in ENERGISED
             if reasons := change.refusals(is_armed=is_armed):
                 reasons += [f"{each}, but not applied" for each in change.changes]

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.methods import InputsEvent, LayoutEvent
 from controller.api.schema import TouchInputStatus
-from controller.api.server import InputsEvent, LayoutEvent
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
 from controller.effects.layout import SurfaceLayout

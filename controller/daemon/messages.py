@@ -16,30 +16,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from controller.api.amplifier_status import AmplifierStatus
-from controller.api.methods import EffectsResult, HelloResult, StrengthResult
-from controller.api.schema import (
-    API_VERSION,
-    STATE_WORDS,
-    AmplifierReport,
-    AmplifierSilence,
-    ContactStatus,
-    EffectDescription,
-    EraPosition,
-    LatencySummary,
-    LearningStatus,
-    LearningSummary,
-    LinkCounters,
-    Message,
-    PlateEvent,
-    PlayedTone,
-    RigSummary,
-    TableSummary,
-)
-from controller.api.server import (
+from controller.api.methods import (
     AmplifiersEvent,
     ContactsEvent,
-    Hub,
+    EffectsResult,
+    HelloResult,
     InputsEvent,
     LatencyEvent,
     LinkEvent,
@@ -47,7 +28,28 @@ from controller.api.server import (
     PatternEvent,
     SilenceEvent,
     StateEvent,
+    StrengthResult,
 )
+from controller.api.schema import (
+    API_VERSION,
+    STATE_WORDS,
+    AmplifierReport,
+    AmplifierSilence,
+    AmplifierStatus,
+    ApiMessage,
+    ContactStatus,
+    EffectDescription,
+    EraPosition,
+    LatencySummary,
+    LearningStatus,
+    LearningSummary,
+    LinkCounters,
+    PlateEvent,
+    PlayedTone,
+    RigSummary,
+    TableSummary,
+)
+from controller.api.server import Hub
 from controller.daemon.config import DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.effects.layout import SurfaceLayout
@@ -394,7 +396,7 @@ def plate_event(status: LearningStatus) -> PlateEvent:
     return PlateEvent(**_same(status, PlateEvent))
 
 
-def _same(status: object, message: type[Message]) -> dict[str, Any]:
+def _same(status: object, message: type[ApiMessage]) -> dict[str, Any]:
     """What of a status has a key of the same name in a message."""
     return {key: getattr(status, key) for key in message.model_fields if hasattr(status, key)}
 

@@ -13,6 +13,7 @@ from functools import partial
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
+    METHODS,
     ArmParams,
     ArmResult,
     ClearParams,
@@ -36,7 +37,6 @@ from controller.api.methods import (
     UnsubscribeParams,
     api_method,
 )
-from controller.api.registered import METHODS
 from controller.api.schema import AmplifierSilence, Empty, headline
 from controller.api.server import Handler
 from controller.content.pattern import pattern_of_points

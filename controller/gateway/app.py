@@ -38,9 +38,8 @@ from controller.api.jsonrpc import (
     unknown_method,
 )
 from controller.api.link import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
-from controller.api.methods import Method
-from controller.api.registered import METHODS, SILENCING
-from controller.api.schema import API_VERSION, Message
+from controller.api.methods import METHODS, SILENCING, Method
+from controller.api.schema import API_VERSION, ApiMessage
 from controller.api.summaries import SUMMARIES
 from controller.gateway.connections import (
     CLIENT_TIMEOUT,
@@ -51,7 +50,7 @@ from controller.gateway.connections import (
 )
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import SUBPROTOCOL, VERSIONS, Access, Settings
+from controller.gateway.settings import SUBPROTOCOL, VERSIONS, Access, GatewaySettings
 from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections
@@ -84,7 +83,7 @@ _GATEWAY_ERRORS = {
 }
 
 
-class ErrorBody(Message):
+class ErrorBody(ApiMessage):
     """Body of a response with an error status."""
 
     error: str
@@ -166,7 +165,7 @@ _PAGE = Path(__file__).parent / "page"
 class Gateway:
     """State shared by the routes; `field.run` and `keep_connected` are to be run beside `app`."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: GatewaySettings) -> None:
         self.field = DrawnField(settings.socket)
         self._access = Access(settings)
         self._daemon = settings.socket
@@ -379,7 +378,7 @@ _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
 
 
-async def serve(settings: Settings, *, announce: Callable[[int], None]) -> None:
+async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -> None:
     """Serve until SIGINT or SIGTERM; announce: called with the port. Raises InputError."""
     with contextlib.suppress(OSError):  # a service may be forbidden to
         os.nice(_NICENESS)
@@ -430,7 +429,7 @@ def _is_own_failure(record: logging.LogRecord) -> bool:
     return not isinstance(error, OSError | HttpProcessingError)
 
 
-def load_certificate(settings: Settings) -> ssl.SSLContext | None:
+def load_certificate(settings: GatewaySettings) -> ssl.SSLContext | None:
     """Load certificate and key, None without; raises InputError unless they match."""
     if settings.certificate is None:
         return None
@@ -449,7 +448,7 @@ def load_certificate(settings: Settings) -> ssl.SSLContext | None:
     return tls
 
 
-def listen(settings: Settings) -> socket.socket:
+def listen(settings: GatewaySettings) -> socket.socket:
     """Listen on a socket of its own; raises InputError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:

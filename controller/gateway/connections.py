@@ -27,7 +27,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from controller.api.jsonrpc import ErrorCode, RpcError, read_request
 from controller.api.link import DaemonLink, Unreachable
-from controller.api.registered import SILENCING
+from controller.api.methods import SILENCING
 from controller.gateway.field import DrawnField
 from controller.gateway.settings import HEADERS
 from controller.process.log import RateLimiter

@@ -15,9 +15,9 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from controller.api.amplifier_status import AmplifierStatus
 from controller.api.methods import StatusResult
 from controller.api.schema import (
+    AmplifierStatus,
     DaemonStateName,
     LatencySummary,
     LearningState,

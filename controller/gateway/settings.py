@@ -30,7 +30,7 @@ _MAX_TOKEN_FILE = 4096  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class GatewaySettings:
     """Settings of the gateway; raises InputError if they are unsafe.
 
     socket: the daemon's; host: an IP address to bind; port: 0 for any free one; token: gives full
@@ -235,7 +235,7 @@ class Access:
     set headers, the subprotocol `era-haptics.token.TOKEN` beside `era-haptics.v1`.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: GatewaySettings) -> None:
         self._settings = settings
         self._origins = settings.allowed_origins
 

@@ -4,10 +4,8 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from controller.api.jsonrpc import ERROR_MEANINGS
-from controller.api.methods import Method
-from controller.api.registered import METHODS
-from controller.api.schema import Message
-from controller.api.server import TOPICS, EventParams
+from controller.api.methods import METHODS, TOPICS, EventParams, Method
+from controller.api.schema import ApiMessage
 from controller.api.summaries import SUMMARIES
 from message_types import Models, Notation, each_model
 
@@ -49,7 +47,7 @@ def _notes(method: Method) -> Iterator[str]:
         yield "Over a lasting connection alone, not over HTTP."
 
 
-def _rows(prefix: str, model: type[Message], models: Models) -> Iterator[str]:
+def _rows(prefix: str, model: type[ApiMessage], models: Models) -> Iterator[str]:
     """One row per field; collects the models that fields are made of."""
     for name, field in model.model_fields.items():
         kind = _TYPES.type_of(field.rebuild_annotation(), models)
@@ -60,7 +58,7 @@ def _rows(prefix: str, model: type[Message], models: Models) -> Iterator[str]:
         yield f"- {prefix}`{name}` ({kind}){notes and f': {notes}'}"
 
 
-def _data(model: type[Message], models: Models) -> Iterator[str]:
+def _data(model: type[ApiMessage], models: Models) -> Iterator[str]:
     """The rows of a topic; what `status` returns as well is one of them."""
     status = set(_rows("", METHODS["status"].result, models))
     rows = list(_rows("", model, models))
@@ -115,5 +113,5 @@ _TYPES = Notation(
 )
 
 
-def _summary(model: type[Message]) -> str:
+def _summary(model: type[ApiMessage]) -> str:
     return " ".join((model.__doc__ or "").split())

@@ -1,21 +1,21 @@
-"""What clients and gateway have of the methods of the API, from where these are handled.
+"""Parts of `controller/api` that follow from where methods are handled and readings are defined.
 
-Also the readings of amplifiers in their status.
+Methods are registered in `controller/daemon/methods.py`, which clients and gateway do not load.
 """
 
-import inspect
+import textwrap
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Union, get_args, get_origin
 
-from controller.api.calls import BY_HAND, signature_of
-from controller.api.methods import Method
+from controller.api.methods import BY_PLACE, Method
 from controller.api.schema import Empty
 from controller.daemon.methods import ApiService
 from drivers.protocol.definition import READINGS
 
-_HEAD = "# Written by docs/generators/client_stub.py."
 _WIDTH = 100  # of a line, as ruff has it
+_BY_HAND = ("touch", "play", "subscribe", "unsubscribe")
+"""Methods of `AsyncClient` that put parameters together from positions and names of topics."""
 
 
 def registered() -> dict[str, tuple[Method, str]]:
@@ -27,23 +27,10 @@ def registered() -> dict[str, tuple[Method, str]]:
     }
 
 
-def table() -> str:
-    """The whole file registered.py."""
-    methods = {name: method for name, (method, _) in registered().items()}
-    kinds = {kind for each in methods.values() for kind in (each.params, each.result)} - {Empty}
-    lines = [
-        _HEAD,
-        '"""Every method of the API, by name, and those that end what plays."""',
-        "",
-        *_import("controller.api.methods", "Method", *(each.__name__ for each in kinds)),
-        "from controller.api.schema import Empty",
-        "",
-        "METHODS: dict[str, Method] = {",
-        *(f'    "{name}": {_call(method)},' for name, method in methods.items()),
-        "}",
-        "SILENCING = frozenset(name for name, method in METHODS.items() if method.silences)",
-    ]
-    return "\n".join(lines) + "\n"
+def _table() -> str:
+    """The table of all methods, in methods.py."""
+    rows = [f'    "{name}": {_call(method)},' for name, (method, _) in registered().items()]
+    return "\n".join(["METHODS: dict[str, Method] = {", *rows, "}", '"""Every method, by name."""'])
 
 
 def _call(method: Method) -> str:
@@ -56,20 +43,14 @@ def _call(method: Method) -> str:
     return f"Method({', '.join([method.params.__name__, method.result.__name__, *changed])})"
 
 
-def _import(module: str, *names: str) -> Iterator[str]:
-    yield f"from {module} import ("
-    yield from (f"    {name}," for name in sorted(names))
-    yield ")"
-
-
 def summaries() -> str:
     """The whole file summaries.py."""
     lines = [
-        _HEAD,
+        "# Written by docs/generators/client_stub.py.",
         "# ruff: noqa: E501",
         '"""What every method of the API does: in reference, OpenAPI, and the help of `era`.',
         "",
-        "Apart from what messages are made of, which would double the time of help.",
+        "Apart from the messages, whose import would double the time of help.",
         '"""',
         "",
         "SUMMARIES = {",
@@ -79,53 +60,63 @@ def summaries() -> str:
     return "\n".join(lines) + "\n"
 
 
-def status_stub() -> str:
-    """The whole file amplifier_status.pyi."""
-    lines = [
-        *(_HEAD, "", "from controller.api.schema import AmplifierState", ""),
-        "class AmplifierStatus(AmplifierState):",
-        *(f"    {each.key}: float | None{' = None' * each.is_added}" for each in READINGS),
-    ]
-    return "\n".join(lines) + "\n"
+def _readings() -> str:
+    """The fields of an amplifier's status that are readings of the protocol, in schema.py."""
+    lines = []
+    for each in READINGS:
+        default = "None, " if each.is_added else ""
+        meaning = each.meaning + "; null where the amplifier does not state it" * each.is_added
+        line = f'    {each.key}: float | None = Field({default}description="{meaning}")'
+        if len(line) > _WIDTH:
+            line = line.replace("Field(", "Field(\n        ")[:-1] + "\n    )"
+        lines.append(line)
+    return "\n".join(lines)
 
 
-def stub() -> str:
-    """The whole file calls.pyi."""
-    made = {name: each for name, (each, _) in registered().items() if name not in BY_HAND}
-    results = {each.result.__name__ for each in made.values() if each.result is not Empty}
-    lines = [
-        _HEAD,
-        "",
-        "import inspect",
-        "",
-        *_import("controller.api.methods", "Method", *results),
-        "",
-        "BY_HAND: tuple[str, ...]",
-        "",
-        "def signature_of(method: Method) -> inspect.Signature: ...",
-    ]
-    for kind, keyword in (("AsyncCalls", "async def"), ("Calls", "def")):
-        lines += ["", f"class {kind}:"]
-        for name, method in made.items():
-            signature = signature_of(method)
-            result = "None" if method.result is Empty else method.result.__name__
-            line = f"    {keyword} {name}({_parameters(signature)}) -> {result}: ..."
-            if len(line) > _WIDTH:
-                line = line.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
-            lines.append(line)
-    return "\n".join(lines) + "\n"
+def _methods() -> str:
+    """The methods of `AsyncClient` that are one request each."""
+    return "\n\n".join(
+        "\n".join(_method(name, method, summary))
+        for name, (method, summary) in registered().items()
+        if name not in _BY_HAND
+    )
 
 
-def _parameters(signature: inspect.Signature) -> str:
-    parts: list[str] = []
-    for each in signature.parameters.values():
-        if each.kind is each.KEYWORD_ONLY and "*" not in parts:
-            parts.append("*")
-        kind = "" if each.annotation is each.empty else f": {_kind(each.annotation)}"
-        parts.append(
-            each.name + kind + ("" if each.default is each.empty else f" = {each.default!r}")
-        )
-    return ", ".join(parts)
+def _method(name: str, method: Method, summary: str) -> Iterator[str]:
+    parameters = [*_parameters(method)]
+    result = "None" if method.result is Empty else method.result.__name__
+    given = [part.partition(":")[0] for part in parameters if part != "*"]
+    head = f"    async def {name}({', '.join(['self', *parameters])}) -> {result}:"
+    if len(head) > _WIDTH:
+        head = head.replace("(", "(\n        ").replace(") ->", "\n    ) ->")
+    yield head
+    first, dot, rest = summary.partition(". ")
+    wrapped = textwrap.wrap(rest, _WIDTH - 8)
+    yield from _docstring([first + dot.strip(), *([""] if wrapped else []), *wrapped])
+    call = ", ".join([method.result.__name__, f'"{name}"', *(f"{key}={key}" for key in given)])
+    yield f"        {'' if method.result is Empty else 'return '}await self._call({call})"
+
+
+def _docstring(lines: list[str]) -> Iterator[str]:
+    quotes = '"""'
+    lines = [quotes + lines[0], *lines[1:]]
+    if len(lines) == 1:
+        lines[0] += quotes
+    else:
+        lines.append(quotes)
+    yield from (f"        {line}".rstrip() for line in lines)
+
+
+def _parameters(method: Method) -> Iterator[str]:
+    """The parameters: required and marked ones by position or name, all others by name alone."""
+    fields = sorted(method.params.model_fields.items(), key=lambda item: not item[1].is_required())
+    is_by_place = True
+    for name, field in fields:
+        if is_by_place and not field.is_required() and BY_PLACE not in field.metadata:
+            is_by_place = False
+            yield "*"
+        default = "" if field.is_required() else f" = {field.default!r}"
+        yield f"{name}: {_kind(field.annotation)}{default}"
 
 
 def _kind(annotation: Any) -> str:
@@ -135,3 +126,16 @@ def _kind(annotation: Any) -> str:
     if get_origin(annotation) in (Union, types.UnionType):
         return " | ".join(map(_kind, get_args(annotation)))
     return "None" if annotation is type(None) else str(annotation.__name__)
+
+
+def _blocking() -> str:
+    """The methods of `Client`."""
+    return "\n".join(f"    {name} = _blocking(AsyncClient.{name})" for name in registered())
+
+
+PARTS: Mapping[str, Mapping[str, Callable[[], str]]] = {
+    "methods": {"table": _table},
+    "schema": {"readings": _readings},
+    "client": {"methods": _methods, "blocking": _blocking},
+}
+"""The writers of a module of `controller/api`, by module and name of the part."""

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from controller.api.schema import Message
+from controller.api.schema import ApiMessage
 
-Models = dict[str, type[Message]]
+Models = dict[str, type[ApiMessage]]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Notation:
         origin, arguments = get_origin(annotation), get_args(annotation)
         if origin is Literal:
             return self.literals.join(map(self.literal.format, arguments))
-        if isinstance(annotation, type) and issubclass(annotation, Message):
+        if isinstance(annotation, type) and issubclass(annotation, ApiMessage):
             models[annotation.__name__] = annotation
             return self.model(annotation.__name__)
         if origin is Annotated:
@@ -48,7 +48,7 @@ class Notation:
         return self.plain[annotation]
 
 
-def each_model(models: Models) -> Iterator[tuple[str, type[Message]]]:
+def each_model(models: Models) -> Iterator[tuple[str, type[ApiMessage]]]:
     """Every model once, with those that are collected while the ones before are written."""
     shown: set[str] = set()
     while left := [name for name in models if name not in shown]:

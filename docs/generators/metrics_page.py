@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from prometheus_client.parser import text_string_to_metric_families
 
 from controller.api.methods import StatusResult
-from controller.api.schema import Message
+from controller.api.schema import ApiMessage
 from controller.gateway.metrics import exposition
 
 
@@ -38,7 +38,7 @@ def _known(annotation: Any) -> Any:
         return (*map(_known, arguments),)
     if origin is dict:
         return {"": _known(arguments[1])}
-    if isinstance(annotation, type) and issubclass(annotation, Message):
+    if isinstance(annotation, type) and issubclass(annotation, ApiMessage):
         fields = annotation.model_fields.items()
         return annotation.model_construct(
             None, **{name: _known(field.rebuild_annotation()) for name, field in fields}

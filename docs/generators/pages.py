@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import changed_tests
+import client_stub
 import effects_page
 import error_cases
 import rig_page
@@ -20,7 +21,7 @@ from amplifier_dbc import dbc_text
 from amplifier_eds import eds_text
 from amplifier_json import json_text
 from api_page import api_reference
-from client_stub import status_stub, stub, summaries, table
+from client_stub import summaries
 from command_page import command_reference
 from firmware_header import header
 from firmware_records import records_header
@@ -51,7 +52,10 @@ def part(name: str, write: Callable[[], str]) -> Writer:
 def insert(page: str, text: str, *, name: str) -> str:
     """The page with this text as its part of a name; ValueError for a page without its marks."""
     begin = f"<!-- begin: written by {name} -->"
-    found = re.fullmatch(rf"(.*{begin}\n).*?({END}\n.*)", page, re.DOTALL)
+    marks = (rf"{begin}\n", rf"{END}\n")
+    if f"# begin: written by {name}\n" in page:  # of Python
+        marks = (rf"# begin: written by {name}\n", r" *# end\n")
+    found = re.fullmatch(f"(.*{marks[0]}).*?({marks[1]}.*)", page, re.DOTALL)
     if found is None:
         raise ValueError(f"the page has no lines {begin} and {END}")
     return f"{found[1]}\n{text.rstrip()}\n\n{found[2]}"
@@ -67,10 +71,11 @@ def _of_protocol(page: str) -> list[Writer]:
 
 
 WRITTEN: Mapping[str, Sequence[Writer]] = {
-    "controller/api/registered.py": [whole(table)],
     "controller/api/summaries.py": [whole(summaries)],
-    "controller/api/calls.pyi": [whole(stub)],  # before python-api.md, which shows it
-    "controller/api/amplifier_status.pyi": [whole(status_stub)],
+    **{
+        f"controller/api/{module}.py": _parts("client_stub.py", parts)
+        for module, parts in client_stub.PARTS.items()  # before python-api.md, which shows them
+    },
     "examples/javascript/api.d.ts": [whole(messages)],
     "examples/javascript/package.json": [with_version],
     "firmware/core/protocol.h": [whole(header)],

@@ -12,7 +12,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import era_haptics
@@ -56,27 +55,11 @@ def _entries(names: str) -> Iterator[str]:
 
 
 def _tree(thing: Any) -> ast.stmt:
-    """The source of a function, or of a class with that of the coroutines that it wraps."""
+    """The source of a function, or of a class with that of the coroutine functions it wraps."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
     if isinstance(tree, ast.ClassDef):
         tree.body = [_unwrapped(thing, member) for member in tree.body]
-        for base in thing.__bases__:
-            tree.body += _of_stub(base)
     return tree
-
-
-def _of_stub(base: type) -> list[ast.stmt]:
-    """The members of a class in the stub file of its module, if there is one."""
-    is_ours = base.__module__ != "builtins"
-    stub = Path(inspect.getfile(base)).with_suffix(".pyi") if is_ours else Path("none")
-    if not stub.is_file():
-        return []
-    (found,) = (
-        each
-        for each in ast.parse(stub.read_text("utf-8")).body
-        if isinstance(each, ast.ClassDef) and each.name == base.__name__
-    )
-    return found.body
 
 
 def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:

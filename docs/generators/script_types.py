@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from client_stub import registered
-from controller.api.server import TOPICS
+from controller.api.methods import TOPICS
 from message_types import Models, Notation, each_model
 
 _ROOT = Path(__file__).parents[2]

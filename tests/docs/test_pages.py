@@ -38,8 +38,8 @@ from typer.testing import CliRunner
 import constraints
 import model
 import pages
+from controller.api.methods import StateEvent
 from controller.api.schema import headline
-from controller.api.server import StateEvent
 from controller.cli.main import load_commands
 from controller.daemon.config import DaemonSection, DumpSection, LogSection, TouchSection
 from controller.operation.operation_states import DaemonState

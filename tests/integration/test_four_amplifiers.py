@@ -43,8 +43,9 @@ import model
 from chain import Chain
 from controller.api.client import Client
 from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.methods import LayoutEvent, PatternEvent, StateEvent
 from controller.api.schema import ContactStatus, DaemonStateName
-from controller.api.server import Hub, LayoutEvent, PatternEvent, StateEvent
+from controller.api.server import Hub
 from controller.cli.main import run
 from controller.demo.demonstration import Scene, layout_of_people
 from controller.demo.recorder import TouchRecorder

@@ -28,8 +28,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from controller.api.client import AsyncClient, Client
+from controller.api.methods import StateEvent
 from controller.api.schema import LearningSummary
-from controller.api.server import StateEvent
 from controller.cli.commands import app
 from controller.daemon.daemon import Daemon
 from controller.demo.recorder import FingerVibration, steady_contrast_db

@@ -38,8 +38,8 @@ from controller.api.client import AsyncClient
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
-from controller.api.registered import METHODS
-from controller.api.schema import Empty, Message
+from controller.api.methods import METHODS
+from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
@@ -687,7 +687,7 @@ class ServedApi:
         costs: float = 0.0,
         reading_costs: float = 0.0,
     ) -> None:
-        self.calls: list[tuple[str, Message, float]] = []
+        self.calls: list[tuple[str, ApiMessage, float]] = []
         self.is_busy = False
         self.may_arm = asyncio.Event()
         self.stops = 0
@@ -742,8 +742,8 @@ class ServedApi:
         self.stops += 1
 
     def _handle(
-        self, name: str, client: Connection, params: Message
-    ) -> Message | Awaitable[Message]:
+        self, name: str, client: Connection, params: ApiMessage
+    ) -> ApiMessage | Awaitable[ApiMessage]:
         self._processor_time += self._costs
         self.calls.append((name, params, self.clock()))
         self.called(name)
@@ -751,7 +751,7 @@ class ServedApi:
             raise KeyError("a bug, with /a/path in it")
         return self._arm() if name == "arm" else METHODS[name].result.model_construct(state="FAULT")
 
-    async def _arm(self) -> Message:
+    async def _arm(self) -> ApiMessage:
         await self.may_arm.wait()
         return Empty()
 

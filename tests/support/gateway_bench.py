@@ -36,6 +36,7 @@ from controller.api.client import Client
 from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
+    METHODS,
     ArmResult,
     EffectsResult,
     HelloParams,
@@ -43,24 +44,24 @@ from controller.api.methods import (
     LayoutResult,
     ReloadResult,
     RenewResult,
+    StateEvent,
     StatusResult,
     StopResult,
     SubscribeParams,
 )
-from controller.api.registered import METHODS
 from controller.api.schema import (
     API_VERSION,
     AmplifierSilence,
+    ApiMessage,
     EffectDescription,
     Empty,
     EraPosition,
     LatencySummary,
-    Message,
     RigSummary,
     TableSummary,
     Topic,
 )
-from controller.api.server import ApiServer, Hub, StateEvent
+from controller.api.server import ApiServer, Hub
 from daemons import PATIENCE, daemon_table, write_daemon
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable
@@ -78,7 +79,7 @@ class ScriptedDaemon:
 
     def __init__(self, folder: Path) -> None:
         self.socket = folder / "era.sock"
-        self.calls: list[tuple[str, Message]] = []
+        self.calls: list[tuple[str, ApiMessage]] = []
         self.callers: list[Connection] = []  # one per call
         self.silence: dict[str, AmplifierSilence] = {}  # after a stop that is not confirmed
         self._rig_text = write_rig(folder / "rig.yaml").read_text(encoding="utf-8")
@@ -100,7 +101,7 @@ class ScriptedDaemon:
         self._loop.close()
         self.socket.unlink()
 
-    def publish(self, topic: Topic, event: Message) -> None:
+    def publish(self, topic: Topic, event: ApiMessage) -> None:
         """Send an event to all subscribers."""
         self._loop.call_soon_threadsafe(self._hub.publish, topic, lambda: event)
 
@@ -137,8 +138,8 @@ class ScriptedDaemon:
         self._hub.close()
         await server.close()
 
-    def _handler(self, name: str) -> Callable[[Connection, Message], object]:
-        def handle(client: Connection, params: Message) -> object:
+    def _handler(self, name: str) -> Callable[[Connection, ApiMessage], object]:
+        def handle(client: Connection, params: ApiMessage) -> object:
             if name == "subscribe" and isinstance(params, SubscribeParams):
                 self._hub.subscribe(client, params.topics)
             if name not in ("hello", "subscribe"):  # called by the gateway itself
@@ -150,11 +151,11 @@ class ScriptedDaemon:
 
         return handle
 
-    async def _arm(self) -> Message:
+    async def _arm(self) -> ApiMessage:
         await self._may_arm.wait()
         return ArmResult(lease="a-lease", lease_s=5.0)
 
-    def _result(self, name: str) -> Message:
+    def _result(self, name: str) -> ApiMessage:
         match name:
             case "hello":
                 return self._hello()

@@ -30,8 +30,7 @@ from controller.api.link import (
     check_peer,
     find_socket,
 )
-from controller.api.registered import METHODS
-from controller.api.server import LogEvent
+from controller.api.methods import METHODS, LogEvent
 from daemons import (
     PLACE,
     daemon_at,

@@ -29,9 +29,9 @@ from controller.api.connection import (
     Admission,
     Connection,
 )
-from controller.api.registered import METHODS
-from controller.api.schema import MAX_RATE, Message
-from controller.api.server import TOPICS, ContactsEvent, EventParams, Hub, LogEvent
+from controller.api.methods import METHODS, TOPICS, ContactsEvent, EventParams, LogEvent
+from controller.api.schema import MAX_RATE, ApiMessage
+from controller.api.server import Hub
 from controller.gateway.field import DrawnField
 from daemons import (
     PLACE,
@@ -603,7 +603,7 @@ async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCapture
     connection, wire = connect(lambda: 0.0)
     hub.subscribe(connection, ["log", "contacts"])
 
-    def fail() -> Message:
+    def fail() -> ApiMessage:
         raise ZeroDivisionError
 
     for topic in ("log", "contacts", "log"):
@@ -627,7 +627,7 @@ async def test_hub_sends_the_newest_of_changes_at_most_sixty_times_per_second() 
     loop = asyncio.get_running_loop()
     made: list[str] = []
 
-    def make() -> Message:
+    def make() -> ApiMessage:
         made.append("contacts")
         return ContactsEvent(contacts=[])
 

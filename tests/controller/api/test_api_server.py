@@ -25,9 +25,8 @@ from controller.api.jsonrpc import (
     request_line,
     result_line,
 )
-from controller.api.methods import ArmParams, StatusResult, SubscribeParams, TouchParams
-from controller.api.registered import METHODS
-from controller.api.schema import Empty, Message
+from controller.api.methods import METHODS, ArmParams, StatusResult, SubscribeParams, TouchParams
+from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer
 from controller.api.summaries import SUMMARIES
 from controller.daemon.methods import ApiService
@@ -410,7 +409,7 @@ def test_response_has_the_members_of_the_specification() -> None:
         Empty(),
     ],
 )
-def test_request_line_is_read_as_written(params: Message) -> None:
+def test_request_line_is_read_as_written(params: ApiMessage) -> None:
     """Requests of the client have the same id and parameters at the server."""
     line = request_line(7, "any", params.model_dump_json(exclude_none=True).encode())
     request = read_request(line)

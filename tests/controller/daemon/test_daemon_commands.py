@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
-from controller.api.server import TOPICS
+from controller.api.methods import TOPICS
 from controller.cli.commands import app
 from controller.cli.daemon_cli import show_event, show_status
 from controller.cli.main import run

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.api.server import InputsEvent
+from controller.api.methods import InputsEvent
 from controller.cli.daemon_cli import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.layouts import TouchInputs

@@ -20,8 +20,7 @@ import pytest
 
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
-from controller.api.registered import METHODS
-from controller.api.server import TOPICS
+from controller.api.methods import METHODS, TOPICS
 from controller.effects.kinds import File
 from controller.play.selection import Chooser
 from controller.sources import udp_source

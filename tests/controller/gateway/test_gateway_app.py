@@ -25,15 +25,14 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Unreachable
-from controller.api.methods import RequestedBy, StatusResult
-from controller.api.registered import METHODS
-from controller.api.schema import Message, PlayedTone
-from controller.api.server import Hub, LogEvent, PatternEvent
+from controller.api.methods import METHODS, LogEvent, PatternEvent, RequestedBy, StatusResult
+from controller.api.schema import ApiMessage, PlayedTone
+from controller.api.server import Hub
 from controller.gateway import app
 from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import Access, Settings
+from controller.gateway.settings import Access, GatewaySettings
 from daemons import PATIENCE, ready_daemon, until
 from gateway_bench import (
     TOKEN,
@@ -93,7 +92,7 @@ async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
     """Nothing of the machine is told to a network without it."""
     certificate = tmp_path / "panel.pem"
     certificate.touch()
-    settings = Settings(
+    settings = GatewaySettings(
         socket=tmp_path / "era.sock",
         host="192.0.2.7",
         certificate=certificate,
@@ -124,7 +123,7 @@ async def served(
     monkeypatch.setattr(app.AsyncClient, "status", status)
     monkeypatch.setattr("os.nice", lambda _: 0)
     port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-    settings = Settings(socket=tmp_path / "era.sock")
+    settings = GatewaySettings(socket=tmp_path / "era.sock")
     serving = asyncio.create_task(serve(settings, announce=port.set_result))
     async with httpx.AsyncClient(base_url=f"http://localhost:{await port}") as client:
         yield client
@@ -168,7 +167,7 @@ async def test_failure_of_the_gateway_is_answered_and_logged(
 TONE = PlayedTone(frequency_hz=110.0, level=0.5, phase_deg=0.0)
 
 
-class UnknownPattern(Message):
+class UnknownPattern(ApiMessage):
     """A pattern of an incompatible daemon."""
 
     layers: dict[str, dict[str, dict[str, str]]] = {  # noqa: RUF012  pydantic copies it
@@ -382,7 +381,7 @@ def test_who_connects_without_pause_leaves_connections_to_other_hosts(
 ) -> None:
     """It is refused at its own rate, before the one of all hosts is used up."""
     monkeypatch.setattr(app.time, "monotonic", lambda: 0.0)
-    gateway = app.Gateway(Settings(socket=tmp_path / "era.sock"))
+    gateway = app.Gateway(GatewaySettings(socket=tmp_path / "era.sock"))
 
     assert [gateway.may_connect("192.0.2.1") for _ in range(40)] == [True] * 32 + [False] * 8
     assert [gateway.may_connect("192.0.2.2") for _ in range(20)] == [True] * 16 + [False] * 4

@@ -20,7 +20,7 @@ from aiohttp import web
 from controller.demo.demonstration import check_page
 from controller.gateway.app import Gateway, listen, load_certificate, serve
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
-from controller.gateway.settings import Settings, read_token
+from controller.gateway.settings import GatewaySettings, read_token
 from daemons import PATIENCE, until
 from gateway_attacks import ATTACKS, LIMIT, attack, attacked_gateway, make_certificate
 from gateway_bench import (
@@ -135,7 +135,7 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
     daemon: ScriptedDaemon, tmp_path: Path
 ) -> None:
     """Of the loopback, in brackets; other hosts are refused, and tokens of other gateways."""
-    other = Settings(socket=tmp_path).token
+    other = GatewaySettings(socket=tmp_path).token
     with gateway_process(tmp_path, daemon.socket, "--listen", "[::1]:0", token=None) as gateway:
         assert gateway.url.startswith("http://[::1]:")
         token = [gateway.token]
@@ -143,14 +143,14 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
         assert http(gateway, token=token, more=[f"Origin: http://{gateway.host}"]).status == 200
         assert http(gateway, token=token, host=["evil.example"]).status == 421
         assert http(gateway, token=[other]).status == 401
-        assert len({gateway.token, other, Settings(socket=tmp_path).token}) == 3
+        assert len({gateway.token, other, GatewaySettings(socket=tmp_path).token}) == 3
         assert len(gateway.token) == len(other) == 43  # 256 bits
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> None:
     """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
-    listening = listen(Settings(socket=tmp_path / "era.sock", host=host, port=0))
+    listening = listen(GatewaySettings(socket=tmp_path / "era.sock", host=host, port=0))
     server = web.Server(AsyncMock())
     accepting = asyncio.create_task(ConnectionAcceptor(server, None).run(listening))
     _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
@@ -169,7 +169,7 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=rf"port {port} \(Address already in use\).*--listen"):
-            listen(Settings(socket=tmp_path / "era.sock", port=port))
+            listen(GatewaySettings(socket=tmp_path / "era.sock", port=port))
         page = f"127.0.0.1:{port}"
         with pytest.raises(InputError, match=rf"{page} \(Address already in use\).*--dashboard "):
             check_page(page)
@@ -186,7 +186,7 @@ def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path,
     text.write_text("no certificate")
     for first, second in ((certificate, other), (certificate, locked), (text, text)):
         with pytest.raises(InputError, match=f"{first} and {second}.*without password"):
-            load_certificate(Settings(socket=tmp_path, certificate=first, key=second))
+            load_certificate(GatewaySettings(socket=tmp_path, certificate=first, key=second))
 
 
 def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_settings_refuse_what_is_unsafe(name: str) -> None:
     """Before anything listens, with the option to change."""
     given, words = SETTINGS[name]
     with pytest.raises(InputError, match=words):
-        Settings(socket=Path("era.sock"), **given)  # type: ignore[arg-type]
+        GatewaySettings(socket=Path("era.sock"), **given)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,7 @@ def test_settings_refuse_what_is_unsafe(name: str) -> None:
 )
 def test_allowed_origin_is_as_browsers_send_it(given: str, sent: str) -> None:
     """By the serialization of an origin (RFC 6454, 6.2) and the host parser of the URL standard."""
-    settings = Settings(
+    settings = GatewaySettings(
         socket=Path("era.sock"),
         origins=(given,),
         extra_hosts=("B\xfccher.example", "[2001:DB8::07]"),
@@ -292,9 +292,9 @@ def test_allowed_origin_is_as_browsers_send_it(given: str, sent: str) -> None:
 
 def test_settings_show_and_allow_the_address_listened_on() -> None:
     """Besides the usual names; for all addresses the first allowed host is shown."""
-    settings = Settings(socket=Path("era.sock"), host="127.0.0.2")
+    settings = GatewaySettings(socket=Path("era.sock"), host="127.0.0.2")
     assert settings.shown_host == "127.0.0.2"
-    panel = Settings(
+    panel = GatewaySettings(
         socket=Path("era.sock"), **TLS, is_token_user_supplied=True, extra_hosts=("panel.local",)
     )  # type: ignore[arg-type]
     assert panel.shown_host == "panel.local"
@@ -315,7 +315,7 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
     monkeypatch.setattr("os.nice", forbidden)
     monkeypatch.setattr("controller.gateway.app.load_certificate", reached)
     with pytest.raises(InputError, match="reached"):
-        await serve(Settings(socket=Path("era.sock")), announce=lambda port: None)
+        await serve(GatewaySettings(socket=Path("era.sock")), announce=lambda port: None)
 
 
 async def test_gateway_ends_with_what_it_keeps_of_the_daemon(
@@ -325,7 +325,7 @@ async def test_gateway_ends_with_what_it_keeps_of_the_daemon(
     monkeypatch.setattr(Gateway, "keep_connected", AsyncMock(side_effect=ZeroDivisionError))
     with pytest.raises(ZeroDivisionError):
         async with asyncio.timeout(PATIENCE / 6):
-            await serve(Settings(socket=tmp_path / "era.sock"), announce=lambda port: None)
+            await serve(GatewaySettings(socket=tmp_path / "era.sock"), announce=lambda port: None)
 
 
 def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def gateway(
 
     host, port = _host_and_port(listen)
     chosen = {} if token_file is None else {"token": read_token(token_file)}
-    settings = Settings(
+    settings = GatewaySettings(
         socket=find_socket(socket),
         host=host,
         port=port,

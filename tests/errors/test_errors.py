@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -39,6 +40,7 @@ from long_form import full_disk, shortly
 from model.calibration import calibrate
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.errors import InputError
+from model.files.array_file import UNREADABLE, read_arrays
 from model.identification.learned_plate import load_learned
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import load_table
@@ -344,3 +346,16 @@ def test_reader_refuses_in_words_what_is_no_such_file(tmp_path: Path, name: str,
     assert len(str(caught.value)) < 2000 + len(str(path))
     if kind == "sparse" and name != "wires.txt":  # which is read line by line
         assert "must be up to" in str(caught.value)
+
+
+@pytest.mark.parametrize("shape", [b"(True, 4)", b"(-1, -4)", b"(%s,)" % (b"9" * 5000), b"4"])
+def test_array_without_a_shape_is_refused(tmp_path: Path, shape: bytes) -> None:
+    """Of .npy, whose header Python parses: True counts as 1, and two negative counts as a size."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': %s}" % shape
+    header += b" " * (-(len(header) + 11) % 64) + b"\n"
+    member = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(32)
+    path = tmp_path / "arrays.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x.npy", member)
+    with pytest.raises(UNREADABLE):
+        read_arrays(path, {"x": "<f8"}, max_bytes=1 << 20)

@@ -179,7 +179,8 @@ def check(
     The kept share is that of the time in which the level at the skin is within 3 dB of what the
     file asks, where that is within 20 dB of its highest: 1 says that all rises, taps and pauses are
     felt as they were made. Levels are means over 20 ms; taps that are left out are lost, lost
-    sharpness is only mentioned. Exit status 1 if less than --least is kept. Without --at five
+    sharpness is only mentioned. Amplifiers are taken as phased, whichever mode the table was built
+    for. Exit status 1 if less than --least is kept. Without --at five
     places are tried, the middle among them, and the one that keeps the third most is shown.
     """
     from era_haptics.lab.checks.content_check import check_content, least_promise

@@ -34,8 +34,8 @@ def check(
     """Simulate what every region makes felt, and what is felt apart.
 
     In time, by touches over the region, alone and with a resting second finger; and what two and
-    three fingers at once are promised at their worst places. Exit status 1 if a region falls short
-    of the layout.
+    three fingers at once are promised at their worst places. Amplifiers are taken as phased,
+    whichever mode the table was built for. Exit status 1 if a region falls short of the layout.
     """
     import time
 

@@ -431,3 +431,38 @@ def test_tones_that_have_not_settled_are_left_out(rig: Rig, tmp_path: Path) -> N
     wavfile.write(path, rate, rising.astype(np.int16))
     found = read_stepped(path, Desk(rig, FIXED))
     assert {each.sensor for each in found} == {"P2"}
+
+
+def test_level_beyond_any_number_is_refused(rig: Rig, tmp_path: Path) -> None:
+    """10^(10^6 / 20) is beyond what a float is; the error names line and column."""
+    path = tmp_path / "P1-1.csv"
+    path.write_text("frequency_hz,magnitude_db,phase_deg\n61,1e6,0\n")
+    with pytest.raises(InputError, match=r"P1-1\.csv:2: magnitude_db must be .* up to 200"):
+        read_stepped(path, Desk(rig, FIXED))
+
+
+@pytest.mark.parametrize(
+    ("rate", "channels", "words"),
+    [
+        (
+            STEPPED_FILE_RATE,
+            1,
+            "channels must be 2 of sensors and 1 or 4 references behind them, got 1",
+        ),
+        (1, 3, "rate must be 1000 to 1000000 Hz, got 1"),
+        (2**31, 3, "rate must be 1000 to 1000000 Hz, got 2147483648"),
+    ],
+)
+def test_recording_of_other_inputs_or_rates_is_refused(
+    rig: Rig, tmp_path: Path, rate: int, channels: int, words: str
+) -> None:
+    """Fewer channels than sensors, a second of one sample, and a rate that no converter has."""
+    path, written = tmp_path / "all.wav", STEPPED_FILE_RATE
+    noise = np.random.default_rng(0).uniform(-0.5, 0.5, (written, channels)).astype(np.float32)
+    wavfile.write(path, written, noise)
+    content = path.read_bytes().replace(
+        written.to_bytes(4, "little"), rate.to_bytes(4, "little"), 1
+    )
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_stepped(path, Desk(rig, FIXED))

@@ -1,4 +1,4 @@
-"""Errors of the driver layer.
+"""Errors of the driver layer, and the counters of a wire.
 
     DriverError
     ├── LinkError (ConnectionError)       the wire or the amplifier on it cannot be reached
@@ -8,11 +8,10 @@
     ├── FrameError                        bytes that are not a valid message; the amplifier's fault
     ├── CommandRefused                    refused by the amplifier or the guard
     │   └── Preempted                     not sent or not repeated: another request came first
+    │       └── Overtaken                 a set that gave way before any amplifier was to play it
     └── CommandError (ValueError)         an invalid request; the caller's fault
 
 Backends translate exceptions of their libraries into these and keep the cause.
-
-Counters of a wire.
 """
 
 import re

@@ -1,24 +1,17 @@
-"""What channels are to play, and what they play at a time.
+"""Tones and layers of an amplifier, and what its channels play at a time.
 
-Voices of one channel: the tones that it plays at once, in any layers, until they have faded.
+The host states `AmplifierLayer`s in physical units; the ledger (`drivers.host.ledger`) checks them
+and rounds them to the integers of the wire. `Playback` is a pure function of these sets and their
+commits. A channel plays the sum of its voices, each one tone of one layer until it has faded:
 
-    Voice: Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its last transition, in full levels
+    Im[A(t) exp(2 pi i n clock(t) / 2^32)], A(t) along its transition, in full levels
 
-Its angle is that of the amplifier's clock (`drivers.protocol.definition`), n its frequency word:
-it does not depend on when it began. Amplitudes are complex, in full levels; times [s] are of any
-one clock. Plain loops and few calls: every set is played by host and far end.
+The angle is that of the amplifier's clock (`drivers.protocol.definition`), with n the frequency
+word: it does not depend on when the voice began. The simulated amplifier takes samples from it, the
+ledger the worst case, witness and conformance checks what to expect.
 
-What the layers of an amplifier are to play: tones in physical units, and layers of them.
-
-The ledger of an amplifier (`drivers.host.ledger`) checks them and makes the integers of the wire.
-Envelopes are in these from the start: all knots of a set are made at once.
-
-What the channels of an amplifier play at a time: a pure function of sets and their commits.
-
-A channel plays the sum of its voices (`drivers.playing`), in a few layers. A simulated
-amplifier asks this for samples, the ledger for the worst case, witness and conformance for what to
-expect. Times [s] are of any one clock and never go back; levels and frequencies are of protocol 4.
-Plain loops and few calls: every set is played by host and far end.
+Amplitudes are complex, in full levels; times [s] are of any one clock and never go back. Loops are
+plain and calls few, since host and far end play every set.
 """
 
 import cmath

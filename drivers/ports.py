@@ -1,19 +1,9 @@
-"""What carries bytes: serial ports of this machine, and TCP connections.
+"""Ports: serial devices of this machine and TCP connections that carry the bytes of a line.
 
-The ports that wires take from the machine, replaceable for tests in virtual time.
-
-Frames, retries and timeouts are the same whoever opens a port. TCP connections belong to the event
-loop.
-
-An open device as a port: read by the event loop, or by a thread where it cannot be watched.
-
-TCP connections as ports: of Modbus, of serial servers and of CAN adapters behind one.
-
-Opening of what carries bytes: serial ports and USB adapters of this machine, and TCP ports.
-
-A serial port never blocks the event loop. A frame that it does not take at once follows as soon as
-it takes it, unless a newer frame replaces the rest of it: what the line delivers late must not
-delay a stop.
+The event loop reads a device that it can watch, a thread any other. A serial port never blocks the
+loop: what it does not take at once follows as soon as it does, unless a newer frame replaces it,
+since bytes that the line delivers late must not delay a stop. `PORT_OPENER` replaces serial ports,
+as by a simulation in virtual time.
 """
 
 import asyncio

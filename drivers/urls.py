@@ -1,8 +1,7 @@
-"""URLs of amplifiers, taken apart: SCHEME://PLACE?NAME=VALUE&...#NUMBER.
+"""URLs of amplifiers: their parts, and how closely a clock is held over the line that they name.
 
-Kinds of lines between a host and amplifiers, and how closely clocks are held over each.
-
-They have the names of the lines that are simulated (`sim.transport.simulated_line`).
+A URL is SCHEME://PLACE?NAME=VALUE&...#NUMBER. Each wire (`drivers.wires`) takes the parts that it
+has. The kinds of lines have the names of the simulated ones (`sim.transport.simulated_line`).
 """
 
 import re

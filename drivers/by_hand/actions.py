@@ -1,13 +1,12 @@
-"""Actions of `era amp` on one amplifier; each returns the rows of its result.
-
-A synchronous amplifier for scripts.
+"""One amplifier by hand: the actions of `era amp`, and `BlockingAmplifier` for scripts.
 
     with BlockingAmplifier("serial:///dev/ttyUSB0", limits=GuardLimits(40, 500, 0.5)) as amplifier:
         amplifier.arm()
         tone = AmplifierTone(channel=0, frequency=110, level=0.2)
         amplifier.play([AmplifierLayer(0, (tone,))], duration=0.5)
 
-Only `play` and `measure`, while they wait, and `heartbeat` feed the watchdog: a script that hangs
+Each action returns the rows of its result, with units in the names of keys. Only `play` and
+`measure`, while they wait, and `heartbeat` feed the watchdog: the amplifier of a script that hangs
 falls silent.
 """
 

@@ -6,14 +6,11 @@ import sys
 from collections.abc import Coroutine
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from drivers.errors import CommandError, CommandRefused, DriverError, FrameError, LinkError
-
-if TYPE_CHECKING:
-    pass
 
 _T = TypeVar("_T")
 

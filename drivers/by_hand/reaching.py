@@ -1,15 +1,9 @@
-"""The amplifier at a URL, for one action; what its wire carries; values of messages as rows.
+"""Amplifiers by URL: reaching one, discovering all, and checking those of a configuration.
 
-Rows are in units, with the unit in the name of each key.
-
-Ports and interfaces of this machine at which amplifiers may be; CAN adapters on serial ports.
-
-Nothing is sent to them, but for `with_slcan`: devices receive two characters, V and CR, and an
-adapter is opened in listen-only mode, so nothing is sent on the bus.
-
-A rig's amplifiers by their URLs alone, for `era config check`: what is wrong, how they connect.
-
-Nothing is opened. A daemon counts how closely clocks are held by what it sees on the lines.
+Discovery lists the serial ports and CAN interfaces of this machine. It sends nothing before it
+probes, but for `with_slcan`: that sends V and CR to serial ports and opens CAN adapters in
+listen-only mode, so that nothing is sent on their bus. The checks of a configuration open nothing.
+Messages become rows for reading, with units in the names of keys.
 """
 
 import asyncio
@@ -210,7 +204,7 @@ def candidates() -> list[Candidate]:
 def with_slcan(candidate: Candidate) -> Candidate:
     """Turn a serial port into a CAN adapter if it replies as one.
 
-    Blocks; see `drivers.by_hand.reaching` for what is sent. Its amplifiers are not identified.
+    Blocks; the module describes what is sent. Its amplifiers are not identified.
     """
     if not candidate.is_serial:
         return candidate

@@ -1,8 +1,7 @@
-"""One amplifier of protocol 4, whatever its wire: who it is, and its requests.
+"""One amplifier of protocol 4 on any wire: its identity, its requests and its measurements.
 
-What an amplifier measures: its channels, and tones at its sensors.
-
-Nothing here needs a session, feeds the watchdog, or changes what plays.
+`Amplifier` identifies, arms, silences, disarms and stops it. Measurements, of its channels and of
+tones at its sensors, need no session, do not feed the watchdog and do not change what plays.
 """
 
 import asyncio
@@ -496,7 +495,8 @@ async def start_reading(
     check_tones(frequencies, window)
     number = random.randint(_Q["reading"].minimum, _Q["reading"].maximum)  # noqa: S311  no secret
     values: Values = {
-        **{"reading": number, "window": _Q["window"].to_wire(window)},
+        "reading": number,
+        "window": _Q["window"].to_wire(window),
         "tones": len(frequencies),
         "frequencies": [_Q["frequency"].to_wire(each) for each in frequencies],
     }

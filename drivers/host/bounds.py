@@ -1,15 +1,14 @@
-"""What a set may lead to at the worst: level, power and rise of a channel over all its layers.
+"""Limits of one amplifier, and how close a set may come to them at the worst.
 
-A set plays from an unknown moment in the next tenth of a second: the voices are those of
-`drivers.playing` after a commit that is that uncertain. Along a straight line in the complex
-plane a magnitude is a convex function of the way, so that sums are largest where each transition
-is at one of its points.
+`wire_limits` combines the limits of rig, amplifier, channels and ceilings to the least of each.
+`Rounding` turns layers into integers of the wire: levels, frequencies and phases to the nearest
+step, ramps upward, and `valid_for` never to 0, which means without end. It refuses what the wire
+cannot have or the limits forbid. `Budget` keeps rate, on-time and duty.
 
-What a set may contain: limits in force, layers as the wire rounds them, and limits over time.
-
-Limits are the least of rig, amplifier, channels and ceilings. Levels, frequencies and phases are
-rounded to the nearest step, ramps upward, and `valid_for` never to 0, which means without end; what
-the wire cannot have, or limits forbid, is refused. Envelopes come in integers of the wire.
+`Bounds` gives the largest level, power and rise over all layers. A set plays from an unknown moment
+in the next tenth of a second: the voices are those of `drivers.playing` after a commit that is that
+uncertain. Along a straight line in the complex plane a magnitude is a convex function, so sums are
+largest where each transition is at one of its points.
 """
 
 import math

@@ -1,23 +1,20 @@
-"""The clock of an amplifier as its host sees it, and how the host holds it to its own.
+"""The clock of one amplifier: how the host reads and steers it, and what its statuses report.
 
-Each Status is a reading, of a moment between the last bit of its request and the first of its
-reply. USB frames, other traffic and operating systems add to the time of the bits and never take
-from it, so a reading less the soonest arrival of its request is the lead of the clock or more, and
-the lowest ones are nearly right; the way back, with its latency timers and the waking of this
-process, does not count. Of each part of the time that was read, at most a quarter of a second, the
-lowest is kept, and a line is laid by least squares through the lower half of these: the lowest
-alone are the nearest where frames add, their mean where the operating system does. The one above
-these tells how late they may be. Shift and rate of the host are taken off before, so that steering
-feeds nothing back into what is measured.
+A Status reads the clock between the last bit of its request and the first of its reply. USB frames,
+other traffic and operating systems add to the time of the bits and never take from it, so a reading
+less the soonest arrival of its request is at least the lead of the clock, and the lowest readings
+are nearly right. The way back, with its latency timers, does not count. Of each part of the time
+that was read, at most a quarter of a second, the lowest reading is kept, and a line is fitted by
+least squares to the lower half of these: the lowest alone are best where frames add to the time,
+their mean where the operating system does. Readings above the line show how late they may be. Shift
+and rate of the host are taken off before, so that steering does not feed back into the measurement.
 
-The shift goes with Arm, to the nearest step of 305 us; the rate with each Ping, which undoes the
-crystal's and leads the rest to zero: soon while nothing plays, else within what is not felt. A
-clock that cannot be steered or is not to be trusted has an infinite error, and stops nothing.
+The shift goes with Arm, to the nearest step of 305 us. The rate goes with each Ping: it cancels the
+crystal's and leads the rest to zero, fast while nothing plays, else too slowly to be felt. A clock
+that cannot be steered or trusted has an infinite error, and stops nothing.
 
-Clocks of one line keep the same byte of a Mark, whatever delays it: what they differ by is known to
-what they state. One is held to the host's, and the others to it.
-
-What an amplifier reports of itself, for its user, and what contradicts its requests.
+A Mark lets all clocks of a line keep the same byte, whatever delays it, so their differences are
+known as exactly as they state them. One clock is held to the host's, the others to that one.
 """
 
 import math

@@ -1,11 +1,9 @@
-"""What one amplifier was sent and has replied: sets, ledger, watchdog, latch, contradictions.
+"""The exchanges with one amplifier: what it was sent, what it replied, and until when it may play.
 
-Until when an amplifier may play: when its watchdog was fed, and what confirms its silence.
-
-Moments at which sets start, as a Commit names them to the clocks of several amplifiers.
-
-A clock that is steered shows the host's time. One that is not has its own, by its readings: the
-word that names a moment to it is another, and what has passed for others may be ahead for it.
+`Dialogue` keeps session, latch, status and ledger of the amplifier, and raises CommandRefused once
+its replies contradict its requests. `Feeding` counts its watchdog: when it was fed, and when it
+must have silenced the amplifier. At the end, the words of the clocks of several amplifiers for one
+moment: a steered clock shows the host's time, another one its own, by its readings.
 """
 
 import asyncio

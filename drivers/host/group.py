@@ -1,11 +1,11 @@
-"""All amplifiers of a plate: they play together or not at all.
+"""All amplifiers of a plate: they play together or not at all, and their watchdogs are fed here.
 
-Who of a group is fed, when and by what: the only place that decides it.
+`Group` is the state of all amplifiers: a failure of one stops all, and nothing arms by itself.
 
-A watchdog that runs down, and starts anew with each heartbeat, shows that it would silence its
-amplifier: so its status is read just before it is fed, five times a second, and less often on a
-slow wire or where replies come late. On a line whose replies come late each exchange may take a
-third of a watchdog: there all are fed ahead of what is sent to one.
+`Heartbeats` alone decides which amplifier is fed, when and by what. A status read just before a
+heartbeat shows that the watchdog runs down, and so would silence its amplifier: this is read five
+times a second, less often on a slow wire or where replies come late. Where late replies let one
+exchange take a third of a watchdog, all amplifiers of a line are fed ahead of a request to one.
 """
 
 import asyncio

@@ -1,20 +1,18 @@
-"""What amplifiers play together: a set is staged on all that it names, then committed on them.
+"""Sets that several amplifiers play together, the amplifiers of a group, and their clocks.
 
-At one moment on all, or on none: by one broadcast on a line that they share, on several lines for a
-moment that is ahead for the slowest. On one amplifier it plays with its last part. A token is newer
-than another by less than half of 2^16 (RFC 1982): an amplifier that was left out of 40 000 sets
-would take the next one for an older one. It commits an empty one before.
+A set is staged on all amplifiers that it names, then committed at one moment on all or on none: by
+one broadcast on a line that they share, on several lines for a moment that is ahead for the
+slowest. On one amplifier it plays with its last part. A token is newer than another by less than
+half of 2^16 (RFC 1982), so an amplifier that was left out of 40 000 sets would take the next one
+for an older one: it commits an empty set before.
 
-The amplifiers of a group: which reply, which are lost, which of several errors counts.
+`Members` tells which amplifiers reply and which are lost, and which of several errors counts. Stops
+and disarms begin at once and go on to their end.
 
-Their stops and disarms are begun at once, and go on to their end.
-
-The clocks of all amplifiers of a plate: how well they agree, and what more is read of them.
-
-Where heartbeats alone do not show clocks well enough, on USB of full speed or in a busy network,
-statuses are read between them, the seldomer the better these are known, and given up for whatever
-is sent next. On a line that several share one Mark lets all keep the clock of the same byte, so
-that what delays it is common to all of them.
+`Clocks` compares the clocks of all amplifiers. Where heartbeats do not show them well enough, as on
+full-speed USB or in a busy network, it reads statuses between them, less often the better a clock
+is known; any other request preempts these. On a line that several amplifiers share a Mark lets all
+clocks keep the same byte.
 """
 
 import asyncio

@@ -1,8 +1,9 @@
-"""What one amplifier was sent and may play: the only maker of the sets that go over its wire.
+"""The ledger of one amplifier: what it was sent and may play.
 
-A set is checked when its turn on the line has come, as the wire rounds it, against what plays then
-over the sum of all layers. What was sent and is not confirmed is one doubt: until it is resolved
-only silence is admitted. Times [s] are of any one clock.
+It is the only maker of the sets that go over the wire. A set is checked when its turn on the line
+has come, as the wire rounds it, against what plays then over the sum of all layers. A set that was
+sent and is not confirmed is a doubt: until that is resolved only silence is admitted. Times [s] are
+of any one clock.
 """
 
 import logging

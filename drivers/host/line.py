@@ -1,17 +1,10 @@
-"""One physical line: requests of all amplifiers on it, one at a time, by priority.
+"""One physical line: the requests of all amplifiers on it, one at a time, by priority.
 
-The pump is a function, called by whoever submits, receives or is the timer; nothing waits for a
-turn in a task of its own. A request is made when its turn has come, so that it is checked once,
-against what really went out before. The parts of a set go out without a pause, and the last alone
-is replied to, and repeated. Times [s] are of the event loop's clock.
-
-What requests of an amplifier fail with, in words: the cause, and what to do.
-
-Requests that wait for a line, and commits that wait for other lines.
-
-Which one is sent next, and which are superseded. Commits of several lines arrive at one moment,
-whatever the speeds of the lines and what keeps them; the remaining skew is that with which the
-operating system sends bytes. Times [s] are of the event loop's clock.
+The pump is a function, called on each submission, arrival and timer; no request waits in a task of
+its own. A request is made when its turn has come, so that it is checked once, against what really
+went out before. The parts of a set go out without a pause; only the last has a reply, and is
+repeated. Stop-class requests preempt and supersede all others. Times [s] are of the event loop's
+clock.
 """
 
 import asyncio

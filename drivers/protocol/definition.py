@@ -1,14 +1,10 @@
-"""Protocol 4 as data: quantities, messages and sets, each once, for every wire and both ends.
+"""Protocol 4 as data: quantities, messages, clock and times, each once, for every wire and end.
 
-`records` turns the messages into 16-bit words and back; a wire adds its frame. The numbers of
-states, faults and refusals, and the times of the contract, stand here too. What the messages mean
+`records` turns messages into 16-bit words and back; a wire adds its frame. What the messages mean
 is written in docs/decisions/0088-protocol-4.md.
 
-The clock of an amplifier as integers of the wire: 32 bits that go round once in 20 s.
-
-A voice of frequency word n has the angle n times clock modulo 2^32, in turns of 2^-32.
-
-Shortest watchdog and time to detect a loss on a wire, by arithmetic; times in s.
+The clock of an amplifier has 32 bits, which go round once in 20 s. A voice of frequency word n has
+the angle n times clock modulo 2^32, in turns of 2^-32. Times are in s.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -57,8 +53,14 @@ STATES: Mapping[str, int] = {
     name: number
     for number, name in enumerate(
         (
-            *("NOT_READY", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON"),
-            *("OPERATION_ENABLED", "QUICK_STOP_ACTIVE", "FAULT_REACTION_ACTIVE", "FAULT"),
+            "NOT_READY",
+            "SWITCH_ON_DISABLED",
+            "READY_TO_SWITCH_ON",
+            "SWITCHED_ON",
+            "OPERATION_ENABLED",
+            "QUICK_STOP_ACTIVE",
+            "FAULT_REACTION_ACTIVE",
+            "FAULT",
         )
     )
 }
@@ -72,8 +74,15 @@ FAULTS: Mapping[str, int] = {
     name: number
     for number, name in enumerate(
         (
-            *("NONE", "WATCHDOG", "OVER_TEMPERATURE", "OVER_VOLTAGE", "ARC", "CHANNEL"),
-            *("INTERNAL", "INTERLOCK", "OVER_CURRENT"),
+            "NONE",
+            "WATCHDOG",
+            "OVER_TEMPERATURE",
+            "OVER_VOLTAGE",
+            "ARC",
+            "CHANNEL",
+            "INTERNAL",
+            "INTERLOCK",
+            "OVER_CURRENT",
         )
     )
 }
@@ -92,7 +101,11 @@ REFUSALS: Mapping[str, int] = {
 }
 STATUS_FLAGS: Mapping[str, int] = {"high_voltage": 0, "interlock_open": 1, "limited": 2}
 SENSOR_UNITS: Mapping[str, int] = {
-    **{"ACCELERATION": 1, "VELOCITY": 2, "DISPLACEMENT": 3, "FORCE": 4, "VOLTAGE": 5},
+    "ACCELERATION": 1,
+    "VELOCITY": 2,
+    "DISPLACEMENT": 3,
+    "FORCE": 4,
+    "VOLTAGE": 5,
 }
 """m/s², m/s, m, N and V, of the range and of the amplitudes of a sensor."""
 READING_STATES: Mapping[str, int] = {"NONE": 0, "RUNNING": 1, "COMPLETE": 2, "DISTURBED": 3}
@@ -100,8 +113,14 @@ READING_STATES: Mapping[str, int] = {"NONE": 0, "RUNNING": 1, "COMPLETE": 2, "DI
 UNKNOWN_PLACE: Final = 0xFFFF
 """Coordinate of a sensor whose place the amplifier does not know."""
 FEATURES: Mapping[str, int] = {
-    **{"output": 0, "events": 1, "levels_measured": 2, "interlock": 3},
-    **{"electrical": 4, "sensors": 5, "address": 6, "mark": 7},
+    "output": 0,
+    "events": 1,
+    "levels_measured": 2,
+    "interlock": 3,
+    "electrical": 4,
+    "sensors": 5,
+    "address": 6,
+    "mark": 7,
 }
 """Bits; output: full level is a linear amplifier's full output, else the stroke of a motion."""
 
@@ -297,7 +316,10 @@ _MESSAGES = (
         feeds=True,
     ),
     Message(
-        *("Commit", 6, Record(*_numbers("session", "token", "at")), STATUS),
+        "Commit",
+        6,
+        Record(*_numbers("session", "token", "at")),
+        STATUS,
         is_broadcast=True,
         feeds=True,
     ),
@@ -308,19 +330,28 @@ _MESSAGES = (
     Message("Clear", 11, Record(*_numbers("latch")), STATUS),
     Message("Ping", 12, Record(*_numbers("session", "rate")), STATUS, feeds=True),
     Message(
-        *("GetAchieved", 13, Record(*_numbers("layer"))),
+        "GetAchieved",
+        13,
+        Record(*_numbers("layer")),
         Record(*_numbers("token:played_token"), *LAYER.fields, Rows("commands", "count", COMMAND)),
     ),
     Message(
-        *("GetMeasured", 14, Record()),
+        "GetMeasured",
+        14,
+        Record(),
         Record(*_numbers("count"), Rows("channels", "count", _MEASURED)),
     ),
     Message(
-        *("SetAddress", 15, Record(*_numbers("address"), Text("serial_number")), STATUS),
+        "SetAddress",
+        15,
+        Record(*_numbers("address"), Text("serial_number")),
+        STATUS,
         is_broadcast=True,
     ),
     Message(
-        *("GetSensors", 16, Record(*_numbers("first:sensor"))),
+        "GetSensors",
+        16,
+        Record(*_numbers("first:sensor")),
         Record(*_numbers("all:count", "count"), Rows("sensors", "count", _SENSOR)),
     ),
     Message(

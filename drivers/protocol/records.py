@@ -24,13 +24,22 @@ _REAL_MAX = (2 - 2**-23) * 2.0**127  # of IEEE 754 binary32
 _TOLERANCE = 1e-3  # of a step; sums of floats may exceed a range by rounding
 
 UNITS: Mapping[str, tuple[str, str]] = {
-    **{"": ("", ""), "of full level": ("", ""), "full levels/s": ("_per_s", "_per_second")},
-    **{"Hz": ("_hz", "_hertz"), "s": ("_s", "_seconds"), "degrees": ("_deg", "_degrees")},
-    **{"m": ("_m", "_meters"), "V": ("_v", "_volts"), "°C": ("_c", "_celsius")},
-    **{"A": ("_a", "_amperes"), "mA": ("_ma", "_milliamperes"), "W": ("_w", "_watts")},
-    **{"%": ("_percent", "_percent"), "rpm": ("_rpm", "_rpm")},
+    "": ("", ""),
+    "of full level": ("", ""),
+    "full levels/s": ("_per_s", "_per_second"),
+    "Hz": ("_hz", "_hertz"),
+    "s": ("_s", "_seconds"),
+    "degrees": ("_deg", "_degrees"),
+    "m": ("_m", "_meters"),
+    "V": ("_v", "_volts"),
+    "°C": ("_c", "_celsius"),
+    "A": ("_a", "_amperes"),
+    "mA": ("_ma", "_milliamperes"),
+    "W": ("_w", "_watts"),
+    "%": ("_percent", "_percent"),
+    "rpm": ("_rpm", "_rpm"),
 }
-"""Of quantities, with the ends of the keys and of the metrics of values in them."""
+"""Units of quantities, with the suffixes of their keys in JSON and of their metrics."""
 
 Values = dict[str, Any]
 View = Literal["status", "page"]

@@ -1,9 +1,8 @@
-"""Sets: what layers are to play, as a stream of words that is cut into parts, and their tokens.
+"""Sets as streams of words: their layers, parts and tokens, and what an amplifier achieves of them.
 
-All numbers are integers of the wire. A stream has the layers that a set changes one after the
-other; a part is the values of one Set message. The far end collects parts in an `Assembly`.
-
-What a layer plays by a GetAchieved, compared with what it must play: steps and shares.
+All numbers are integers of the wire. A stream has the layers that a set changes, one after the
+other; a part is the values of one Set message, and the far end collects parts in an `Assembly`.
+`achieved_problem` compares the reply to GetAchieved with what a layer must play.
 """
 
 import math
@@ -37,14 +36,18 @@ _COUNTS = 1 << _RENEW - _COUNT
 _CHANNELS, _Q = QUANTITIES["channel"].maximum + 1, QUANTITIES
 _LOW, _HIGH = _Q["phase"].minimum, _Q["phase"].maximum
 _WIDEST: Values = {
-    **{"layers": _Q["layer"].maximum + 1, "channels": _CHANNELS, "knots": _Q["knots"].maximum},
-    **{"ramp_max": _Q["ramp"].maximum, "envelope_step_min": _Q["envelope_step"].minimum},
+    "layers": _Q["layer"].maximum + 1,
+    "channels": _CHANNELS,
+    "knots": _Q["knots"].maximum,
+    "ramp_max": _Q["ramp"].maximum,
+    "envelope_step_min": _Q["envelope_step"].minimum,
     "envelope_step_max": _Q["envelope_step"].maximum,
     "limits": _CHANNELS
     * [
         {
-            **{"frequency_min": _Q["frequency"].minimum, "level_max": _Q["level"].maximum},
+            "frequency_min": _Q["frequency"].minimum,
             "frequency_max": _Q["frequency"].maximum,
+            "level_max": _Q["level"].maximum,
         }
     ],
 }

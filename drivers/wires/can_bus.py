@@ -1,19 +1,13 @@
-"""CAN buses: frames, the host's side, addresses and adapters.
+"""CAN buses: the host's side of the wire, its ports and URLs.
 
-The host's side of a CAN bus: frames of words, matched by node and sequence number.
-
-Its bytes are packed frames (`drivers.wires.can_frames`), for a port that takes frames.
-
-An open bus of python-can as a port of packed frames.
-
-CAN buses by URL: adapters of python-can, serial ones (LAWICEL's commands), socketcand servers.
-
-    can+socketcand://can0#NODE
+    can+socketcan://can0#NODE
     can+python-can://INTERFACE/CHANNEL?bitrate=500000#NODE
-    can+slcan:///dev/ttyACM0?bitrate=500000#NODE, or on HOST:PORT
+    can+slcan:///dev/ttyACM0?bitrate=500000#NODE     or on HOST:PORT; LAWICEL's commands
     can+socketcand://HOST:PORT/can0#NODE
 
-Frames come and go packed: see `drivers.wires.can_frames`.
+Requests are frames of words, matched by node and sequence number. Ports carry packed frames
+(`drivers.wires.can_frames`): `BusPort` those of python-can, `TextPort` those of slcan and
+socketcand.
 """
 
 import asyncio

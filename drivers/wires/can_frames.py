@@ -1,12 +1,9 @@
-"""Frames on a CAN bus, and the numbers of CANopen (CiA 301) that amplifiers and hosts agree on.
+"""CAN frames without I/O: protocol 4 in frames of eight bytes, and frames as text of adapters.
 
-Messages of protocol 4 as CAN frames of eight bytes, and back; no I/O.
-
-Byte 0 is the sequence number, 0 in broadcasts and events; byte 1 the index of the frame. Frame 0
-goes on with type, number of words and two words, the others with three words each, low byte first.
-Words that are not used are 0 and ignored.
-
-CAN frames as text: slcan lines of serial adapters, and elements of socketcand; no I/O.
+Byte 0 of a frame is the sequence number, 0 in broadcasts and events, byte 1 the index of the frame.
+Frame 0 continues with type, number of words and two words, the others with three words each, low
+byte first. Unused words are 0 and ignored. `CANOPEN` has the numbers of CANopen (CiA 301) that
+amplifiers and hosts agree on. Text is that of slcan adapters and socketcand servers.
 """
 
 import math
@@ -35,12 +32,18 @@ CANOPEN: Mapping[str, Any] = {
     "product_code": 1,
     "revision": 1,
     "cob_ids": {  # plus the node, except NMT
-        **{"nmt": 0x000, "emergency": 0x080, "sdo_answer": 0x580, "sdo_request": 0x600},
-        **{"heartbeat": 0x700},
+        "nmt": 0x000,
+        "emergency": 0x080,
+        "sdo_answer": 0x580,
+        "sdo_request": 0x600,
+        "heartbeat": 0x700,
     },
     "nmt": {
-        **{"start": 1, "stop": 2, "pre_operational": 128, "reset_node": 129},
-        **{"reset_communication": 130},
+        "start": 1,
+        "stop": 2,
+        "pre_operational": 128,
+        "reset_node": 129,
+        "reset_communication": 130,
     },
     "nmt_states": {"BOOT_UP": 0, "STOPPED": 4, "OPERATIONAL": 5, "PRE_OPERATIONAL": 127},
     "emergencies": {  # of each fault
@@ -55,9 +58,14 @@ CANOPEN: Mapping[str, Any] = {
         "OVER_CURRENT": {"code": 0x2310, "error_register": 0x03},  # continuous over-current
     },
     "objects": {
-        **{"device_type": 0x1000, "error_register": 0x1001, "emergency_cob_id": 0x1014},
-        **{"heartbeat_producer": 0x1017, "identity": 0x1018},
-        **{"texts": 0x2000, "capabilities": 0x2001, "status": 0x2002},
+        "device_type": 0x1000,
+        "error_register": 0x1001,
+        "emergency_cob_id": 0x1014,
+        "heartbeat_producer": 0x1017,
+        "identity": 0x1018,
+        "texts": 0x2000,
+        "capabilities": 0x2001,
+        "status": 0x2002,
     },
 }
 

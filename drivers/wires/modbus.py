@@ -1,12 +1,11 @@
-"""Modbus, RTU and TCP: frames, the host's side and addresses.
+"""Modbus RTU and TCP: the host's side of a wire, its RTU port, and URLs.
 
-The port of Modbus RTU, which keeps the line silent before each frame.
+    modbus+tcp://HOST:PORT/UNIT
+    modbus+rtu:///dev/ttyS1?baud=115200#UNIT
 
-The host's side of Modbus, RTU and TCP: a message is written, then its reply is read.
-
-modbus+tcp://HOST:PORT/UNIT and modbus+rtu:///dev/ttyS1?baud=115200#UNIT. Responses are matched by
-the transaction number over TCP, by unit, function and length over RTU, and by the tag. RTU goes
-over a port that keeps the line silent before each frame.
+A message is written, then its reply is read. Responses are matched by the transaction number over
+TCP, by unit, function and length over RTU, and by the tag. `SilentPort` keeps an RTU line silent
+before each frame.
 """
 
 import asyncio

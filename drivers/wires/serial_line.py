@@ -1,8 +1,7 @@
-"""Serial lines: frames, the host's side and addresses.
+"""Serial lines: frames of words, matched by address and sequence number, and their URLs.
 
-The host's side of a serial line: frames of words, matched by address and sequence number.
-
-serial:///dev/ttyUSB0?baud=921600&address=1, or on a server serial+tcp://HOST:PORT.
+serial:///dev/ttyUSB0?baud=921600&address=1
+serial+tcp://HOST:PORT?baud=921600&address=1     a serial server with raw TCP
 """
 
 import random

@@ -1,9 +1,8 @@
-"""A kind of wire without I/O: requests of a host as bytes, and received bytes as what came.
+"""A kind of wire without I/O: requests of a host as bytes, and received bytes as arrivals.
 
-A wire carries one request at a time. What arrives is matched by it: a reply to an earlier request
-is counted as unexpected, and damaged bytes as invalid.
-
-What the URL of an amplifier says, whatever its wire, and ports that change or delay bytes.
+A wire carries one request at a time and matches what arrives with it: a reply to an earlier request
+counts as unexpected, damaged bytes as invalid. `WireAddress` is an amplifier's URL on a kind of
+wire, `PortAbove` a port that changes or delays the bytes of another one.
 """
 
 from abc import ABC, abstractmethod

@@ -20,10 +20,10 @@ from era_haptics.packages import check_packages, drop_foreign_backend
 check_packages()
 drop_foreign_backend()
 
-_IMPORT = re.compile(r"^from (\S+) import (\w+)", re.MULTILINE)
+_IMPORT = re.compile(r"^from (\S+) import (\w+(?:, \w+)*)", re.MULTILINE)
 _NAME = re.compile(r"^from \S+ import (\w+) as (\w+)$|^(\w+) = (\w+)$", re.MULTILINE)
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_MODULES = {own: module for module, own in _IMPORT.findall(_STUB)}
+_MODULES = {own: module for module, names in _IMPORT.findall(_STUB) for own in names.split(", ")}
 _OWN = {name or alias: own or known for own, name, alias, known in _NAME.findall(_STUB)}
 _HOMES = {name: (_MODULES[own], own) for name, own in _OWN.items()}
 """The module that defines each name, and the name that it has there."""

@@ -21,9 +21,7 @@ from era_haptics.plates import draw_contents as draw_contents
 from era_haptics.plates import draw_contrast_map as draw_contrast_map
 from era_haptics.plates import draw_map as draw_map
 from era_haptics.plates import draw_playback as draw_playback
-from era_haptics.rigs import Era as Era
-from era_haptics.rigs import Exciter as Exciter
-from era_haptics.rigs import Plate as Plate
+from era_haptics.rigs import EraKeys, ExciterKeys, PlateKeys
 from era_haptics.rigs import calibrate as calibrate
 from era_haptics.rigs import commands_for as commands_for
 from era_haptics.rigs import open_amplifier as open_amplifier
@@ -62,6 +60,9 @@ from sim.plant.excited_plate import PlatePlayback
 from sim.plant.excited_plate import Vibration as Vibration
 from sim.plant.fingers import FingerRecord
 
+Era = EraKeys
+Exciter = ExciterKeys
+Plate = PlateKeys
 Playback = PlatePlayback
 Record = FingerRecord
 

@@ -1,9 +1,4 @@
-"""Plates, ERAs and exciters by the keys of a rig file.
-
-Amplifiers of a rig for scripts: opened by the rig's URLs and limits.
-
-Calibration of a rig by responses measured on it.
-"""
+"""Rigs for scripts: their parts by the keys of a rig file, their amplifiers, their calibration."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +19,7 @@ from model.rig.rig_writing import checked_keys
 from model.rig.sections import PlateSection
 
 
-class Plate(dict[str, Any]):
+class PlateKeys(dict[str, Any]):
     """A plate by the keys of `plate` in a rig file.
 
     `Plate(length="12 in", width="9 in", thickness=0.0015, material="aluminium")`. Raises
@@ -35,7 +30,7 @@ class Plate(dict[str, Any]):
         super().__init__(checked_keys("era.Plate", PlateSection, keys))
 
 
-class Era(dict[str, Any]):
+class EraKeys(dict[str, Any]):
     """An ERA by the keys below `eras` in a rig file.
 
     `Era(at=(0, 0), stiffness="17 kN/m", amplifier="main", channel=0)`. Raises ConfigError.
@@ -45,7 +40,7 @@ class Era(dict[str, Any]):
         super().__init__(checked_keys("era.Era", EraSection, keys))
 
 
-class Exciter(dict[str, Any]):
+class ExciterKeys(dict[str, Any]):
     """An exciter by the keys below `eras` in a rig file, of which `kind` is stated already.
 
     `Exciter(type="DAEX25CT-4", at=(0.1, 0.1), amplifier="card", channel=0)`. Raises ConfigError.

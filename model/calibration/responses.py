@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
-from model.files.csv_file import Column, Line, read_lines, write_columns
+from model.files.csv_file import Column, CsvLine, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
     DISPLACEMENT,
@@ -594,7 +594,7 @@ def are_places(sensors: Sequence[WiredSensor]) -> bool:
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 
 
-def _place(line: Line, before: Collection[str], plate: Plate) -> tuple[str, Point]:
+def _place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
     """Name and place of a sensor, which the ones before do not have; raises InputError."""
     name = line.cells["sensor"]
     if not name or name in before:
@@ -605,7 +605,7 @@ def _place(line: Line, before: Collection[str], plate: Plate) -> tuple[str, Poin
 
 
 def _sensor(
-    line: Line, before: Sequence[WiredSensor], plate: Plate, *, mass: float | None, moves: bool
+    line: CsvLine, before: Sequence[WiredSensor], plate: Plate, *, mass: float | None, moves: bool
 ) -> WiredSensor:
     place = line.place
     name, (x, y) = _place(line, [other.name for other in before], plate)

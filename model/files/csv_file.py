@@ -82,7 +82,7 @@ def as_frame(columns: Columns) -> Any:
 
 
 @dataclass(frozen=True)
-class Line:
+class CsvLine:
     """A line of a file: its file and number, for errors, and the text of each column.
 
     has_decimal_comma: whether a number may have a comma in place of a point; factors: on numbers of
@@ -151,7 +151,7 @@ def read_lines(
     *,
     optional: Sequence[str] = (),
     unnamed: Sequence[str] = (),
-) -> list[Line]:
+) -> list[CsvLine]:
     """Read a file whose first line names its columns, in any order.
 
     Columns are separated by commas, semicolons, tabs or spaces; but for commas a decimal comma is
@@ -209,7 +209,7 @@ def read_lines(
                     f"{len(row)}; the file is damaged"
                 )
             cells = dict(zip(header, map(str.strip, row), strict=True))
-            lines.append(Line(place, cells, has_decimal_comma, factors))
+            lines.append(CsvLine(place, cells, has_decimal_comma, factors))
     except csv.Error as error:
         raise InputError(
             f"{path}:{rows.line_num}: invalid CSV ({error}); check quotes and the end of the file"

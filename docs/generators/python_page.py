@@ -46,6 +46,7 @@ def _entries(names: str) -> Iterator[str]:
         name, _, members = entry.strip().partition(":")
         tree = _tree(getattr(era_haptics, name.strip("()")))
         if isinstance(tree, ast.ClassDef):
+            tree.name = name.strip("()")  # that of the API, whatever it is called in its module
             yield from [""] if place else []
             yield from _class(tree, members.replace(",", " ").split(), name.endswith("()"))
         elif isinstance(tree, Function):

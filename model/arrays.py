@@ -1,10 +1,8 @@
-"""Array types of signatures, the points of a lattice, and how near points are.
-
-Choices among scores that rounding cannot turn.
+"""Array types, points of a lattice, and choices among scores that rounding cannot turn.
 
 Scores that are equal in theory, as of two places that mirror each other, differ by rounding, which
-is another one on another processor. So scores within a small distance of the best count as equal to
-it, and the first of them is chosen.
+varies with the processor. So scores within a small distance of the best count as equal to it, and
+the first of them is chosen.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,7 +1,4 @@
-"""The folder of what is kept between runs: tables, and the compiled library of kernels.
-
-Versions of the code and of its numbers, which results carry.
-"""
+"""The cache folder of tables and compiled kernels, and the versions that results carry."""
 
 import hashlib
 from functools import cache

@@ -1,7 +1,4 @@
-"""The error class of the model.
-
-Checks of arguments of the Python API, whose callers may not use a type checker.
-"""
+"""The error class of the model, and checks of arguments by callers without a type checker."""
 
 import os
 from numbers import Integral, Real

@@ -1,4 +1,4 @@
-"""Finite elements: mesh, matrices, and direct solutions of the plate.
+"""The plate in finite elements: mesh, matrices, and natural modes.
 
 A structured mesh over the plate of Reissner-Mindlin rectangles: MITC4, the paper's, Q3 to Q5.
 
@@ -10,8 +10,6 @@ rectangle takes rotations by their mean along the strain. Narrow elements at a f
 boundary layer, as wide as the plate is thick, that limits elements of low order to linear
 convergence (Babuška and Li, Comput. Methods Appl. Mech. Engrg. 100 (1992) 249-273; Häggblad and
 Bathe, Int. J. Num. Meth. Eng. 30 (1990) 981-1011).
-
-The plate in finite elements: its matrices, and natural modes of them.
 """
 
 import math

@@ -1,8 +1,6 @@
-"""Tasks on processes of this machine, each with one thread for linear algebra.
+"""Parallel tasks with progress: on processes of this machine, or on workers of a Dask scheduler.
 
-How far long work is: the one way in which it is shown.
-
-Tasks on the workers of a Dask scheduler, which run the same code as this machine.
+Each process has one thread for linear algebra. Workers must run the same code as this machine.
 """
 
 import multiprocessing

@@ -1,7 +1,4 @@
-"""Formatting of quantities and shares.
-
-Numbers with their nouns: `1 cell`, `2 cells`.
-"""
+"""Formatting of quantities, shares, and numbers with their nouns."""
 
 import math
 

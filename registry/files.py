@@ -1,8 +1,7 @@
-"""Opening and reading files that a user names: only regular ones, bounded, without waiting.
+"""Files that a user names: only regular ones are opened, bounded, without waiting; and file locks.
 
-What only POSIX systems have: locks on files, and a sentence where its modules are missing.
-
-Wires, daemon, clients and gateway need it; the plate, its tables, answers and designs do not.
+Locks exist on POSIX systems only. Wires, daemon, clients and gateway need them; the plate, its
+tables, answers and designs do not, and a missing module is explained (`posix_needed`).
 """
 
 import errno

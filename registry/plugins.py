@@ -1,9 +1,8 @@
-"""Registries of this project's objects and of plug-ins of installed packages, by name.
+"""Registries of objects by name: this project's own, and plug-ins of installed packages.
 
 A plug-in is an entry point of a group. It is imported only when its name is looked up, so that a
-broken one affects nothing else. A name that several packages claim is refused.
-
-Suggestions for mistyped names.
+broken one affects nothing else. A name that several packages claim is refused. A name that is not
+known gets a suggestion.
 """
 
 import re

@@ -1,18 +1,13 @@
-"""Blocking work and event loops in daemon threads: no cancellation and no exit waits for them.
+"""Threads, event loops and time, where amplifiers must not wait.
 
-A program waits for the threads of asyncio's own pool before it ends, which may take indefinitely if
-a connection or a disk hangs.
+Blocking work runs in daemon threads, so that no cancellation and no exit waits for it: a program
+waits for the threads of asyncio's own pool before it ends, which may take indefinitely if a
+connection or a disk hangs. Garbage collections are kept short while amplifiers are armed: a full
+one visits every loaded object, 80 ms with the numerical and CAN libraries, and on a busy machine
+longer than an amplifier's watchdog. Pauses between retries grow.
 
-Avoidance of long garbage collections while amplifiers are armed.
-
-A full collection visits every loaded object: 80 ms with the numerical and CAN libraries, and on a
-busy machine longer than an amplifier's watchdog.
-
-Pauses before retries.
-
-The clock of links and far ends: that of the event loop.
-
-It is time.monotonic() on asyncio's own loops, and virtual time on a loop with a virtual clock.
+The clock of links and far ends is that of the event loop: time.monotonic() on asyncio's own loops,
+and virtual time on a loop with a virtual clock.
 """
 
 import _thread

@@ -1,4 +1,4 @@
-"""Wording of errors of libraries, like that of all others."""
+"""Errors of pydantic and typer in the words of all other errors."""
 
 from typing import TYPE_CHECKING
 

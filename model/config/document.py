@@ -1,11 +1,9 @@
-"""YAML files read strictly, with the line of every key.
+"""YAML files read strictly, with the line of every key, and written with other values.
 
 A file is UTF-8, at most 1 MiB and 50 000 values in 20 levels, one document with a mapping at the
 top, without anchors, aliases or tags, so that nothing expands or gets constructed; all this is
-checked before a value is made. No key is given twice. Words are text unless they are decimal
-numbers, true, false or null (core schema of YAML 1.2).
-
-Configuration files with new values in them, and new ones.
+checked before a value is made. Keys are unique. Words are text unless they are decimal numbers,
+true, false or null (core schema of YAML 1.2). A file that is edited keeps its comments and layout.
 """
 
 import errno

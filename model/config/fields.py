@@ -1,10 +1,8 @@
-"""Values with a unit, such as `12 in`, `1.5 mm` or `70 GPa`, and bare SI numbers.
+"""Values of users and their checks: quantities with units, sections of files, options, shapes.
 
-Sections of configuration files as pydantic models; all problems are reported at once.
-
-Positions, counts and frequency ranges as text of the command line.
-
-Shapes of regions on the plate, and how files state them.
+A quantity is a number with a unit, such as `12 in`, `1.5 mm` or `70 GPa`, or a bare SI number.
+Sections of configuration files are pydantic models, whose problems are all reported at once. The
+command line gives positions, counts and frequency ranges as text. Shapes are regions of the plate.
 """
 
 import math

@@ -1,9 +1,8 @@
-"""Arrays in an uncompressed .npz file, written atomically and checked before they are read.
+"""Files written whole or not at all: arrays in an uncompressed .npz, and checks of output paths.
 
-Names, types and sizes must be those expected; nothing may be compressed or pickled, and no array
-may declare more than the file holds.
-
-Checks of output paths: ending, folder, and what may be replaced.
+Arrays are checked before they are read: names, types and sizes must be those expected; nothing may
+be compressed or pickled, and no array may declare more than the file holds. Output paths are
+checked for their ending, their folder, and the kind of file that they would replace.
 """
 
 import glob

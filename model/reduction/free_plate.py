@@ -1,10 +1,11 @@
 """The free plate, solved once for all ERAs, fingers and masses that may be attached at points.
 
 Modes of the free plate up to twice the highest frequency come from one factorisation for each
-symmetry class; the contribution of the truncated modes (`model.reduction.free_plate`) takes a few
-more solves with the same factors for each point of attachment, cached. Solutions for points are
-then a low-rank correction (`model.structure.attachments`): for each frequency a system as small as
-their number, independent of the mesh.
+symmetry class; the contribution of the truncated modes takes a few more solves with the same
+factors for each point of attachment, cached. On a mesh of elements these are solved for on demand;
+in polynomials all modes of the deflection are known, and the sums over the truncated ones are taken
+as they stand. Solutions for points are then a low-rank correction (`model.structure.attachments`):
+for each frequency a system as small as their number, independent of the mesh.
 
 Receptance. Modes and truncated modes of one solution serve for every modulus, thickness and loss
 factor: with q = (1 + i eta) E h² / (E h²)_solved and modal masses that grow as h,
@@ -20,23 +21,16 @@ All stiffness of a plate is taken as E h³ and all its mass as h (laws of scale 
 for a thin plate; by shear, rotary inertia and the layer at its edges the response of the paper's
 plate then differs by 0.1 % for 2 % of thickness, and 0.3 % for 5 %.
 
-Contribution of the truncated modes to a receptance, from a few static solves.
-
-A truncated mode of eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)),
-z = omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) in its
+Truncated modes. One of eigenvalue lambda has the receptance 1 / ((1 + i eta)(lambda - z)), z =
+omega² / (1 + i eta). A static solve with the shift sigma gives u = 1 / (lambda + sigma) in its
 place, two solves u², and so on; all truncated modes have u within (0, u_c], u_c that of the lowest.
 So u / (1 - s u), s = z + sigma, is approximated on that interval by a polynomial in u without
 constant term. The optimum follows from Chebyshev's; its relative error for each mode is
 
     T_k(t(u)) / T_k(t(1 / s)),    t(u) = 2 u / u_c - 1,
 
-exactly. A Taylor series, the usual residual flexibility with its higher terms, gains a factor of
-1 / |s u_c| with each term; this polynomial about four times as much.
-
-Modes of the free plate, and its truncated ones at points: on a mesh, or in polynomials.
-
-On a mesh the truncated ones are solved for on demand. All modes of the polynomials of the
-deflection are known, so that the sums over the truncated ones are taken as they stand.
+exactly. A Taylor series, the usual residual flexibility with its higher terms, gains a factor of 1
+/ |s u_c| with each term; this polynomial about four times as much.
 """
 
 import math

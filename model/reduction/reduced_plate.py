@@ -13,27 +13,26 @@ mass, and one coordinate, the displacement x [m] of its phalanx: m_p x'' + c_j x
 force of the pulp, a spring and a damper between the plate and the phalanx. So does an exciter whose
 magnet is free: its spring and damper end at a mass.
 
-Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²),
-which no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of
-the plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
+Structural damping. The frequency domain uses a hysteretic stiffness (1 + i eta) diag(omega²), which
+no causal equation in time has. C_s is its viscous equivalent: in the modes psi_j, omega_j of the
+plate *on its ERAs*, C_s,jk = eta psi_j^T diag(omega²) psi_k / sqrt(omega_j omega_k), eta the
 geometric mean of those at omega_j and omega_k where it varies with frequency, and what soft layers,
-air and the springs of supports with a loss factor lose added to eta omega². That is
-positive semidefinite, and at every resonance of the supported plate it dissipates exactly the power
-of the hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy
-in the springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 %
-the steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate,
-40 to 500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
+air and the springs of supports with a loss factor lose added to eta omega². That is positive
+semidefinite, and at every resonance of the supported plate it dissipates exactly the power of the
+hysteretic one; a ratio eta/2 on the modes of the *free* plate would not, because the energy in the
+springs has no loss. Contacts do not change it. The two differ off resonance: with eta = 1 % the
+steady accelerations of the paper's plate differ by at most 0.5 % (relative L2 over the plate, 40 to
+500 Hz), in proportion to eta; deep nulls move a little, they are not filled.
 
 Its modes on its ERAs are those of the undamped plate. A damping ratio says how much of its energy
 such a mode loses, psi' C psi / (2 omega) at modal mass 1, to the plate's own losses and to the
 dampers of the ERAs; that dampers also couple the modes is left out here, not in the plate in time.
 
-Derivatives of fields of a plate by the places of the points where they are taken.
-
-Differences of second order, inwards at edges. Closed forms would be simple for polynomials, but a
-footprint that an edge cuts adds integrals along that edge, and the compliance of unresolved waves
-is fitted, with limits beside edges. Over this step differences are right to 1e-6 of the largest,
-and the rounding of another processor changes them by 3e-8.
+Slopes of fields by the places of the points where they are taken (`place_slopes`) are differences
+of second order, inwards at edges. Closed forms would be simple for polynomials, but a footprint
+that an edge cuts adds integrals along that edge, and the compliance of unresolved waves is fitted,
+with limits beside edges. Over this step differences are right to 1e-6 of the largest, and the
+rounding of another processor changes them by 3e-8.
 """
 
 from collections.abc import Callable, Sequence

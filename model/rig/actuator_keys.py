@@ -1,17 +1,12 @@
-"""Values of the keys of a rig file: names, places, rows of numbers, with their bounds.
+"""Actuators in a rig file: values of their keys, and a section for each kind.
 
-Keys that actuators of every kind have below `eras` in a rig file, and what each kind adds.
+A section makes the actuator that it states, and states one again. ERAs are the default kind.
 
-ERAs in a rig file: their keys, and the ERA that a section is.
-
-Exciters in a rig file: their keys, and the exciter that a section is.
-
-A data sheet's resonance is mostly that of the light coil against the magnet, `free`; glued to a
-plate the magnet moves, `mounted`. Of either and the mass that moves then follow stiffness and
-damping: k = m (2 pi f)², c = 2 pi f m / Q. The voltage at level 1 is the least of the amplifier's
-clip and of what heats the coil by its rated power, (R_e + R_g) sqrt(2 P / R_e).
-
-Kinds of actuators of a rig file, a row each.
+A data sheet's resonance of an exciter is mostly that of the light coil against the magnet, `free`;
+glued to a plate the magnet moves, `mounted`. Stiffness and damping follow from either and the mass
+that moves: k = m (2 pi f)², c = 2 pi f m / Q. The voltage at level 1 is the lower one of the
+amplifier's clip and of the voltage that heats the coil by its rated power, (R_e + R_g) sqrt(2 P /
+R_e).
 """
 
 import math

@@ -1,11 +1,9 @@
-"""A rig: a plate, its ERAs, the amplifier channel of each ERA; and what else must be the same.
+"""A rig: a plate, its ERAs, their amplifier channels, and how well all of them are known.
 
-How well a rig knows its plate, its ERAs, its amplifiers and the fingers on it.
-
-Layouts of ERAs by name.
-
-The drawings of the paper's layouts (its Figures 8 and 9) are not available, so these are our own.
-Places are fractions of the plate's length and width, so that a layout fits every plate.
+Also here: which parts of a rig must be the same for a table to hold (`physics_of`), and named
+layouts of ERAs. The drawings of the paper's layouts (its Figures 8 and 9) are not available, so
+these are our own; their places are fractions of the plate's sides, so that a layout fits every
+plate.
 """
 
 import hashlib

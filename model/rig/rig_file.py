@@ -1,10 +1,7 @@
-"""The text of a mesh, in a rig's and in a table's file.
+"""Reading a rig from its file: the text of its mesh, checks across its sections, and the rig.
 
-Conversion of the sections of a rig file to values of the model.
-
-Checks of a rig across its sections.
-
-Reading a rig from its file.
+A section checks and makes its own part (`model.rig.sections`). Problems between sections that are
+valid by themselves are found here, and all problems of a file are reported at once.
 """
 
 import math

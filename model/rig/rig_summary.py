@@ -1,11 +1,8 @@
-"""What the exciters of a rig can follow: from which frequency on, and what its file may mean.
+"""Summary of a rig, and warnings about its file.
 
-Numbers of a rig's plate and its exciters: materials, rigidity, bending wavelengths, types.
-
-Rig files as a kind of configuration of `era config`.
-
-Its amplifiers are checked by the package that knows wires. Warnings say what a rig does not know or
-leaves out.
+Numbers of its plate and exciters: materials, rigidity, bending wavelengths, types; frequencies that
+its exciters can follow. Rig files as a kind of configuration for `era config`; warnings say what a
+rig does not know or leaves out. Its amplifiers are checked by the package that knows wires.
 """
 
 import cmath

@@ -1,9 +1,8 @@
-"""Text of a rig file with other values of the rig and unchanged comments and layout.
+"""Rigs made, changed and written by the keys of a rig file.
 
-Rigs by the keys of a rig file that a program gives: made, changed, and written.
-
-A rig keeps the keys that it was made of, so that what follows from one follows its change: the
-damping of a ratio, a mesh that is chosen, the homogeneous plate that a laminate is like.
+A rig keeps the keys that it was made of, so that dependent values follow a change: the damping of a
+ratio, a mesh that is chosen, the homogeneous plate of a laminate. The text of a file with other
+values keeps its comments and layout.
 """
 
 import math

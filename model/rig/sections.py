@@ -1,6 +1,7 @@
-"""The sections of a rig file: keys, defaults and bounds.
+"""The sections of a rig file: keys with defaults and bounds, and what they make.
 
-Bounds are wide: they catch values in the wrong unit.
+A section that reads a part of a rig (`made`) also writes it (`stated`). Bounds are wide: they catch
+values in the wrong unit.
 """
 
 import math

@@ -1,16 +1,15 @@
-"""Response of a plate in polynomials solved at each frequency, without modes: the reference.
+"""Direct solution of a plate in polynomials at each frequency, and slopes of its stiffness.
 
-Nothing is approximated in frequency: adhesives, air and the inertia along the plate are those of
-the frequency at hand, and the compliance that polynomials do not resolve is added.
+The direct solution is the reference of the modal one: it approximates nothing in frequency.
+Adhesives, air and the inertia along the plate are those of the frequency at hand, and the
+compliance that polynomials do not resolve is added.
 
-How a plate's stiffness between given shapes changes with its sides and its Poisson's ratios.
-
+Slopes are those of the stiffness between given shapes with the plate's sides and Poisson's ratios.
 Displacements along the plate follow deflections by least energy: a change of stiffness dK then
 changes the energy of shapes v by v^T dK v, to first order without a solve of another plate. By a
-side it has a closed form (`class_stiffness`); by Poisson's ratio nu of a layer, which all layers
-have changed alike, by what a small change of it does to the section, in which K is linear.
-
-What the air behind a plate adds is left out, and how rotary inertia changes.
+side it has a closed form (`class_stiffness`); by Poisson's ratio nu, which changes alike in all
+layers, it follows from a small change of the section, in which K is linear. The stiffness that air
+adds, and changes of rotary inertia, are left out.
 """
 
 import math

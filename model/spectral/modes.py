@@ -1,41 +1,39 @@
-"""Modes of one symmetry class of a plate, of one layer or several, with the air behind it.
+"""Modes of a plate in Legendre polynomials, and the compliance that these do not resolve.
 
-Displacements along the plate follow the deflection (`stiffness.follow`): what vibrates is the
-deflection, and the air. Moduli that depend on the frequency or lose energy, and the friction of
-air, are taken for every mode at its own natural frequency: the complex mode is solved for in the
-space of the lowest modes of three real plates, whose moduli span those of the frequencies in
-question. Its imaginary eigenvalue is its loss; at other frequencies the mode keeps its shape, and
-has another eigenvalue. Modes beyond them are those of the plate at the middle frequency.
+The plate has one layer or several, with the air behind it, and is solved one symmetry class at a
+time. Displacements along the plate follow the deflection (`model.spectral.polynomials.follow`):
+only the deflection and the air vibrate. Moduli that depend on the frequency or lose energy, and the
+friction of air, are taken for every mode at its own natural frequency: the complex mode is solved
+for in the space of the lowest modes of three real plates, whose moduli span those of the
+frequencies in question. Its imaginary eigenvalue is its loss; at other frequencies the mode keeps
+its shape, and has another eigenvalue. Modes beyond them are those of the plate at the middle
+frequency. `SpectralMesh` chooses the degrees of the polynomials for a frequency.
 
-Degrees of the polynomials over the plate, chosen for a frequency.
-
-Compliance under a point force that polynomials of limited degree cannot represent.
-
-At a point, Legendre polynomials up to degree p resolve waves along x up to the wavenumber
-a = 2 (p - 0.9) / (L s), s = sqrt(1 - (2 x / L - 1)²), and b along y. Missing is the infinite
-plate's compliance in all shorter waves, the mean over all directions phi of
+At a point, Legendre polynomials up to degree p resolve waves along x up to the wavenumber a = 2 (p
+- 0.9) / (L s), s = sqrt(1 - (2 x / L - 1)²), and b along y. The compliance missing under a point
+force is the infinite plate's in all shorter waves, the mean over all directions phi of
 
     1 / (4 pi D k²) + ln(k_max / k) / (2 pi S),    k = min(a / |cos phi|, b / |sin phi|),
 
 D the flexural rigidity, of a board that towards phi, and S the shear rigidity. The square of a
-Legendre polynomial waves along the plate, and so does what is missing in all higher ones: at
-x = L (1 - cos t) / 2 there is 1 + o times as much in all waves that end at a, so that a is to be
-divided by sqrt(1 + o),
+Legendre polynomial oscillates along the plate, and so does the compliance missing in all higher
+ones: at x = L (1 - cos t) / 2 there is 1 + o times as much in all waves that end at a, so that a is
+to be divided by sqrt(1 + o),
 
     o = cos(2 (p - 1) t) / ((p - 1) sin t).
 
 It follows from P_n(cos t)² ~ (1 + sin((2 n + 1) t)) / (pi n sin t) for large n, summed with the
 weight n^-3 over n > p - 2, since the curvature of a polynomial of degree p has degree p - 2.
 
-At a free edge the compliance is larger. A wave that runs along the
-edge with wavenumber k, for a force at a distance d from it, has the closed form of a half-plane,
+At a free edge the compliance is larger. A wave that runs along the edge with wavenumber k, for a
+force at a distance d from it, has the closed form of a half-plane,
 
     1 + exp(-2 q) (F - 1 + G (q + q²)),    q = k d,
     F = 8 / ((1 - nu) (3 + nu)),    G = 2 (1 - nu) / (3 + nu),
 
-times the infinite plate's compliance, averaged here over all k above a or b. The shear part without
-limit is cut for a point at k_max = 1 / h: on a shorter scale a plate is no plate. A disc limits it
-itself.
+times the infinite plate's compliance, averaged here over all k above a or b. The shear part, which
+has no limit, is cut for a point at k_max = 1 / h: plate theory does not hold on a shorter scale. A
+disc limits it by itself.
 """
 
 import math

@@ -1,24 +1,23 @@
-"""Functions of one direction: Legendre polynomials, and boundary layers of a free edge.
+"""Functions of x and y over a plate, and its matrices in them, one symmetry class at a time.
 
-Everything is even or odd about the middle. Displacements along a free edge twist the layers of a
-plate against each other in boundary layers exp(-k x), which polynomials resolve only at very high
-degree: of one homogeneous layer, the rotations of Reissner and Mindlin, one as wide as it is
-thick, k = sqrt(10) / h. So there is one more function for each, exp(-k x) +- exp(-k (L - x)).
-Integrals are by Gauss's rule on pieces that shrink towards the edges.
+Functions of one direction are Legendre polynomials and boundary layers of a free edge, all of them
+even or odd about the middle. Displacements along a free edge twist the layers of a plate against
+each other in boundary layers exp(-k x), which polynomials resolve only at very high degree: in one
+homogeneous layer the rotations of Reissner and Mindlin have one as wide as it is thick, k =
+sqrt(10) / h. So there is one more function for each, exp(-k x) +- exp(-k (L - x)). Integrals are by
+Gauss's rule on pieces that shrink towards the edges.
 
-Stiffness and mass of a free plate of one layer or several in the functions of both directions.
-
-Unknowns of a symmetry class: the deflection w, in polynomials; then the displacements along the
+Unknowns of a symmetry class are the deflection w, in polynomials, and the displacements along the
 plate u_x and u_y of every interface between the layers, with boundary layers. u_x has the other
-parity along x, u_y along y. Energy, with the sections of `model.structure.plate` summed over the
-interfaces:
+parity along x, u_y along y. The energy, with the sections of `model.structure.plate` summed over
+the interfaces, is
 
     stretch (u_x,x u_x,x + u_y,y u_y,y) + 2 across u_x,x u_y,y + twist (u_x,y + u_y,x)²
     + slip (u_x² + u_y²) + 2 lever (u_x w,x + u_y w,y) + shear (w,x² + w,y²)
 
 with other stretch, slip, lever and shear along x than along y where a material has a grain.
 
-Air in a gap behind the plate, in the natural shapes of the pressure between its edges. Sealed
+Air in a gap behind the plate moves in the natural shapes of the pressure between its edges. Sealed
 edges hold the flow back, grad p is zero across them: cosines. At open edges p = 0: sines. The
 displacement of the air along the gap is a sum of a grad(psi) / k over these shapes psi of
 wavenumber k, orthonormal over the plate, and compresses it with the deflection w:

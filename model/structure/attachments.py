@@ -1,28 +1,23 @@
-"""What is attached to the plate at points: actuators (ERAs), masses, and fingertips.
+"""What is attached to the plate: actuators (ERAs), masses, feet, frames, and fingertips.
 
-All of it supports the plate with a dynamic stiffness; a source also drives it with a force. An ERA
-is a spring, a damper and a bolt between the plate and a base that moves. Pressed on the plate, a
-fingertip is a contact mass that moves with it, and a spring and a damper (the pulp) to the phalanx,
-which a joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the
-dynamic stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507. How well
-the values are known: docs/concepts/people.md.
+Each acts on the plate with a dynamic stiffness; a source also drives it with a force. The plate on
+its attachments is a low-rank correction of the free plate (Woodbury identity).
 
-The plate on its attachments is a low-rank correction of the free plate (Woodbury identity).
+An ERA is a spring, a damper and a bolt between the plate and a base that moves. A fingertip is a
+contact mass that moves with the plate, and a spring and a damper (the pulp) to the phalanx, which a
+joint holds. The phalanx is not at rest: at 60, 100 and 250 Hz the real part of the dynamic
+stiffness is 69, -87 and -358 N/m where a phalanx at rest gives 972, 921 and 507.
+docs/concepts/people.md says how well the values are known.
 
-Feet by their kind, and what acts along all edges of a plate, as points.
+A bonded frame or foam tape along the edges acts at Gauss-Legendre points of each edge with their
+weights: with n points the work in products of shapes up to degree 2 n - 1 is exact. As points they
+keep their mass and stiffness on a plate of any thickness. Each point is a small disc, since a point
+force dents a plate with shear deformation without limit, as the logarithm of its size.
 
-What acts along the edges, a bonded frame or foam tape, acts at Gauss-Legendre points of each edge
-with their weights: of n points the work in products of shapes up to degree 2 n - 1 is exact. As
-points they stay what they are on a plate of any thickness, which what is solved of it is not. Each
-is a small disc: a line does not dent the plate without limit, as a point does.
+Footprints are such discs, or points, at which attachments act. A force on a disc is spread evenly
+over the part of it that is on the plate, and the attachment follows the mean deflection there.
 
-Footprints: discs of the plate on which ERAs, masses and fingertips act, or points.
-
-A point force dents a plate with shear deformation without limit, as the logarithm of its size; a
-disc does not. A force on a disc is spread evenly over the part of it that is on the plate, and what
-it acts on follows the mean deflection of that part.
-
-Whether springs support a plate: whether they hold all of its rigid-body modes.
+Springs support a plate if they hold all of its rigid-body modes.
 """
 
 import cmath

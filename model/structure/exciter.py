@@ -15,8 +15,6 @@ moving mass of that sheet.
 
 Not modelled: stiffness and damping by amplitude, heat of the coil (0.39 % of R_e a kelvin), eddy
 currents, rocking of the magnet.
-
-Kinds of actuators that drive a plate.
 """
 
 import math

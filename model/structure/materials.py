@@ -1,16 +1,14 @@
-"""Materials by name, each with the source of its numbers and their variation.
+"""Catalogue of materials and of exciters by name, each value with its source.
 
-An installed package adds one by an entry point of the group `era_haptics.materials` that leads to
-a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
+An installed package adds a material by an entry point of the group `era_haptics.materials` that
+leads to a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
 
 Moduli of plywood are those of its veneers: E of the grain where it runs along, and none across it
 (Handbook of Finnish Plywood), so that in bending, with the cross veneers between heights a and b
 from the middle, E2 h³ = 8 E sum (b³ - a³) and E1 + E2 = E.
 
-Types of exciters that are sold: values of their sheets, each with its source.
-
-No maker's sheet could be opened: values are second hand, or assumed where no source gives any. A
-resonance is that of the light coil against the magnet (`free`). Measure one that you have.
+No maker's sheet of an exciter could be opened: values are second hand, or assumed where no source
+gives any. A resonance is that of the light coil against the magnet (`free`). Measure your own.
 """
 
 from collections.abc import Callable, Mapping

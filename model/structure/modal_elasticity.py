@@ -1,13 +1,13 @@
-"""Stiffness and loss of each mode of a free plate, where they were found to differ from its theory.
+"""Stiffness and loss of each mode of a free plate, and the scaling of a solution to other plates.
 
-A plate is made of nothing as homogeneous as its theory has it: laminate, seams, air and edges
-change the lowest modes each in its own way. So a plate may state by how much the eigenvalue and the
-loss factor of its lowest elastic modes differ (`Plate.mode_deviations`), and that its loss factor
-varies as a power of the frequency. Shapes stay those of the theory, and so do all higher modes.
+A real plate is less homogeneous than its theory: laminate, seams, air and edges change the lowest
+modes each in its own way. So a plate may state by how much the eigenvalue and the loss factor of
+its lowest elastic modes differ (`Plate.mode_deviations`), and that its loss factor varies as a
+power of the frequency. Shapes and higher modes remain those of the theory. Adhesives and air change
+the complex eigenvalues of modes with frequency: their dispersion.
 
-Adhesives and air change the complex eigenvalues of modes with frequency: their dispersion.
-
-What discretisations of a plate have in common: the shortest waves that they resolve.
+`Discretisation` is what meshes of elements and of polynomials have in common: the shortest waves
+that they resolve.
 """
 
 from abc import ABC, abstractmethod

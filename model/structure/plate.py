@@ -1,22 +1,19 @@
-"""The touch plate: its material or layers, its dimensions, and the air behind it.
+"""The touch plate: materials, layers, the air behind it, and how it bends.
 
-A laminate, such as cover glass on adhesive on a panel, layer by layer.
+From the ground up: a material, a sheet of it, a laminate, an air gap, the plate; then stiffness of
+a laminate's section, bending waves in it, and the homogeneous plate that is like it.
 
-Every layer bends, stretches and shears by itself; displacements along the plate are continuous
-from layer to layer and linear within each (a layerwise theory of first order: Reddy, Mechanics of
-Laminated Composite Plates and Shells, 2nd ed., ch. 12), the deflection is the same through the
-thickness. Soft adhesives between stiff layers then shear as in the theories of Kerwin (J. Acoust.
-Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound Vib. 10 (1969) 163), more the shorter the
-wave. With stiff adhesives it becomes classical laminate theory.
+Laminates, such as cover glass on adhesive on a panel. Every layer bends, stretches and shears by
+itself. Displacements along the plate are continuous from layer to layer and linear within each (a
+layerwise theory of first order: Reddy, Mechanics of Laminated Composite Plates and Shells, 2nd ed.,
+ch. 12); the deflection is the same through the thickness. Soft adhesives between stiff layers then
+shear as in the theories of Kerwin (J. Acoust. Soc. Am. 31 (1959) 952) and Mead and Markus (J. Sound
+Vib. 10 (1969) 163), more the shorter the wave. With stiff adhesives it becomes classical laminate
+theory. Layers may also be laid loosely (`Bond.NONE`) and slide on each other without friction.
+Bonded layers are solved as they are (`model.spectral.modes`), loose ones and a single one as the
+homogeneous plate, which also gives wavelengths, meshes and estimates.
 
-Layers may also be laid loosely (`Bond.NONE`): they slide on each other without friction.
-
-Not modelled: layers that change their thickness, as a foam does under a force at a point; change of
-an adhesive with temperature; air between loose layers.
-
-Air in a narrow gap behind a plate: its mass, its friction, and its stiffness.
-
-The plate displaces air, which flows along the gap. In the low reduced frequency model (Zwikker and
+Air in a narrow gap behind the plate flows along it. In the low reduced frequency model (Zwikker and
 Kosten 1949; Beltman, J. Sound Vib. 227 (1999) 555) the pressure is constant across the gap, the
 flow profile follows from viscosity, and the temperature from conduction to both walls:
 
@@ -28,11 +25,8 @@ with the mean velocity v over the depth d and the plate's deflection w away from
 becomes 12 mu / (iωρ d²) + 6/5, the squeeze film of Reynolds' equation, and air is isothermal; fast,
 b = 1, and it is adiabatic. Holds while the gap is narrow compared with waves and with the plate.
 
-Stiffness of a laminate's section, the bounds of its rigidity, and bending waves in it.
-
-The theory of `model.structure.plate`, per area. And the homogeneous plate that is like a laminate
-at one frequency: it gives wavelengths, meshes and estimates; loose layers and a single one are
-solved as it. Bonded layers are solved as they are (`model.spectral.modes`).
+Not modelled: layers that change their thickness, as a foam does under a force at a point; change of
+an adhesive with temperature; air between loose layers.
 """
 
 import cmath

@@ -4,11 +4,9 @@ It holds the modes of a plate on a raster over it, from which the fields of the 
 frequencies follow, with any fingers on the plate and for any plate within the rig's uncertainty, so
 that any fingertips can be queried in any drive mode.
 
-A regular raster over the plate, with interpolation of fields between its points.
-
-Lagrange polynomials over six points (quintic) at a spacing of a twentieth of the shortest bending
-wavelength interpolate a field within 1e-4. The points of a fingertip are then one small matrix
-product, whatever the mesh.
+Lagrange polynomials over six points of the raster (quintic) at a spacing of a twentieth of the
+shortest bending wavelength interpolate a field within 1e-4. The points of a fingertip are then one
+small matrix product, whatever the mesh.
 """
 
 import math

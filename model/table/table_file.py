@@ -1,18 +1,15 @@
-"""Table files: uncompressed .npz with a JSON header.
+"""Building, keeping, reading and adapting localization tables.
 
-Members: `header` (JSON as bytes) and the arrays of `LocalizationTable` under their own names. The
-header has the format version, the plate's fingerprint, the inputs of the table, and a SHA-256 over
-the content, so that a damaged or foreign file is refused before any of it is used.
+A table is built the same to the bit by any number of processes, and kept between runs in the user's
+cache folder. Its file is an uncompressed .npz with a JSON header. Members are `header` (JSON as
+bytes) and the arrays of `LocalizationTable` under their own names. The header has the format
+version, the plate's fingerprint, the inputs of the table, and a SHA-256 over the content, so that a
+damaged or foreign file is refused before any of it is used.
 
-Building a localization table, the same to the bit by any number of processes, or keeping it.
-
-Tables are kept between runs in the user's cache folder.
-
-A table that follows what is learned of its plate, in a millisecond instead of a build.
-
-Modulus and thickness scale the modes that the table holds, springs, dampers, gains, losses and mode
-deviations are values of the rig, and masses and moved ERAs act where the raster gives their shapes.
-For changes as a plate in service has them; a rig that is another is built anew.
+A table follows what is learned of its plate, in a millisecond instead of a build
+(`table_following`). Modulus and thickness scale the modes that the table holds; springs, dampers,
+gains, losses and mode deviations are values of the rig; masses and moved ERAs act where the raster
+gives their shapes. Changes are small, as of a plate in service; for another rig it is built anew.
 """
 
 import hashlib

@@ -90,6 +90,7 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python tests/support/vocabulary.py
+	-$(BIN)/python tests/support/names.py
 	$(BIN)/python tests/support/ceilings.py
 	$(PAGES) --check
 
@@ -138,7 +139,7 @@ desk-test: .venv/installed-test
 qt-test: .venv/installed-qt
 	$(BIN)/pytest -q tests/integration/test_people_at_a_plate.py
 
-# The whole chain in virtual time, thousands of seeds; `make test` takes seven short ones.
+# The whole chain in virtual time, thousands of seeds; `make test` takes a short one.
 # Others: make soak SOAK='--minutes 10 --wire serial', or one again: make soak SOAK='--seed 17'
 soak: .venv/installed-test
 	$(BIN)/python tests/support/soak.py $(SOAK)

@@ -1,10 +1,6 @@
-"""No circle of files outside the packages, whose own circles an import contract excludes.
+"""What keeps the house in order: imports of programs, names, retired words, tests of a change.
 
-Classes of the model and the controller are nouns of the field, each defined once.
-
-Which tests `make test-changed` takes, and what it does without time.
-
-Retired words do not return as identifiers.
+Import contracts exclude circles within the packages; here the folders beside them are checked.
 """
 
 import ast
@@ -12,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from collections import Counter
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -21,7 +16,7 @@ import pytest
 import changed_tests
 import vocabulary
 from changed_tests import ALSO, also, nearest
-from changed_tests import ROOT as CHANGED_TESTS_ROOT
+from names import misleading_names
 from vocabulary import retired_identifiers
 
 ROOT = Path(__file__).parents[1]
@@ -48,38 +43,35 @@ def test_no_circle_of_programs() -> None:
     assert len([*TopologicalSorter(graph).static_order()]) >= len(graph)
 
 
-PACKAGES = ("controller", "model")
-
-_REGULAR = re.compile(r"[A-Z][a-z]+ed")
-_IRREGULAR = re.compile(
-    "Built|Chosen|Drawn|Felt|Found|Given|Heard|Held|Kept|Known|Left|Made|Meant|Met|Playing|Sent"
-    "|Shown|Sought|Taken|Told|Unknown|Unsent"
-)
-
-
-def test_classes_are_nouns_that_are_defined_once() -> None:
-    """No bare participle, and no name twice."""
-    names = Counter(
-        node.name
-        for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ClassDef)
-    )
-    assert [name for name, count in names.items() if count > 1 or _is_participle(name)] == []
+PRODUCT = {
+    "sim/line.py": "class Line: ...\nclass _Chosen: ...\nclass _Chosen: ...",
+    "model/line.py": "class Table:\n    class Line: ...",
+    "model/cli.py": "class Preempted(Refusal): ...\nclass Refusal(LinkError): ...",
+    "sim/cli.py": "class Felt: ...",
+    "tests/line.py": "class Line: ...",
+}
 
 
-def _is_participle(name: str) -> bool:
-    plain = name.strip("_")
-    return bool(_REGULAR.fullmatch(plain) or _IRREGULAR.fullmatch(plain))
+def test_names_that_mislead_are_listed_with_their_places(tmp_path: Path) -> None:
+    """Classes and modules of one name, and participles; errors and private classes are free."""
+    for name, text in PRODUCT.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, "utf-8")
+    found = [re.findall(r"^\w+ \w+|\w+/\S+\d", line) for line in misleading_names(tmp_path)]
+    assert found == [
+        ["module line"],
+        ["class Line", "model/line.py:2", "sim/line.py:1"],
+        ["class Felt", "sim/cli.py:1"],
+        ["class _Chosen", "sim/line.py:2"],
+    ]
 
 
 def importing(module: str) -> set[str]:
     """The files of tests with a line that imports something out of a module."""
     line = re.compile(rf"^from {re.escape(module)} import", re.MULTILINE)
-    files = CHANGED_TESTS_ROOT.glob("tests/**/test_*.py")
+    files = ROOT.glob("tests/**/test_*.py")
     found = {path for path in files if line.search(path.read_text("utf-8"))}
-    return {path.relative_to(CHANGED_TESTS_ROOT).as_posix() for path in found}
+    return {path.relative_to(ROOT).as_posix() for path in found}
 
 
 @pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
@@ -107,9 +99,7 @@ def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     assert nearest(["tests/support/set_table.py"]).keys() >= importing("set_table")
     assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_summary.py"] == 0
     assert nearest(["tests/test_docs_site.py"]) == {"tests/test_docs_site.py": 0}
-    assert len(nearest(["tests/conftest.py"])) == len(
-        [*CHANGED_TESTS_ROOT.glob("tests/**/test_*.py")]
-    )
+    assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
 
 
 def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() -> None:
@@ -123,11 +113,9 @@ def test_tests_of_a_page_that_is_written_anew_come_before_those_that_import() ->
 
 def test_rows_name_what_there_is() -> None:
     """Files or folders, and targets of the Makefile."""
-    targets = re.findall(
-        r"^([\w-]+):", (CHANGED_TESTS_ROOT / "Makefile").read_text("utf-8"), re.MULTILINE
-    )
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
     for paths, commands in ALSO:
-        assert [path for path in paths if not (CHANGED_TESTS_ROOT / path).exists()] == []
+        assert [path for path in paths if not (ROOT / path).exists()] == []
         named = [command.split()[1] for command in commands if command.startswith("make ")]
         assert set(named) <= set(targets)
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
@@ -149,7 +137,7 @@ def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> 
     ]
     for until, outcome in (("inf", "2 passed"), ("0", "2 without time")):
         more = {
-            "PYTHONPATH": str(CHANGED_TESTS_ROOT / "tests" / "support"),
+            "PYTHONPATH": str(ROOT / "tests" / "support"),
             "ERA_TESTS_UNTIL": until,
         }
         more["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to load

@@ -18,7 +18,7 @@ import pytest
 from controller.cli.main import main, run
 from controller.daemon.children import gateway_options
 from controller.process.daemon_process import SocketLock
-from long_form import full_disk
+from interrupted import full_disk
 from model.errors import InputError
 
 

@@ -23,7 +23,7 @@ from controller.process.daemon_process import ServiceManager
 from controller.process.log import LogFormatter, LogThread, RateLimitFilter
 from drivers.wires.wire import Reply
 from gateway_bench import wait_for
-from long_form import full_disk
+from interrupted import full_disk
 from registry import threads
 from virtual_lines import in_virtual_time
 

@@ -26,7 +26,7 @@ from drivers.trace import Direction, TraceWriter, tracing
 from drivers.wires.known import address_of
 from firmware_records import records_header
 from hand_written import HALF, Talk
-from long_form import full_disk
+from interrupted import full_disk
 from protocol_tables import records
 from real_wires import LATER, WORD
 from real_wires import age as age

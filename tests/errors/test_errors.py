@@ -35,8 +35,8 @@ from era_haptics.lab.measuring.sound_card import Desk
 from era_haptics.lab.witness import capture
 from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
 from error_cases import RIG as ERROR_CASES_RIG
-from interrupted import interrupted
-from long_form import full_disk, shortly
+from interrupted import full_disk, interrupted
+from long_form import shortly
 from model.calibration import calibrate
 from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.errors import InputError

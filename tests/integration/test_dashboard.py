@@ -768,6 +768,7 @@ async def test_login_needs_the_token(tab: Page, gateway: GatewayProcess, era: Cl
             assert await tab.evaluate(REASON) == "gateway-refused"
 
 
+@pytest.mark.long
 async def test_page_reconnects_after_gateway_and_daemon_restarts(tab: Page, tmp_path: Path) -> None:
     """Each loss is shown, and the page continues by itself."""
     with gateway_process(tmp_path, tmp_path / "era.sock") as first:

@@ -147,7 +147,7 @@ async def until_all_feel(era: AsyncClient, level_db_sl: float) -> StatusResult:
 
 @pytest.mark.real_time
 @pytest.mark.alone
-@pytest.mark.parametrize("name", shortly(PEOPLE, ["car_display"]))
+@pytest.mark.parametrize("name", shortly(PEOPLE, []))
 async def test_everyone_at_an_example_feels_their_own(
     name: str, tmp_path: Path, table_cache: Path
 ) -> None:
@@ -326,6 +326,7 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
     await daemons_until(lambda: loudness(daemon.far) == 0)
 
 
+@pytest.mark.long
 @pytest.mark.alone
 async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -> None:
     """With 2000 idle and 10 unreading ones memory is bounded, and a new client can stop it."""
@@ -345,6 +346,7 @@ async def test_daemon_plays_on_with_idle_and_unreading_clients(tmp_path: Path) -
         await play(era, daemon.far)
 
 
+@pytest.mark.long
 @pytest.mark.alone
 async def test_stops_are_served_while_clients_connect_again_and_again(tmp_path: Path) -> None:
     """Of 25 new clients each, beside 2000 connections in a second, and of the command."""

@@ -21,7 +21,7 @@ import pytest
 
 from drivers.playing import AmplifierTone
 from firmware_machine import play
-from long_form import full_disk
+from interrupted import full_disk
 from model.errors import InputError
 from model.rig.rig import Rig
 from recordings import read_recording

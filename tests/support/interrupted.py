@@ -1,20 +1,41 @@
-"""Commands that are interrupted, each a process that gets the signal while it does what takes long.
+"""Commands that are cut short: interrupted while they compute, or writing to a full disk.
 
-They are forked off one process that has loaded what they need, since loading takes the most time.
+Each interrupted command is a process, forked off one that has loaded what all of them need: loading
+takes the most time.
 """
 
+import contextlib
 import json
 import os
+import resource
 import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from unittest.mock import patch
+
+
+@contextlib.contextmanager
+def full_disk(*, at: int = 1024) -> Iterator[None]:
+    """Limit the size [bytes] of every file that this process writes: beyond it, OSError is raised.
+
+    Python writes no bytecode meanwhile: it would not notice that a file was cut off, and later
+    imports of the module would fail.
+    """
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    without_bytecode = sys.dont_write_bytecode
+    sys.dont_write_bytecode = True
+    resource.setrlimit(resource.RLIMIT_FSIZE, (at, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = without_bytecode
 
 
 def interrupted(commands: Mapping[str, str], folder: Path) -> dict[str, tuple[int, str]]:

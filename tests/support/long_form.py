@@ -1,14 +1,10 @@
-"""Cases of which `make test` takes a few; `make test-long` takes the others.
+"""The short and the long form of the suite, and the files of tests that take longest.
 
-The files of tests that take longest.
-
-A disk that is full, as a process sees it.
+A test or a case with the mark `long` is left to `make test-long`, which `make nightly` runs;
+`make test` has a short case of the same.
 """
 
-import contextlib
-import resource
-import sys
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -34,48 +30,32 @@ def _long(*values: Any) -> Any:
 
 
 SLOWEST = (
-    "test_dashboard.py",
-    "test_demo.py",
-    "test_desk.py",
-    "test_daemon_faults_process.py",
-    "test_how_to_pages.py",
-    "test_firmware_host.py",
-    "test_latency_measured.py",
-    "test_errors.py",
-    "test_link_faults.py",
-    "test_dashboard_losses.py",
-    "test_rig_check.py",
-    "test_tutorials.py",
-    "test_calibration.py",
-    "test_diagnosis.py",
-    "test_daemon_over_a_wire.py",
-    "test_soak.py",
-    "test_soft_amp_sound.py",
-    "test_group_stops.py",
-    "test_convergence.py",
-    "test_table_commands.py",
-    "test_quick_faults.py",
-    "test_calibrate_on_the_bench.py",
     "test_identify.py",
-    "test_consistency.py",
+    "test_dashboard.py",
+    "test_loop_is_free.py",
+    "test_conformance.py",
+    "test_firmware.py",
+    "test_errors.py",
+    "test_table_commands.py",
+    "test_control_loop.py",
+    "test_joint_sets.py",
+    "test_people_at_a_plate.py",
+    "test_decoders.py",
+    "test_daemon_commands.py",
+    "test_examples.py",
     "test_layout_check.py",
+    "test_verdict.py",
+    "test_calibrate.py",
+    "test_link_faults.py",
+    "test_rig_on_wire.py",
+    "test_four_amplifiers.py",
+    "test_daemon_faults_process.py",
+    "test_daemon_in_use.py",
+    "test_quick_faults.py",
+    "test_wires.py",
+    "test_pages.py",
+    "test_over_duration.py",
+    "test_answer.py",
+    "test_sound_card.py",
 )
 """Run in this order before all others: one that started last would leave the other cores idle."""
-
-
-@contextlib.contextmanager
-def full_disk(*, at: int = 1024) -> Iterator[None]:
-    """No file may become longer than so many bytes: what is written beyond raises OSError.
-
-    Python writes no bytecode meanwhile: it does not notice that a file was cut off, and later
-    imports of the module fail.
-    """
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    writes_none = sys.dont_write_bytecode
-    sys.dont_write_bytecode = True
-    resource.setrlimit(resource.RLIMIT_FSIZE, (at, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        sys.dont_write_bytecode = writes_none

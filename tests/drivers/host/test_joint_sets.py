@@ -419,8 +419,8 @@ async def test_watchdog_that_stands_still_is_found_where_replies_are_late() -> N
 STOPS, FIRST = (int(os.environ.get(name, value)) for name, value in (("STOPS", 108), ("FIRST", 0)))
 
 
-@pytest.fixture(autouse=True)
-def _unlogged() -> Iterator[None]:
+@pytest.fixture
+def unlogged() -> Iterator[None]:
     """Losses and planted exceptions are logged by the thousand."""
     logger = logging.getLogger("drivers")
     logger.setLevel(logging.CRITICAL)
@@ -434,6 +434,7 @@ def _unlogged() -> Iterator[None]:
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # coroutines that were never awaited
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("unlogged")
 def test_stop_is_true(programme: str, share: int, least: float) -> None:
     """On every wire: what is confirmed silent is silent, and stays so.
 

@@ -52,7 +52,7 @@ from drivers.wires.modbus_frames import (
     response_to,
 )
 from drivers.wires.serial_frames import PAYLOAD_MAX, Frame, FrameReader, encode_frame, frame_length
-from long_form import in_turn
+from long_form import in_turn, shortly
 from registry import threads
 from virtual_lines import in_virtual_time
 
@@ -369,7 +369,7 @@ def test_damaged_bytes_raise_and_log_nothing(caplog: pytest.LogCaptureFixture) -
 NOISE = [b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"]
 
 
-@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("waits", shortly([True, False], [True]))
 @pytest.mark.parametrize(("noise", "part"), in_turn(NOISE, [250, 1 << 18]))
 def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
     noise: bytes, waits: bool, part: int, monkeypatch: pytest.MonkeyPatch

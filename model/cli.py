@@ -4,18 +4,13 @@ import typer
 
 from model.commands.calibrate_cli import calibrate
 from model.commands.config_cli import config_app
-from model.commands.plate_cli import materials, plate_app, show, template
+from model.commands.plate_cli import plate_app
 from model.commands.table_cli import build, contrast_map, export, plot, query, table_app
-from model.commands.table_show_cli import show as show_table
-from model.commands.table_show_cli import verify
+from model.commands.table_show_cli import show, verify
 from model.errors import InputError
 
-plate_app.command()(materials)
-plate_app.command()(show)
-plate_app.command()(template)
-
 table_app.command()(build)
-table_app.command("show")(show_table)
+table_app.command()(show)
 table_app.command()(verify)
 table_app.command()(query)
 table_app.command("map")(contrast_map)
@@ -29,4 +24,4 @@ app.add_typer(plate_app, name="plate")
 app.add_typer(table_app, name="table")
 
 EXIT_STATUS: dict[type[BaseException], int] = {InputError: 2}
-"""Exit status of the errors that these commands raise on purpose."""
+"""Exit status for each class of error that these commands raise on purpose."""

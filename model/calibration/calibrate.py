@@ -235,7 +235,7 @@ def lacking_of(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> FloatArr
     return np.asarray(np.sqrt(shares) / size)
 
 
-def gain_rows(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
+def gains_of_response(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
     """Rows of known gains (f,) for a rig."""
     known = np.isfinite(gains) & (gains != 0)
     return tuple(
@@ -609,7 +609,7 @@ def _report(
     rig = rig_of_fit(problem, fit, plain[0])
     responses, gains = predicted_by(rig, problem, live.points, fit)
     eras = tuple(
-        replace(era, gains=gain_rows(gains[:, number], live.frequencies) or era.gains)
+        replace(era, gains=gains_of_response(gains[:, number], live.frequencies) or era.gains)
         for number, era in enumerate(rig.eras)
     )
     parameters = tuple(
@@ -672,7 +672,7 @@ def change_rows(calibration: Calibration) -> list[str]:
     return value_rows([*map(_change, calibration.parameters), *moved])
 
 
-def calibration_report_gain_rows(calibration: Calibration) -> list[str]:
+def gain_rows(calibration: Calibration) -> list[str]:
     """Lines of all ERAs: median and range over frequency of their gains, with standard error."""
     rows = []
     for number, era in enumerate(calibration.rig.eras):
@@ -721,7 +721,7 @@ def check_rows(calibration: Calibration) -> list[str]:
     )
 
 
-def as_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
+def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
     """All results for programs, units in the keys or beside the values."""
     held_out = calibration.held_out
     frequencies = calibration.frequencies

@@ -1,1 +1,1 @@
-"""The model's commands of `era`: arguments parsed, answers printed."""
+"""The model's commands of `era`: arguments, options and printed reports."""

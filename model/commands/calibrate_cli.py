@@ -1,6 +1,6 @@
 """`era calibrate`: fit a rig to responses measured on it.
 
-What commands that fit a rig to a measurement have in common: the file they write, their end.
+The file of a fitted rig and the end of the report are shared by all commands that fit a rig.
 """
 
 import re
@@ -31,13 +31,30 @@ NO_FIT = 1
 """Exit status where a fit does not explain the measurement."""
 
 _HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify)`:\s*$|\Z")
-"""First line of a rig that was fitted, or of an empty file."""
+"""First line of a file that a command fitted, or of an empty one."""
+
+_NO_FIT = (
+    "the fit must predict the measurement within 25 %; no rig is written. Check that it is this "
+    "plate, places of sensors and ERAs, noise, phases as exp(+i omega t), and that the rig's mesh "
+    "is as fine as auto"
+)
+
+_UNCHECKED = (
+    "the fit must be checked by a sensor that it was not shown; no rig is written. Few responses "
+    "are explained by a wrong plate as well: measure at {least} places or more, better at eight"
+)
+
+_DEAD = (
+    "every ERA that is played must move the plate, {eras} did not; no rig is written. Find out why "
+    "by era rig check, or remove it from the rig"
+)
 
 
 def check_rig_output(output: Path, *taken: Path) -> None:
-    """Raise InputError unless a rig can be written to a place other than the files taken.
+    """Raise InputError unless a fitted rig can be written to a path.
 
-    There may be a fitted rig already, but no file that somebody wrote.
+    A rig that was fitted before is replaced; a file that a person wrote, or that the command
+    reads (`taken`), is not.
     """
     check_place(output, example="rig2.yaml")
     check_ending(output, ".yaml", ".yml", what="a rig file")
@@ -58,9 +75,9 @@ def write_fitted_rig(
     *,
     mesh: str | None = None,
 ) -> list[str]:
-    """Write the document of a rig with the values of its fit, and return the files written.
+    """Write the document of a rig with its fitted values, and return the files written.
 
-    rigs: before and after; comment: a heading as in _HEADING, and lines of the report.
+    rigs: before and after the fit; comment: a heading that `_HEADING` matches, then the report.
     """
     from model.files.array_file import whole_or_nothing
     from model.rig.rig_writing import rewritten_text
@@ -79,10 +96,10 @@ def finish(
     elapsed: float,
     refusal: str | None,
 ) -> None:
-    """Print a report as text, or as JSON if there is one, and what was written.
+    """Print the report of a fit, as text or as JSON if there is a report object.
 
-    refusal: why the first of the files, the rig, was not; the exit status is then NO_FIT.
-    elapsed: time of the fit [s].
+    files: those written, the rig first; elapsed: time of the fit [s]; refusal: why no rig was
+    written, None if it was. Exits with `NO_FIT` on a refusal.
     """
     answer = (report or {}) | {"solve_time_s": elapsed, "files": list(files)}
     print_report(rows, answer, as_json=report is not None)
@@ -93,24 +110,6 @@ def finish(
         print(f"\nwrote {', '.join(files)}; fitted in {elapsed:.1f} s")
         table = Path(files[0]).with_suffix(".npz")
         print(next_line("era", "table", "build", files[0], "-o", table))
-
-
-_NO_FIT = (
-    "the fit must predict the measurement within 25 %; no rig is written. Check that it is this "
-    "plate, places of sensors and ERAs, noise, phases as exp(+i omega t), and that the rig's mesh "
-    "is as fine as auto"
-)
-
-
-_UNCHECKED = (
-    "the fit must be checked by a sensor that it was not shown; no rig is written. Few responses "
-    "are explained by a wrong plate as well: measure at {least} places or more, better at eight"
-)
-
-_DEAD = (
-    "every ERA that is played must move the plate, {eras} did not; no rig is written. Find out why "
-    "by era rig check, or remove it from the rig"
-)
 
 
 def calibrate(
@@ -134,8 +133,14 @@ def calibrate(
 
     Write a new rig, and print its values with their uncertainties.
     """
-    from model.calibration import calibrate as calibration_report
     from model.calibration.calibrate import calibrate as fit
+    from model.calibration.calibrate import (
+        calibration_json,
+        change_rows,
+        check_rows,
+        finding_rows,
+        gain_rows,
+    )
     from model.calibration.responses import LEAST_SENSORS, read_measured, responses_of
     from model.config.document import read_document
     from model.diagnosis.verdict import check_consistency
@@ -150,11 +155,8 @@ def calibrate(
     with Stopwatch() as timed, progress_bar("fits") as progress:
         screened = check_consistency(rig, responses)
         calibration = fit(rig, responses, screened, all_scales=all_scales, progress=progress)
-    rows = calibration_report.change_rows(calibration)
-    notes = [
-        *calibration_report.finding_rows(calibration),
-        *calibration_report.check_rows(calibration),
-    ]
+    rows = change_rows(calibration)
+    notes = [*finding_rows(calibration), *check_rows(calibration)]
     refusal = None
     if not calibration.is_good:
         refusal = _NO_FIT if calibration.held_out else _UNCHECKED.format(least=LEAST_SENSORS + 1)
@@ -177,18 +179,10 @@ def calibrate(
         f"from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
         f"{counted(responses.count, 'value')}"
     )
+    report = calibration_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
     finish(
-        [
-            heading,
-            "",
-            *rows,
-            *calibration_report.calibration_report_gain_rows(calibration),
-            "",
-            *notes,
-        ],
-        calibration_report.as_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
-        if as_json
-        else None,
+        [heading, "", *rows, *gain_rows(calibration), "", *notes],
+        report if as_json else None,
         files=files,
         elapsed=timed.elapsed,
         refusal=refusal,

@@ -1,7 +1,4 @@
-"""Options that several commands share.
-
-The option `--drive ERA=HZ[@LEVEL[:PHASE_DEG]]`.
-"""
+"""Options, parsed values and reports that several commands share."""
 
 import json
 import math
@@ -55,8 +52,6 @@ LowestOption = Annotated[
 ClusterOption = Annotated[
     str | None, typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler.")
 ]
-
-
 ExactOption = Annotated[
     bool, typer.Option("--exact", help="Simulate the rig's own plate, with no deviation.")
 ]
@@ -69,53 +64,22 @@ SeedOption = Annotated[
     ),
 ]
 
-
-def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
-    """Seed of a simulated plate, by default 0; None for the rig's own.
-
-    Raises InputError for both.
-    """
-    if exact and seed is not None:
-        raise InputError("--exact and --seed exclude each other; give one")
-    return None if exact else seed or 0
-
-
-def figure_size(text: str | None) -> tuple[float, float] | None:
-    """Width and height [in] of pictures from `WxH` in centimetres; None for their own.
-
-    Raises InputError for anything else, and for sizes that no page has.
-    """
-    if text is None:
-        return None
-    try:
-        width, height = (float(part) for part in text.replace("×", "x").split("x"))
-    except ValueError:
-        width = height = 0.0
-    if not (2 <= width <= 200 and 2 <= height <= 200):  # False for NaN
-        raise InputError(f"--size must be WxH in cm, 2 to 200 each, such as 16x10, got {text!r}")
-    return width / 2.54, height / 2.54
-
-
-def next_line(*words: str | Path) -> str:
-    """Format the next command for the shell, with quotes where they are needed."""
-    arguments = [str(word) for word in words]
-    if os.name == "nt":
-        from subprocess import list2cmdline
-
-        return f"Next: {list2cmdline(arguments)}"
-    return f"Next: {shlex.join(arguments)}"
-
-
-def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print what a command has found: rows of text without those that are None, or its answer."""
-    text = json.dumps(answer) if as_json else "\n".join(row for row in rows if row is not None)
-    sys.stdout.write(f"{text}\n")
+_LINE_INTERVAL = 2.0  # s
+_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"
+_DRIVE = re.compile(
+    rf"(?P<era>[^=]+)=\s*(?P<frequency>{_NUMBER})\s*"
+    rf"(@\s*(?P<level>{_NUMBER})\s*(:\s*(?P<phase>{_NUMBER}))?)?",
+    re.IGNORECASE,
+)
+_NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
+"""Groups of `_DRIVE` that are numbers, and their defaults."""
 
 
 class Stopwatch:
-    """The time that a block takes: `elapsed` [s] after it."""
+    """Measures the time that a `with` block takes."""
 
     elapsed = 0.0
+    """Duration of the block [s], known after it."""
 
     def __enter__(self) -> "Stopwatch":
         self._started = time.perf_counter()
@@ -125,14 +89,11 @@ class Stopwatch:
         self.elapsed = time.perf_counter() - self._started
 
 
-_LINE_INTERVAL = 2.0  # s
-
-
 @contextmanager
 def progress_bar(unit: str) -> Iterator[Progress]:
-    """Show a progress bar on standard error, or lines if that is no terminal.
+    """Show a progress bar on standard error, or lines of text if that is not a terminal.
 
-    Yield its update(done, total). unit: plural of the things counted.
+    Yields update(done, total). unit: plural of the things counted.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
@@ -149,7 +110,7 @@ def progress_bar(unit: str) -> Iterator[Progress]:
 
 
 def _lines(unit: str) -> Progress:
-    """Print how far it is every two seconds."""
+    """Return an update(done, total) that prints a line every two seconds."""
     printed = time.monotonic()
 
     def update(done: int, total: int) -> None:
@@ -161,25 +122,57 @@ def _lines(unit: str) -> Progress:
     return update
 
 
-_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"
-_FORM = re.compile(
-    rf"(?P<era>[^=]+)=\s*(?P<frequency>{_NUMBER})\s*"
-    rf"(@\s*(?P<level>{_NUMBER})\s*(:\s*(?P<phase>{_NUMBER}))?)?",
-    re.IGNORECASE,
-)
-_NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
-"""Parts of a drive, with what they are where they are left out."""
+def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print the report of a command: rows of text, of which None is skipped, or JSON."""
+    text = json.dumps(answer) if as_json else "\n".join(row for row in rows if row is not None)
+    sys.stdout.write(f"{text}\n")
+
+
+def next_line(*words: str | Path) -> str:
+    """Format the next command for the shell, with quotes where they are needed."""
+    arguments = [str(word) for word in words]
+    if os.name == "nt":
+        from subprocess import list2cmdline
+
+        return f"Next: {list2cmdline(arguments)}"
+    return f"Next: {shlex.join(arguments)}"
+
+
+def seed_of_plate(*, exact: bool, seed: int | None) -> int | None:
+    """Return the seed of a simulated plate, 0 by default, or None for the rig's own plate.
+
+    Raises InputError where both options are given.
+    """
+    if exact and seed is not None:
+        raise InputError("--exact and --seed exclude each other; give one")
+    return None if exact else seed or 0
+
+
+def figure_size(text: str | None) -> tuple[float, float] | None:
+    """Parse `WxH` in centimetres to the width and height of pictures [in]; None stays None.
+
+    Raises InputError for other text, and for sides outside 2 to 200 cm.
+    """
+    if text is None:
+        return None
+    try:
+        width, height = (float(part) for part in text.replace("×", "x").split("x"))
+    except ValueError:
+        width = height = 0.0
+    if not (2 <= width <= 200 and 2 <= height <= 200):  # False for NaN
+        raise InputError(f"--size must be WxH in cm, 2 to 200 each, such as 16x10, got {text!r}")
+    return width / 2.54, height / 2.54
 
 
 def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
-    """Excitation from drives such as `SW=110`, `NE=250@0.5` or `NE=250@0.5:90`.
+    """Parse drives such as `SW=110`, `NE=250@0.5` or `NE=250@0.5:90` to an excitation.
 
-    Level 1, full stroke, and phase 0 where they are not given. Raises InputError.
+    The level is 1, full stroke, and the phase 0 where they are left out. Raises InputError.
     """
     excitation: dict[str, Tone] = {}
     names = [era.name for era in rig.eras]
     for text in texts:
-        match = _FORM.fullmatch(text.strip())
+        match = _DRIVE.fullmatch(text.strip())
         if match is None:
             raise InputError(
                 f"--drive must be ERA=HZ[@LEVEL[:PHASE_DEG]], in hertz, share of full stroke and "
@@ -206,7 +199,7 @@ def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
 
 
 def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
-    """Return a warning if tones are outside the rig's frequency limits."""
+    """Return a warning if tones are outside the rig's frequency limits, else None."""
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     beyond = [
         f"{era} at {tone.frequency:g} Hz"

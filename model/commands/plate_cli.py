@@ -1,14 +1,10 @@
-"""`era plate`: natural frequencies, maps, materials and rigidity.
-
-`era plate template`: the board in real size, to glue by.
-"""
+"""`era plate`: natural frequencies, maps, meshes, materials, rigidity and a template of a plate."""
 
 import math
 import sys
 from collections.abc import Iterable, Iterator
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -30,13 +26,13 @@ from model.quantities import counted
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
 
+_MAX_NAMED = 6  # masses or supports that are listed one by one; a frame has many
 
-class BoundaryCondition(StrEnum):
-    """Boundary condition of the plate."""
-
-    ERAS = "eras"
-    SIMPLY_SUPPORTED = "simply-supported"
-    FREE = "free"
+_ATTACHED = {
+    "point_masses": ("carries", "mass_kg", 1e3, "g"),
+    "supports": ("held by", "stiffness_n_m", 1e-3, "kN/m"),
+}
+"""By key of a summary: a verb, the key of a quantity, and its factor from SI to a display unit."""
 
 
 @plate_app.command()
@@ -44,8 +40,8 @@ def modes(
     rig_file: RigArgument,
     mesh: MeshOption = None,
     support: Annotated[
-        BoundaryCondition, typer.Option(help="Boundary condition.")
-    ] = BoundaryCondition.ERAS,
+        Literal["eras", "simply-supported", "free"], typer.Option(help="Boundary condition.")
+    ] = "eras",
     count: Annotated[int, typer.Option("-n", min=1, help="Number of modes.")] = 12,
     as_json: JsonOption = False,
 ) -> None:
@@ -58,12 +54,12 @@ def modes(
 
     rig = load_rig(rig_file, mesh=mesh)
     with Stopwatch() as timed:
-        solved = natural_modes(rig, count, support=support.value)
+        solved = natural_modes(rig, count, support=support)
     carried = solved.mesh.highest_frequency(rig.plate)
     name = solved.mesh.element_name
     element = "" if name in str(solved.mesh) else f" {name}"
     rows = [
-        f"{rig_file}: {solved.mesh}{element}, {solved.mesh.dof} dof, support: {support.value}",
+        f"{rig_file}: {solved.mesh}{element}, {solved.mesh.dof} dof, support: {support}",
         *(
             f"mode {number:3d}  {frequency:9.2f} Hz"
             f"{'  mesh too coarse' if frequency > carried else ''}"
@@ -78,7 +74,7 @@ def modes(
     answer = {
         "frequencies_hz": solved.frequencies.tolist(),
         "mesh_carries_up_to_hz": carried,
-        "support": support.value,
+        "support": support,
         "mesh": [solved.mesh.nx, solved.mesh.ny],
         "dof": solved.mesh.dof,
         "element": solved.mesh.element_name,
@@ -107,6 +103,7 @@ def plate_map(
     """Compute peak acceleration over the plate for any drive."""
     import numpy as np
 
+    from model.arrays import best_of
     from model.commands.options import beyond_limits, parse_drives
     from model.rig.rig_file import load_rig
     from model.structure.attachments import support_problem
@@ -131,8 +128,6 @@ def plate_map(
         title = ", ".join([*drive, *(["not supported"] if unsupported else [])])
         figure = map_figure(rig, solved, active=excitation.keys(), title=title)
         save_figure(figure, output, inches=inches)
-    from model.arrays import best_of
-
     row, column = divmod(best_of(solved.peak.ravel()), len(solved.x))
     rows = [
         f"{rig_file}: {', '.join(drive)}, mesh {rig.mesh}, solved in {timed.elapsed:.2f} s",
@@ -247,10 +242,11 @@ def convergence(
 
 
 def _percents(shares: Iterable[float]) -> str:
-    """Format shares in columns."""
+    """Format shares as columns of per cent."""
     return "".join(f"{100 * share:10.3f} %" for share in shares)
 
 
+@plate_app.command()
 def materials(as_json: JsonOption = False) -> None:
     """List known materials with their sources."""
     from model.structure.materials import known_material, material_names
@@ -291,11 +287,7 @@ def materials(as_json: JsonOption = False) -> None:
         print(f"era: warning: {problem}", file=sys.stderr)
 
 
-def _in_gpa(moduli: dict[str, float]) -> str:
-    """Moduli of a material, as `E 70 GPa`."""
-    return f"{', '.join(f'{key} {each / 1e9:.4g}' for key, each in moduli.items())} GPa"
-
-
+@plate_app.command()
 def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     """Show material and rigidity of a rig's plate, and what its exciters reach.
 
@@ -344,44 +336,8 @@ def show(rig_file: RigArgument, as_json: JsonOption = False) -> None:
     print_report(rows, summary, as_json=as_json)
 
 
-_MAX_NAMED = 6  # of masses and supports, which a frame has many of
-
-
-def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
-    """Yield the moduli of a board along the plate's length (1) and its width (2)."""
-    if grain is not None:
-        moduli = {key[:-3]: each for key, each in grain.items() if key.endswith("_pa")}
-        yield f"    along its length and width  {_in_gpa(moduli)}, nu12 {grain['nu12']:.3g}"
-        yield (
-            f"    flexural rigidity along, across  {grain['flexural_rigidity_along_n_m']:.4g}, "
-            f"{grain['flexural_rigidity_across_n_m']:.4g} N m"
-        )
-
-
-_ATTACHED = {
-    "point_masses": ("carries", "mass_kg", 1e3, "g"),
-    "supports": ("held by", "stiffness_n_m", 1e-3, "kN/m"),
-}
-"""In words, by key of a summary: a quantity, with its unit of so many a SI unit."""
-
-
-def _attached_rows(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield what the plate carries, and what holds it without driving it."""
-    for kind, (verb, key, count, unit) in _ATTACHED.items():
-        points = summary[kind]
-        if len(points) > _MAX_NAMED:
-            together = count * sum(each[key] for each in points)
-            yield f"    {verb} {together:.4g} {unit} at {len(points)} points"
-            continue
-        for each in points:
-            loss = f", loss factor {loss:g}" if (loss := each.get("loss_factor")) else ""
-            yield "    {} {:g} {}{} at ({:g}, {:g}) m".format(
-                verb, count * each[key], unit, loss, *each["at_m"]
-            )
-
-
 def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
-    """Yield the layers of a plate, None for a single one, and its rigidities."""
+    """Yield the layers and rigidities of a laminate; None for a plate of one layer."""
     if laminate is None:
         yield "plate"
         return
@@ -407,6 +363,26 @@ def _laminate_rows(laminate: dict[str, Any] | None) -> Iterator[str]:
     yield "homogeneous plate like it at the highest frequency"
 
 
+def _frequency(key: str) -> str:
+    return key.replace("_hz", " Hz")
+
+
+def _grain_rows(grain: dict[str, float] | None) -> Iterator[str]:
+    """Yield the moduli of a board along the plate's length (1) and its width (2)."""
+    if grain is not None:
+        moduli = {key[:-3]: each for key, each in grain.items() if key.endswith("_pa")}
+        yield f"    along its length and width  {_in_gpa(moduli)}, nu12 {grain['nu12']:.3g}"
+        yield (
+            f"    flexural rigidity along, across  {grain['flexural_rigidity_along_n_m']:.4g}, "
+            f"{grain['flexural_rigidity_across_n_m']:.4g} N m"
+        )
+
+
+def _in_gpa(moduli: dict[str, float]) -> str:
+    """Format the moduli of a material, as `E 70 GPa`."""
+    return f"{', '.join(f'{key} {each / 1e9:.4g}' for key, each in moduli.items())} GPa"
+
+
 def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
     """Yield the air gap behind a plate."""
     if air is None:
@@ -419,8 +395,23 @@ def _air_rows(air: dict[str, Any] | None) -> Iterator[str]:
         yield f"        stiffness against even motion  {stiffness:.4g} MN/m³"
 
 
+def _attached_rows(summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the masses on the plate, and the supports that do not drive it."""
+    for kind, (verb, key, count, unit) in _ATTACHED.items():
+        points = summary[kind]
+        if len(points) > _MAX_NAMED:
+            together = count * sum(each[key] for each in points)
+            yield f"    {verb} {together:.4g} {unit} at {len(points)} points"
+            continue
+        for each in points:
+            loss = f", loss factor {loss:g}" if (loss := each.get("loss_factor")) else ""
+            yield "    {} {:g} {}{} at ({:g}, {:g}) m".format(
+                verb, count * each[key], unit, loss, *each["at_m"]
+            )
+
+
 def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) -> Iterator[str]:
-    """Each exciter by itself, and from which frequency all of them reach a level."""
+    """Yield each exciter, and the frequency from which all together reach a level."""
     if reach is None:
         return
     lowest = f"{reach['frequencies_hz'][0]:g} Hz"
@@ -450,7 +441,7 @@ def _exciter_rows(exciters: list[dict[str, Any]], reach: dict[str, Any] | None) 
 
 
 def _type_rows(types: dict[str, Any]) -> Iterator[str]:
-    """What is assumed of the types of exciters."""
+    """Yield the notes and assumed values of the exciter types."""
     for name, known in types.items():
         yield f"    {name}: {known['note']}"
         assumed = [f"{key} {low:g} to {high:g}" for key, (low, high) in known["assumed"].items()]
@@ -458,17 +449,7 @@ def _type_rows(types: dict[str, Any]) -> Iterator[str]:
             yield f"        assumed, measure yours: {', '.join(assumed)}"
 
 
-def _frequency(key: str) -> str:
-    return key.replace("_hz", " Hz")
-
-
-class Side(StrEnum):
-    """The side of the board that is seen."""
-
-    BELOW = "below"
-    ABOVE = "above"
-
-
+@plate_app.command()
 def template(
     rig_file: RigArgument,
     output: Annotated[
@@ -478,8 +459,9 @@ def template(
         ),
     ],
     side: Annotated[
-        Side, typer.Option(help="Where it is stuck on; actuators are glued below.")
-    ] = Side.BELOW,
+        Literal["below", "above"],
+        typer.Option(help="Where it is stuck on; actuators are glued below."),
+    ] = "below",
     sensors_file: Annotated[
         Path | None,
         typer.Option("--sensors", metavar="SENSORS.csv", help="Places of sensors, to be marked."),
@@ -497,13 +479,13 @@ def template(
     check_picture(output)
     rig = load_rig(rig_file)
     sensors = read_places(sensors_file, rig.plate) if sensors_file else {}
-    drawn = Template(rig, sensors, is_below=side is Side.BELOW)
+    drawn = Template(rig, sensors, is_below=side == "below")
     pages = write_template(output, drawn)
     length, width = drawn.board
     rows = [
-        f"{rig_file}: {length:g} x {width:g} mm seen from {side.value}, "
+        f"{rig_file}: {length:g} x {width:g} mm seen from {side}, "
         f"{counted(len([*drawn.places()]), 'place')}",
         f"wrote {output}, {counted(pages, 'page')}; print at 100 %",
     ]
     answer = {"board_m": [rig.plate.length, rig.plate.width], "pages": pages}
-    print_report(rows, answer | {"side": side.value, "files": [str(output)]}, as_json=as_json)
+    print_report(rows, answer | {"side": side, "files": [str(output)]}, as_json=as_json)

@@ -1,16 +1,12 @@
-"""`era table query`: the pattern for a set of contacts, or a content for each finger.
-
-`era table build`, `plot`, `map` and `export`: files of a table.
-"""
+"""`era table build`, `query`, `map`, `plot` and `export`: make a localization table and use it."""
 
 import json
 import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -40,12 +36,89 @@ from model.files.array_file import (
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.spectral.modes import PlateMesh
     from model.study.contrast_maps import ContrastMap
 
-_MAX_LINE = 1 << 20  # characters of a question
+_MAX_LINE = 1 << 20  # characters of a question in a batch
+
+_COARSE_ERROR = 5.0  # % of the fields, as large as the error of a gain
 
 table_app = typer.Typer(help="Build, query and check localization tables.")
+
+
+def build(
+    rig_file: RigArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="TABLE", help="File to write.")],
+    frequencies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LO:HI:STEP",
+            help="Frequencies in Hz, both ends included; default: 40:500:10 within the rig's "
+            "limits.frequency.",
+        ),
+    ] = None,
+    drive_mode: Annotated[
+        str, typer.Option("--mode", help="Default drive mode: switched or phased.")
+    ] = "switched",
+    grid: Annotated[
+        str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
+    ] = "12x9",
+    mesh: MeshOption = None,
+    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve the plate and write its table."""
+    from model.compiled.kernels import why_slow
+    from model.drive_modes import checked_mode
+    from model.finger import Grid
+    from model.rig.rig_file import load_rig
+    from model.table.table import default_drive_frequencies
+    from model.table.table_file import ZIP, TableProblem, save_table, solve_table
+
+    checked_mode(drive_mode, "--mode")
+    check_place(output, example="table.npz")
+    check_ending(output, ".npz", what="a localization table")
+    check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
+    rig = load_rig(rig_file, mesh=mesh)
+    chosen = (
+        parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
+    )
+    problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
+    with Stopwatch() as timed, progress_bar("parts") as progress:
+        table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
+    save_table(table, output)
+    error = 100 * float(table.discretisation_error.max())
+    rows = [
+        f"{counted(table.pattern_count, 'pattern')} of "
+        f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
+        f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
+        f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
+        f"{table.reference_mesh}",
+        rig.uncertainty_note,
+        f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
+        next_line("era", "table", "show", output),
+    ]
+    answer = {
+        "patterns": table.pattern_count,
+        "cells": table.grid.cell_count,
+        "drive_frequencies_hz": table.frequencies.tolist(),
+        "mesh": [table.mesh.nx, table.mesh.ny],
+        "element": table.mesh.element_name,
+        "discretisation_error_percent": error,
+        "mode": table.drive_mode,
+        "fingerprint": table.fingerprint,
+        "code_version": table.code_version,
+        "exactly_known": [*rig.exactly_known],
+        "build_time_s": timed.elapsed,
+        "files": [str(output)],
+    }
+    print_report(rows, answer, as_json=as_json)
+    coarse = (
+        f"mesh {table.mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised "
+        "takes this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
+    )
+    for warning in (coarse if error >= _COARSE_ERROR else None, why_slow()):
+        if warning:
+            typer.echo(f"era: warning: {warning}", err=True)
 
 
 def query(
@@ -140,8 +213,27 @@ def query(
     print_report(rows, answer, as_json=as_json)
 
 
+def _own(text: str) -> dict[str, Any]:
+    """Parse X,Y[@LOW-HIGH], a finger with a vibration of its own."""
+    place, separator, band = text.partition("@")
+    at = parse_point(place, what="--own")
+    return {"at": at, "band_hz": _band(band)} if separator else {"at": at}
+
+
+def _band(text: str) -> tuple[float, float]:
+    """Parse LOW-HIGH, or a single frequency, to the lowest and highest frequency [Hz]."""
+    low, separator, high = text.partition("-")
+    try:
+        return float(low), float(high if separator else low)
+    except ValueError:
+        raise InputError(
+            "band of --own must be LOW-HIGH or a single frequency in Hz, such as @40-120 or @110, "
+            f"got {text!r}"
+        ) from None
+
+
 def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
-    """Yield the drive of each layer; beside others it is given by its frequency alone."""
+    """Yield the drive of a single layer; of several, the frequencies beside the fingers do."""
     if len(found["layers"]) != 1:
         return
     (layer,) = found["layers"]
@@ -155,7 +247,7 @@ def _rows_of_layers(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
-    """Yield what each finger feels, and what was changed."""
+    """Yield a line for each finger with its vibration and verdict, then the changes made."""
     from model.answer.answer import verdict_shown
 
     yield "finger [m]         frequency       level    contrast  nominal  foreign level    exposure"
@@ -178,7 +270,7 @@ def _rows_of_fingers(found: dict[str, Any]) -> Iterator[str]:
 
 
 def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
-    """Yield what is computed of one vibration besides."""
+    """Yield the further measures of an answer with one vibration."""
     if "residual_db" not in found:
         return
     rows = [("residual after the end", found["residual_db"], "dB nominal")]
@@ -200,26 +292,6 @@ def _rows_of_measures(found: dict[str, Any]) -> Iterator[str]:
         yield f"{name:30s} {value:z6.1f} {unit}"
 
 
-def _own(text: str) -> dict[str, Any]:
-    """A finger with a content of its own, of X,Y[@LOW-HIGH]."""
-    place, separator, band = text.partition("@")
-    at = parse_point(place, what="--own")
-    return {"at": at, "band_hz": _band(band)} if separator else {"at": at}
-
-
-def _band(text: str) -> tuple[float, float]:
-    """Lowest and highest frequency [Hz] of LOW-HIGH, or of one frequency."""
-
-    low, separator, high = text.partition("-")
-    try:
-        return float(low), float(high if separator else low)
-    except ValueError:
-        raise InputError(
-            "band of --own must be LOW-HIGH or a single frequency in Hz, such as @40-120 or @110, "
-            f"got {text!r}"
-        ) from None
-
-
 def _place(finger: dict[str, Any]) -> str:
     x, y = finger["at_m"]
     return f"({x:g}, {y:g})"
@@ -232,7 +304,7 @@ def _cell(value: float | None, unit: str = "") -> str:
 def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> None:
     """Answer line by line; exit with 1 at the end if a line had no answer.
 
-    defaults: of keys that lines leave out.
+    defaults: values for keys that a line leaves out.
     """
     from model.answer.answer_report import query_batch
     from model.table.table_file import load_table
@@ -252,7 +324,7 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
                 has_failed = has_failed or "error" in answer
                 print(json.dumps(answer), flush=is_piped)
     except BrokenPipeError:
-        raise  # of who reads the answers
+        raise  # the reader of the answers has gone
     except OSError as error:
         raise InputError(
             f"--batch {batch} cannot be read: {error.strerror}; give a file of JSON lines"
@@ -261,99 +333,6 @@ def _query_batch(table_file: Path, batch: Path, defaults: dict[str, Any]) -> Non
         raise InputError(f"--batch {batch} must be UTF-8; save it as UTF-8") from error
     if has_failed:
         raise typer.Exit(1)
-
-
-class Format(StrEnum):
-    """File format of other programs."""
-
-    MAT = "mat"
-    CSV = "csv"
-
-
-class Picture(StrEnum):
-    """File format of pictures."""
-
-    PNG = "png"
-    SVG = "svg"
-    PDF = "pdf"
-
-
-class TableContent(StrEnum):
-    """Rows of a CSV file."""
-
-    PATTERNS = "patterns"
-    FIELDS = "fields"
-
-
-def plot(
-    table_file: TableArgument,
-    output: FolderOption,
-    to: Annotated[Picture, typer.Option("--format", help="Of the pictures.")] = Picture.PNG,
-    size: SizeOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Draw weak cells, levels, contrast and an answer."""
-    from model.figures import save_figure, table_figures
-    from model.study.overview import find_overview
-    from model.table.table_file import load_table
-
-    inches = figure_size(size)
-    table = load_table(table_file)
-    output.mkdir(parents=True, exist_ok=True)
-    files = []
-    with Stopwatch() as timed:
-        with progress_bar("questions") as progress:
-            overview = find_overview(table, progress=progress)
-        for name, figure in table_figures(table, overview):
-            path = output / f"{name}.{to.value}"
-            save_figure(figure, path, inches=inches)
-            files.append(str(path))
-    rows = [
-        f"{timed.elapsed:.1f} s; wrote",
-        *(f"  {file}" for file in files),
-        next_line("era", "table", "show", table_file, "--weak"),
-    ]
-    print_report(rows, {"files": files}, as_json=as_json)
-
-
-def export(
-    table_file: TableArgument,
-    to: Annotated[Format, typer.Option("--format", help="MATLAB and Octave, or text.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
-    content: Annotated[
-        TableContent | None,
-        typer.Option(help="Rows of a CSV file: patterns of the map, or fields on the raster."),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Write a table for other programs.
-
-    docs/reference/table-file.md describes the content.
-    """
-    from model.study.overview import export_csv, export_mat
-    from model.table.table_file import load_table
-
-    if content is not None and to is Format.MAT:
-        raise InputError("--content must be left out with --format mat, which holds everything")
-    check_place(output, example=f"table.{to.value}")
-    check_ending(output, f".{to.value}", what=f"a file of --format {to.value}")
-    table = load_table(table_file)
-    if to is Format.MAT:
-        export_mat(table, output)
-    else:
-        export_csv(table, output, content=(content or TableContent.PATTERNS).value)
-    rows = [
-        f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
-        f"Next: {_reader(to, output)}",
-    ]
-    print_report(rows, {"files": [str(output)]}, as_json=as_json)
-
-
-def _reader(to: Format, output: Path) -> str:
-    """Format a hint that opens the file."""
-    if to is Format.MAT:
-        return f"load('{output}') in MATLAB or Octave, scipy.io.loadmat in Python"
-    return f"open {output} in a spreadsheet, or pandas.read_csv('{output}')"
 
 
 def contrast_map(
@@ -424,7 +403,7 @@ def contrast_map(
 
 
 def _map_rows(found: "ContrastMap") -> Iterator[str]:
-    """Yield a map of each drive mode, the largest y first, and its distribution."""
+    """Yield a map for each drive mode, largest y first, each with its percentiles."""
     import numpy as np
 
     for mode, promised in found.promised_db.items():
@@ -441,86 +420,69 @@ def _map_rows(found: "ContrastMap") -> Iterator[str]:
         yield ""
 
 
-def build(
-    rig_file: RigArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="TABLE", help="File to write.")],
-    frequencies: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LO:HI:STEP",
-            help="Frequencies in Hz, both ends included; default: 40:500:10 within the rig's "
-            "limits.frequency.",
-        ),
-    ] = None,
-    drive_mode: Annotated[
-        str, typer.Option("--mode", help="Default drive mode: switched or phased.")
-    ] = "switched",
-    grid: Annotated[
-        str, typer.Option(metavar="NXxNY", help="Target cells along x and y.")
-    ] = "12x9",
-    mesh: MeshOption = None,
-    workers: Annotated[int, typer.Option(min=1, max=256, help="Number of processes.")] = 1,
+def plot(
+    table_file: TableArgument,
+    output: FolderOption,
+    to: Annotated[
+        Literal["png", "svg", "pdf"], typer.Option("--format", help="Of the pictures.")
+    ] = "png",
+    size: SizeOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve the plate and write its table."""
-    from model.compiled.kernels import why_slow
-    from model.drive_modes import checked_mode
-    from model.finger import Grid
-    from model.rig.rig_file import load_rig
-    from model.table.table import default_drive_frequencies
-    from model.table.table_file import ZIP, TableProblem, save_table, solve_table
+    """Draw weak cells, levels, contrast and an answer."""
+    from model.figures import save_figure, table_figures
+    from model.study.overview import find_overview
+    from model.table.table_file import load_table
 
-    checked_mode(drive_mode, "--mode")
-    check_place(output, example="table.npz")
-    check_ending(output, ".npz", what="a localization table")
-    check_replaceable(output, is_own=begins_with(output, ZIP), what="localization table")
-    rig = load_rig(rig_file, mesh=mesh)
-    chosen = (
-        parse_frequencies(frequencies) if frequencies else default_drive_frequencies(rig.limits)
-    )
-    problem = TableProblem(rig, chosen, Grid(*parse_pair(grid, what="--grid")))
-    with Stopwatch() as timed, progress_bar("parts") as progress:
-        table = solve_table(problem, drive_mode=drive_mode, workers=workers, progress=progress)
-    save_table(table, output)
-    error = 100 * float(table.discretisation_error.max())
+    inches = figure_size(size)
+    table = load_table(table_file)
+    output.mkdir(parents=True, exist_ok=True)
+    files = []
+    with Stopwatch() as timed:
+        with progress_bar("questions") as progress:
+            overview = find_overview(table, progress=progress)
+        for name, figure in table_figures(table, overview):
+            path = output / f"{name}.{to}"
+            save_figure(figure, path, inches=inches)
+            files.append(str(path))
     rows = [
-        f"{counted(table.pattern_count, 'pattern')} of "
-        f"{counted(len(table.frequencies), 'frequency', plural='frequencies')} for "
-        f"{counted(table.grid.cell_count, 'cell')}, built in {timed.elapsed:.2f} s",
-        f"mesh {table.mesh}: error of the fields {error:.3g} %, estimated with "
-        f"{table.reference_mesh}",
-        rig.uncertainty_note,
-        f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)",
-        next_line("era", "table", "show", output),
+        f"{timed.elapsed:.1f} s; wrote",
+        *(f"  {file}" for file in files),
+        next_line("era", "table", "show", table_file, "--weak"),
     ]
-    answer = {
-        "patterns": table.pattern_count,
-        "cells": table.grid.cell_count,
-        "drive_frequencies_hz": table.frequencies.tolist(),
-        "mesh": [table.mesh.nx, table.mesh.ny],
-        "element": table.mesh.element_name,
-        "discretisation_error_percent": error,
-        "mode": table.drive_mode,
-        "fingerprint": table.fingerprint,
-        "code_version": table.code_version,
-        "exactly_known": [*rig.exactly_known],
-        "build_time_s": timed.elapsed,
-        "files": [str(output)],
-    }
-    print_report(rows, answer, as_json=as_json)
-    for warning in filter(None, (_coarse(error, table.mesh), why_slow())):
-        typer.echo(f"era: warning: {warning}", err=True)
+    print_report(rows, {"files": files}, as_json=as_json)
 
 
-NOTED_ERROR = 5.0
-"""Error of the fields [%] from which a mesh is called coarse, as large as that of a gain."""
+def export(
+    table_file: TableArgument,
+    to: Annotated[
+        Literal["mat", "csv"], typer.Option("--format", help="MATLAB and Octave, or text.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")],
+    content: Annotated[
+        Literal["patterns", "fields"] | None,
+        typer.Option(help="Rows of a CSV file: patterns of the map, or fields on the raster."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a table for other programs.
 
+    docs/reference/table-file.md describes the content.
+    """
+    from model.study.overview import export_csv, export_mat
+    from model.table.table_file import load_table
 
-def _coarse(error: float, mesh: "PlateMesh") -> str | None:
-    """Warn of the error [%] of a mesh, None for a small one."""
-    if error < NOTED_ERROR:
-        return None
-    return (
-        f"mesh {mesh} is coarse: its fields are wrong by {error:.3g} %; what is promised takes "
-        "this error into account and is lower for it; `mesh: auto` chooses one for about 1 %"
-    )
+    if content is not None and to == "mat":
+        raise InputError("--content must be left out with --format mat, which holds everything")
+    check_place(output, example=f"table.{to}")
+    check_ending(output, f".{to}", what=f"a file of --format {to}")
+    table = load_table(table_file)
+    if to == "mat":
+        export_mat(table, output)
+        reader = f"load('{output}') in MATLAB or Octave, scipy.io.loadmat in Python"
+    else:
+        export_csv(table, output, content=content or "patterns")
+        reader = f"open {output} in a spreadsheet, or pandas.read_csv('{output}')"
+    size = f"{output.stat().st_size / 1e6:.1f} MB"
+    rows = [f"wrote {output} ({size})", f"Next: {reader}"]
+    print_report(rows, {"files": [str(output)]}, as_json=as_json)

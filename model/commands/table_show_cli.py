@@ -1,4 +1,7 @@
-"""`era table show` and `era table verify`, by other methods or by measuring."""
+"""`era table show` and `era table verify`: a table's summary, and checks of its answers.
+
+A table is verified by other methods of solution, or by measuring on the plate itself.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,6 +48,95 @@ def show(
         _example_query(table_file, summary["plate_m"]),
     ]
     print_report(rows, summary | {"map": cells.as_json()}, as_json=as_json)
+
+
+def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
+    """Format the summary of a table; mapped: cells of the map that the shares are of."""
+    from model.finger import FELT_DB_SL
+    from model.study.contrast_maps import WANTED_CONTRAST_DB as WANTED_DB
+
+    def percent(key: str) -> str:
+        return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
+
+    low, high = summary["frequency_range_hz"]
+    measured_to = summary["threshold_measured_to_hz"]
+    beyond = f", extrapolated above {measured_to:g} Hz" if high > measured_to else ""
+    threshold = f"{summary['threshold']}{beyond}"
+    length, width, thickness = (1000 * side for side in summary["plate_m"])
+
+    def with_error(key: str) -> str:
+        value, error = summary[f"{key}_db"], summary[f"{key}_error_db"]
+        return "-" if value is None else f"{value:.1f} ± {error:.1f} dB"
+
+    contrast = [
+        (
+            f"contrast to {others} other{'s' if others > 1 else ''}",
+            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, one in ten "
+            f"below {with_error(f'promised_contrast_{others}_quiet_tenth_percentile')}; "
+            f"nominal {with_error(f'contrast_{others}_quiet_median')}",
+        )
+        for others in (1, 2, 3)
+    ]
+    rows = [
+        ("plate", f"{length:g} x {width:g} x {thickness:g} mm"),
+        ("ERAs", ", ".join(summary["eras"])),
+        ("frequencies", f"{summary['frequency_count']} from {low:g} to {high:g} Hz"),
+        ("thresholds", threshold),
+        ("mode", f"{summary['mode']} by default"),
+        ("patterns", f"{summary['patterns']} of one or two ERAs"),
+        ("cells", f"{summary['cells']} ({summary['grid']})"),
+        (
+            "feasible cells",
+            f"{percent('feasible_share')} of {mapped} ({WANTED_DB:g} dB or more to the median "
+            "finger)",
+        ),
+        (
+            "weak cells",
+            f"{percent('weak_share')} of {mapped} (below {WANTED_DB:g} dB to one finger in ten)",
+        ),
+        ("dead zones", f"{percent('dead_zone_share')} (below {FELT_DB_SL:g} dB SL at full stroke)"),
+        ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
+        *contrast,
+        (
+            "mesh",
+            f"{summary['mesh_name']}, error of the fields "
+            f"{summary['discretisation_error_percent']:.3g} %, estimated with "
+            f"{summary['reference_mesh']}",
+        ),
+        ("raster", summary["raster"]),
+        ("built by", f"era-haptics {summary['code_version']}"),
+        ("fingerprint", summary["fingerprint"]),
+    ]
+    return [f"{name:20s} {value}" for name, value in rows]
+
+
+def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
+    """Yield the map of a table; listed: with every weak cell."""
+    import numpy as np
+
+    from model.study.contrast_maps import text_map
+
+    yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
+    if np.isfinite(cells.errors_db).any():
+        median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
+        yield f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB"
+    yield from text_map(cells)
+    if listed:
+        yield "\nweak cells: centre, contrast to the median other finger, to one in ten"
+        for (x, y), median, tenth in zip(
+            cells.centres[cells.weak],
+            cells.median_db[cells.weak],
+            cells.tenth_db[cells.weak],
+            strict=True,
+        ):
+            yield f"({x:.4f}, {y:.4f}) m {median:7.1f} dB {tenth:7.1f} dB"
+
+
+def _example_query(table_file: Path, plate: list[float]) -> str:
+    """Format a query with fingers at one and three quarters across the plate."""
+    length, width, _ = plate
+    quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
+    return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
 
 
 def verify(
@@ -141,95 +233,6 @@ def _verify_by_solving(
     print_report(rows, answer, as_json=as_json)
     if found.failed_count:
         raise typer.Exit(1)
-
-
-def _example_query(table_file: Path, plate: list[float]) -> str:
-    """Format a query with fingers at one and three quarters across the plate."""
-    length, width, _ = plate
-    quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
-    return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
-
-
-def _summary_rows(summary: dict[str, Any], *, mapped: str) -> list[str]:
-    """Format the summary of a table; mapped: cells of the map that the shares are of."""
-    from model.finger import FELT_DB_SL
-    from model.study.contrast_maps import WANTED_CONTRAST_DB as WANTED_DB
-
-    def percent(key: str) -> str:
-        return "-" if summary[key] is None else f"{100 * summary[key]:.3g} %"
-
-    low, high = summary["frequency_range_hz"]
-    measured_to = summary["threshold_measured_to_hz"]
-    beyond = f", extrapolated above {measured_to:g} Hz" if high > measured_to else ""
-    threshold = f"{summary['threshold']}{beyond}"
-    length, width, thickness = (1000 * side for side in summary["plate_m"])
-
-    def with_error(key: str) -> str:
-        value, error = summary[f"{key}_db"], summary[f"{key}_error_db"]
-        return "-" if value is None else f"{value:.1f} ± {error:.1f} dB"
-
-    contrast = [
-        (
-            f"contrast to {others} other{'s' if others > 1 else ''}",
-            f"median {with_error(f'promised_contrast_{others}_quiet_median')}, one in ten "
-            f"below {with_error(f'promised_contrast_{others}_quiet_tenth_percentile')}; "
-            f"nominal {with_error(f'contrast_{others}_quiet_median')}",
-        )
-        for others in (1, 2, 3)
-    ]
-    rows = [
-        ("plate", f"{length:g} x {width:g} x {thickness:g} mm"),
-        ("ERAs", ", ".join(summary["eras"])),
-        ("frequencies", f"{summary['frequency_count']} from {low:g} to {high:g} Hz"),
-        ("thresholds", threshold),
-        ("mode", f"{summary['mode']} by default"),
-        ("patterns", f"{summary['patterns']} of one or two ERAs"),
-        ("cells", f"{summary['cells']} ({summary['grid']})"),
-        (
-            "feasible cells",
-            f"{percent('feasible_share')} of {mapped} ({WANTED_DB:g} dB or more to the median "
-            "finger)",
-        ),
-        (
-            "weak cells",
-            f"{percent('weak_share')} of {mapped} (below {WANTED_DB:g} dB to one finger in ten)",
-        ),
-        ("dead zones", f"{percent('dead_zone_share')} (below {FELT_DB_SL:g} dB SL at full stroke)"),
-        ("least level", f"{summary['least_level_at_full_stroke_db_sl']:.1f} dB SL at full stroke"),
-        *contrast,
-        (
-            "mesh",
-            f"{summary['mesh_name']}, error of the fields "
-            f"{summary['discretisation_error_percent']:.3g} %, estimated with "
-            f"{summary['reference_mesh']}",
-        ),
-        ("raster", summary["raster"]),
-        ("built by", f"era-haptics {summary['code_version']}"),
-        ("fingerprint", summary["fingerprint"]),
-    ]
-    return [f"{name:20s} {value}" for name, value in rows]
-
-
-def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
-    """Yield the map of a table; listed: with every weak cell."""
-    import numpy as np
-
-    from model.study.contrast_maps import text_map
-
-    yield "promised felt contrast, dB, to the median other finger; * marks weak cells"
-    if np.isfinite(cells.errors_db).any():
-        median, tenth = np.sqrt(np.nanmean(cells.errors_db**2, axis=1))
-        yield f"± {median:.1f} dB by the choice of other fingers, to one in ten ± {tenth:.1f} dB"
-    yield from text_map(cells)
-    if listed:
-        yield "\nweak cells: centre, contrast to the median other finger, to one in ten"
-        for (x, y), median, tenth in zip(
-            cells.centres[cells.weak],
-            cells.median_db[cells.weak],
-            cells.tenth_db[cells.weak],
-            strict=True,
-        ):
-            yield f"({x:.4f}, {y:.4f}) m {median:7.1f} dB {tenth:7.1f} dB"
 
 
 def _verification_rows(found: "Verification") -> Iterator[str]:

@@ -16,7 +16,13 @@ import plates as calibration_plates
 from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, true_values
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
-from model.calibration.calibrate import Calibration, as_json, calibrate, change_rows, finding_rows
+from model.calibration.calibrate import (
+    Calibration,
+    calibrate,
+    calibration_json,
+    change_rows,
+    finding_rows,
+)
 from model.calibration.responses import Responses
 from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
@@ -63,7 +69,9 @@ def test_report_has_the_feet_that_responses_tell_of_and_names_others() -> None:
     assert any(
         "rig's value kept" in row and "foot 2 stiffness" in row for row in finding_rows(found)
     )
-    said = {each["foot"]: each for each in as_json(found, rig)["parameters"] if each["foot"]}
+    said = {
+        each["foot"]: each for each in calibration_json(found, rig)["parameters"] if each["foot"]
+    }
     assert said["1"]["after"] == first.value
     assert (said["2"]["identified"], said["2"]["before"]) == (False, SOFT)
 

@@ -1,1 +1,1 @@
-"""Fitting a rig to what was measured on it."""
+"""Calibration of a rig by responses measured on it, and the files of measured responses."""

@@ -1,34 +1,23 @@
-"""Maximum a posteriori fit of a rig's parameters, with the form errors of its plate.
+"""Maximum a posteriori fit of a rig's parameters and of its plate's form errors to responses.
 
     d_fes = g_fe a_fes(z) + noise
 
-d measured, a of the model as sensors of some scales read it, g a complex gain of every frequency
-and ERA. Gains are projected out (`model.calibration.fit`); z is searched: the
-rig's values, which no prior holds, scales of sensors, form errors and what data sheets know better,
-which tolerances hold.
+d are measured values at frequency f, ERA e and sensor s, a those of the model as sensors of some
+scales read them, g a complex gain of every frequency and ERA. Gains enter linearly: the best ones
+follow from any model, so that only z is searched, with the derivatives of gains and residual by it
+(variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973). z has the rig's values,
+without a prior, and what tolerances hold: scales of sensors, form errors, and what data sheets know
+better. The free plate is solved once (`model.identification.forward`).
 
-Noise has a constant part and a part in proportion to the response, both estimated from the
-residuals. What a check's plate leaves shows the outliers, the worst of a row first, since one pulls
-the gain of its row. What tolerances leave undetermined is part of the standard errors:
-C = (J^T J)^-1 with the tolerances as rows of J, times chi² per degree of freedom where that is
-above 1. With gains projected out of J this is the Schur complement, so that of a gain
+Noise has a constant part and a part in proportion to the response, both estimated from residuals.
+Outliers are found at the plate of the preceding check, the worst of a row first, since each pulls
+the gain of its row. Standard errors contain what tolerances leave undetermined: C = (J^T J)^-1 with
+the tolerances as rows of J, times chi² per degree of freedom where that is above 1. With gains
+projected out of J this is the Schur complement, so that of a gain
 
     var g_fe = sigma_fe² + (dg_fe/dz) C (dg_fe/dz)^T
 
-sigma of the noise: scales that sensors have in common are part of it.
-
-Variable projection of gains, and measures of responses over sensors.
-
-    d_fes = g_fe a_fes + noise
-
-d measured, a of the model, g the gain at frequency f of ERA e. Gains enter linearly: the best ones
-follow from any model, so that only its parameters are searched, with the derivatives of gains and
-residual by these (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
-
-A rig's plate at sensors, for values of what responses there determine.
-
-The forward model of an identification (`model.identification.forward`) with modulus and loss factor
-of the plate, and stiffness, damping and bolt mass of each ERA. The free plate is solved once.
+with sigma of the noise, in which scales that all sensors have in common are included.
 """
 
 import math
@@ -58,6 +47,572 @@ from model.identification.parameters import (
 )
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
+
+_LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
+STARTS = [
+    (modulus, stiffness)
+    for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
+    for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]).tolist()
+]
+"""Logarithms of factors on modulus and stiffnesses from which to search."""
+
+_ADDED_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
+
+_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_ROUNDS = 8
+_SETTLED = 0.1  # of the noise between two rounds
+_MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
+_CLEAR = 3.0  # standard errors of a clear deviation
+_MEAN_WEIGHT = 1e3  # of the row that holds the mean of scales
+_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A fitted value of a rig: of the plate, of an ERA or of a foot."""
+
+    kind: str
+    """Kind of value, as a key of `VALUE_UNITS`."""
+    era: str
+    """Name of the ERA, "" for the plate and for feet."""
+    field: str = ""
+    """Attribute of the ERA, which exciters name differently; by default the kind."""
+    foot: str = ""
+    """Name of the foot, "" for other values."""
+
+    @property
+    def name(self) -> str:
+        """Name in reports."""
+        if self.foot:
+            return f"foot {self.foot} stiffness"
+        return f"{self.era or 'plate'} {self.field or self.kind}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of its value."""
+        return VALUE_UNITS[self.kind]
+
+    @property
+    def is_factor(self) -> bool:
+        """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
+        return self.kind in ("modulus", "stiffness", "magnet_mass", "supports")
+
+    def of(self, rig: Rig) -> float:
+        """The value in a rig."""
+        if self.era:
+            era = rig.era(self.era)
+            return float(getattr(era, era.fields[self.kind]))
+        if self.foot:
+            return rig.masses[rig.feet[rig.foot_names.index(self.foot)]].stiffness
+        return (
+            rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SensedPlate:
+    """A rig's plate with sensors at points, without the rig's gains, and the values fitted of it.
+
+    Parameters z (p,) are those of the model's space, in standard deviations from the rig's values.
+    """
+
+    rig: Rig
+    model: ForwardModel
+    """Its space has the n fitted values, and form errors if there are any; all else is known."""
+
+    @cached_property
+    def rows(self) -> tuple[Parameter, ...]:
+        """The fitted values (n,): modulus and loss factor, those of every ERA and of every foot."""
+        of_eras = (
+            Parameter(kind, era.name, era.fields[kind])
+            for era in self.rig.eras
+            for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
+            if kind in era.fields
+        )
+        names = self.rig.foot_names if self.rig.uncertainty.supports else ()
+        feet = (Parameter("supports", "", foot=name) for name in names)
+        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras, *feet)
+
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Mask of the fitted values that a prior holds (n,)."""
+        return np.asarray(self.largest_errors != 1)
+
+    @cached_property
+    def largest_errors(self) -> FloatArray:
+        """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
+
+        Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
+        """
+        by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
+        rows = self.rows
+        return np.array(
+            [math.inf if row in by_sheet else MAX_GUESSED if row.foot else 1.0 for row in rows]
+        )
+
+    @cached_property
+    def of_exciters(self) -> tuple[Parameter, ...]:
+        """The fitted values of exciters."""
+        exciters = {era.name for era in self.rig.eras if "force_factor" in era.fields}
+        return tuple(row for row in self.rows if row.era in exciters)
+
+    @property
+    def masses(self) -> FloatArray:
+        """Mass of the sensor at each point while it measures there, (s,) [kg]."""
+        return np.array([sensor.mass for sensor in self.model.sensors])
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """Number of each fitted value in the space (n,)."""
+        names, groups = ["", *(era.name for era in self.rig.eras)], self.model.space.groups
+        feet = ["", *self.rig.foot_names]
+        return np.array(
+            [
+                groups[_ADDED_KINDS.get(row.kind, row.kind)].start
+                + max(names.index(row.era) + feet.index(row.foot) - 1, 0)
+                for row in self.rows
+            ]
+        )
+
+    def of(self, rig: Rig) -> "SensedPlate":
+        """The plate of a rig with another modulus, thickness, loss factor, ERAs and masses.
+
+        Its free plate is not solved again.
+        """
+        shifting = None
+        if self.model.form is not None:
+            natural = np.sqrt(np.maximum(self.model.modes.eigenvalues, 0)) / (2 * np.pi)
+            highest = _HIGHEST * self.model.frequencies.max()
+            lowest = _LOWEST * rig.plate.lowest_bending_frequency
+            shifting = int(((natural > lowest) & (natural < highest)).sum())
+        names = [sensor.name for sensor in self.model.sensors]
+        space = space_by_sheets(rig, names, shifting)
+        eras = tuple(replace(era, gains=()) for era in rig.eras)
+        return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
+
+    def responses(self, z: FloatArray | None = None) -> ComplexArray:
+        """Acceleration per base displacement of each ERA at z (p,), by default the rig's values.
+
+        Shape (f, e, s) [1/s²].
+        """
+        z = np.zeros(self.model.space.size) if z is None else z
+        return np.swapaxes(self.model.at(z).responses, 1, 2)
+
+    def rig_at(self, z: FloatArray) -> Rig:
+        """The rig with the fitted values of z."""
+        own = np.zeros(len(z))
+        own[self.numbers] = z[self.numbers]
+        beside = self.model.space.groups["force_factor"]
+        own[beside] = z[beside]  # with the damping that was found beside it
+        values = Values.of(self.rig, self.model.space, own)
+        return rig_with(self.rig, values, self.rig.uncertainty)
+
+    def values(self, z: FloatArray) -> FloatArray:
+        """The fitted values at z in their units (n,)."""
+        rig = self.rig_at(z)
+        return np.array([row.of(rig) for row in self.rows])
+
+    def deviations(self, z: FloatArray) -> FloatArray:
+        """Deviations of the fitted values at z (n,), in standard deviations of rigs as written.
+
+        That is the larger of the uncertainty of data sheets and that of the rig. Losses vary by
+        factors: where they exceed the rig's, their logarithm counts.
+        """
+        stated, std = self.rig.uncertainty, self.model.space.std[self.numbers]
+        factor = math.log(stated.damping)
+        of_kind = {
+            "modulus": math.hypot(2 * stated.thickness, stated.modulus),
+            "loss_factor": factor,
+            "stiffness": math.hypot(stated.stiffness, stated.thickness),
+            "magnet_mass": math.hypot(stated.stiffness, stated.thickness),
+            "damping": math.hypot(factor, KINDS["damping_each"].std),
+            "supports": stated.supports,
+        }
+        own = np.array([row.of(self.rig) for row in self.rows])
+        of_rig = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
+        is_lossy = (own > 0) & [row.kind in _ADDED_KINDS for row in self.rows]
+        unit = std / np.where(is_lossy, own, 1.0)
+        size = unit * z[self.numbers]
+        is_more = is_lossy & (size > 0)
+        size, unit = (np.where(is_more, np.log1p(np.abs(each)), each) for each in (size, unit))
+        return np.asarray(size / np.maximum(unit, of_rig))
+
+    def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
+        """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""
+        is_factor = np.array([row.is_factor for row in self.rows])
+        slopes = self.model.space.std[self.numbers] * np.where(is_factor, self.values(z), 1.0)
+        return np.asarray(slopes * error[self.numbers])
+
+    def moved(self, modulus: float, stiffness: float) -> FloatArray:
+        """Parameters z (p,) for logarithms of factors on the rig's modulus and stiffnesses."""
+        space = self.model.space
+        found = np.zeros(space.size)
+        for kind, logarithm in (("modulus", modulus), ("stiffness", stiffness)):
+            found[space.groups[kind]] = logarithm / space.std[space.groups[kind]]
+        return found
+
+
+def sensed_plate(
+    rig: Rig,
+    points: FloatArray,
+    frequencies: FloatArray,
+    *,
+    masses: FloatArray | None = None,
+    has_form: bool = False,
+) -> SensedPlate:
+    """Solve a rig's free plate once, for sensors at points (s, 2) [m] and frequencies (f,) [Hz].
+
+    masses (s,) [kg]: of a sensor that is moved, as `Sensor.mass`, None for none; has_form: whether
+    the plate may have form errors. Raises InputError for frequencies too high for its
+    mesh.
+    """
+    rig.mesh.check_frequencies(rig.plate, frequencies)
+    loads = np.zeros(len(points)) if masses is None else masses
+    sensors = [
+        Sensor(f"sensor {n}", x=x, y=y, mass=mass)
+        for n, ((x, y), mass) in enumerate(zip(points.tolist(), loads.tolist(), strict=True))
+    ]
+    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
+    form = reduced_modes(rig, free) if has_form else None
+    space = space_by_sheets(rig, (), None)
+    return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
+
+
+def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> SensedPlate:
+    """The plate of a rig at the sensors and frequencies of a measurement, as `sensed_plate`."""
+    return sensed_plate(
+        rig,
+        observation.points,
+        observation.frequencies,
+        masses=observation.masses,
+        has_form=has_form,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem:
+    """The plate of a rig with its form errors, and the measured values."""
+
+    plate: SensedPlate
+    values: ComplexArray
+    """Measured values (f, e, s) [1/s²], NaN where not measured."""
+    searched: NDArray[np.bool_]
+    """Mask (p,) of the parameters to be fitted."""
+    free_scales: NDArray[np.bool_]
+    """Mask (s,) of the scales of sensors without a tolerance."""
+
+    @classmethod
+    def of(cls, plate: SensedPlate, values: ComplexArray) -> Self:
+        """Search everything but the gains of channels, with scales that no tolerance holds."""
+        space = plate.model.space
+        searched = space.uncertain & ~space.of("gain")
+        return cls(plate, values, searched, np.ones(values.shape[2], dtype=bool))
+
+    def without(self, sensors: NDArray[np.bool_]) -> Self:
+        """Leave out the values of some sensors (s,), whose parameters then stay as they start."""
+        groups, searched = self.plate.model.space.groups, self.searched.copy()
+        searched[groups["sensor_scale"]] &= ~sensors
+        searched[groups["sensor_place"]] &= np.repeat(~sensors, 2)
+        values = np.where(sensors, np.nan, self.values)
+        return replace(self, values=values, searched=searched)
+
+    def with_law_at(self, z: FloatArray) -> Self:
+        """Allow viscous losses, whose effect is that at z (p,): it changes little with z."""
+        model = self.plate.model
+        model = replace(model, law=viscous_difference(replace(model, law=None), z))
+        return replace(self, plate=replace(self.plate, model=model))
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Mask of the rig's values that are searched (n,)."""
+        return self.searched[self.plate.numbers]
+
+    def scales(self, z: FloatArray) -> FloatArray:
+        """Scales of sensors (s,) of parameters z (p,)."""
+        return 1 + self.plate.model.space.values(z, "sensor_scale")
+
+    def scale_errors(self, fit: "Fit") -> FloatArray:
+        """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
+        return self.free_scales * self.plate.model.space.values(fit.error, "sensor_scale")
+
+    def at_scales(self, z: FloatArray, scales: FloatArray) -> FloatArray:
+        """Parameters z (p,) with other scales of sensors (s,)."""
+        space, found = self.plate.model.space, z.copy()
+        own = space.groups["sensor_scale"]
+        found[own] = (scales - 1) / space.std[own]
+        return found
+
+    def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rows (m, n) and targets (m,) that hold searched scales and form errors."""
+        space, held = self.plate.model.space, self.searched.copy()
+        held[self.plate.numbers] = self.free & self.plate.held
+        held[space.groups["sensor_scale"]] &= ~self.free_scales
+        rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
+        if self.free_scales.all():
+            # Gains determine a common scale; the mean is held.
+            mean = np.zeros((1, space.size))
+            own = space.groups["sensor_scale"]
+            mean[0, own] = _MEAN_WEIGHT * (space.std * self.searched)[own] / len(self.free_scales)
+            rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
+        return rows[:, self.searched], targets
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Result of a fit."""
+
+    z: FloatArray
+    """Parameters (p,)."""
+    noise: FloatArray
+    """Standard deviation of the real or imaginary part of a value (f, e)."""
+    used: NDArray[np.bool_]
+    """Mask (f, e, s) of values without outliers."""
+    error: FloatArray
+    """Standard errors of the parameters (p,)."""
+    gains: ComplexArray
+    """Gains (f, e), NaN where not measured."""
+    gains_error: FloatArray
+    """Standard errors of the magnitudes of the gains (f, e)."""
+    readings_error: FloatArray
+    """Errors of fields by their readings: relative magnitudes and phases [rad] (2, f, e)."""
+    common_error: float
+    """Error that the magnitudes of all fields have in common, relative."""
+    predicted: ComplexArray
+    """Predicted values (f, e, s), with gains and scales."""
+    chi2: float
+    """Sum of squares per degree of freedom."""
+    dampers: float
+    """Effect of all ERAs' dampers on the responses, relative to that of the plate's own losses."""
+
+
+def start_at(
+    problem: CalibrationProblem, z: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Start of a fit by the plate at z (p,): z with scales of sensors, noise and mask of values."""
+    scales, noise, used = without_outliers(problem.values, problem.plate.responses(z))
+    return problem.at_scales(z, scales), noise, used
+
+
+def without_outliers(
+    values: ComplexArray, model: ComplexArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Scales of sensors (s,), noise (f, e) and the mask (f, e, s) of values without outliers.
+
+    values, model (f, e, s): measured, and by a plate, up to a gain of each frequency and ERA.
+    """
+    used, scales = np.isfinite(values), np.ones(values.shape[2])
+    heard = used.any(axis=(0, 1))
+    for _ in range(_ROUNDS):
+        weight = used / row_rms(values, used)[:, :, None]
+        gains, _ = project_gains(scales * model, values, weight)
+        predicted = np.nan_to_num(gains)[:, :, None] * model
+        share = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
+        scales[heard] = np.nanmedian(share.real[:, :, heard], axis=(0, 1))
+        scales = scales / np.median(scales)
+        raw = np.abs(values - scales * predicted)
+        noise = _noise_of(values, raw, used)
+        kept = _without_worst(raw / noise[:, :, None], used)
+        if (kept == used).all():
+            break
+        used, heard = kept, kept.any(axis=(0, 1))
+    return scales, noise, used
+
+
+def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drop the worst value of each row that has one beyond bounds and more than two values."""
+    deviation = np.where(used, deviation / np.sqrt(2), 0)
+    worst = deviation.argmax(axis=2)
+    f, e = np.nonzero((deviation.max(axis=2) > _MAX_DEVIATION) & (used.sum(axis=2) > 2))
+    kept = used.copy()
+    kept[f, e, worst[f, e]] = False
+    return kept
+
+
+def solve(
+    problem: CalibrationProblem, z: FloatArray, noise: FloatArray, used: NDArray[np.bool_]
+) -> Fit:
+    """Fit parameters, scales and form errors from z (p,), noise (f, e) and a mask (f, e, s)."""
+    finite = np.isfinite(problem.values)
+    used = used & finite
+    for _ in range(_ROUNDS):
+        problem = problem.with_law_at(z)
+        weight, before = used / noise[:, :, None], noise
+        found = _search(problem, z, weight)
+        z = found.x
+        model = problem.plate.responses(z)
+        gains, _ = project_gains(model, problem.values, weight)
+        raw = np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
+        noise = _noise_of(problem.values, raw, used, _noise_left(model, found, weight))
+        # What form errors explain comes back.
+        kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
+        is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
+        used = kept
+        if is_settled:
+            break
+    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
+
+
+def clear(fit: Fit) -> NDArray[np.bool_]:
+    """Mask (p,) of parameters that deviate by several standard errors."""
+    return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
+
+
+def without_form(problem: CalibrationProblem, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Fit the plate without form errors: parameters z (p,), and their standard errors (p,).
+
+    Form errors count as noise, since a rig file does not have them; their likeness to another
+    modulus or loss factor returns to these, as that of a longer side. ERAs stay where they clearly
+    are.
+    """
+    space, z = problem.plate.model.space, fit.z.copy()
+    mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
+    form = space.of(*FORM, "mode_shifts") & ~mine
+    z[form | (space.of("place") & ~clear(fit))] = 0.0
+    part = replace(problem, searched=problem.searched & mine)
+    found = _search(part, z, fit.used / fit.noise[:, :, None])
+    return found.x, _errors(part, found, fit.used)[0]
+
+
+def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:
+    return fit_with_gains(
+        problem.plate.model,
+        problem.values,
+        weight,
+        start,
+        problem.searched,
+        prior=problem.tolerances(start),
+    )
+
+
+def _noise_of(
+    values: ComplexArray,
+    raw: FloatArray,
+    used: NDArray[np.bool_],
+    left: FloatArray | None = None,
+) -> FloatArray:
+    """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
+
+    From the medians of residuals raw (f, e, s), over rows from weak to strong. left (f, e, s):
+    share of noise power that a fit leaves in them; by default all but what a gain takes of its row.
+    """
+    size = row_rms(values, used)
+    sensors = used.sum(axis=2)
+    rows = np.flatnonzero((sensors >= 2).ravel())
+    floor = _SMALLEST_NOISE * size
+    if len(rows) < 4:
+        return floor
+    if left is None:
+        # A gain takes one of the row's values with it.
+        left = np.broadcast_to((1 - 1 / np.maximum(sensors, 2))[:, :, None], raw.shape)
+    telling = used & (left > _MIN_NOISE_LEFT)
+    power = np.full(raw.shape, np.nan)
+    power[telling] = raw[telling] ** 2 / left[telling] / 2
+    power = power.reshape(-1, used.shape[2])[rows]
+    order = np.argsort(size.ravel()[rows], kind="stable")
+    found, at = [], []
+    for group in np.array_split(order, min(12, len(rows) // 2)):
+        # The median of |z|² of complex noise with variance 2 is 2 log 2.
+        found.append(np.nanmedian(power[group]) / np.log(2))
+        at.append(np.median(size.ravel()[rows][group] ** 2))
+    scale = np.maximum(found, 1e-12 * np.array(at))
+    matrix = np.column_stack([1 / scale, np.array(at) / scale])
+    weight = np.linalg.norm(matrix, axis=0)
+    a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
+    return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
+
+
+def _noise_left(model: ComplexArray, found: Minimum, weight: FloatArray) -> FloatArray:
+    """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
+
+    The leverage is that of its row's gain and of all searched parameters.
+    """
+    inside = weight > 0
+    by_gain = np.abs(weight * model) ** 2
+    total = by_gain.sum(axis=2, keepdims=True)
+    left = 1 - by_gain / np.where(total > 0, total, 1)
+    leverage = (_directions(found)[0] ** 2).sum(axis=1)
+    left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
+    return np.asarray(left)
+
+
+def _result(
+    problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
+) -> Fit:
+    z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
+    error, root, chi2 = _errors(problem, found, used)
+    model, by_z = responses_of(problem.plate.model, z, searched)
+    gains, _ = project_gains(model, problem.values, weight)
+    by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
+    power = (np.abs(weight * model) ** 2).sum(axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = by_gain / gains
+        of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
+    # A force factor is found with the gain: their product is what moves the plate.
+    space, numbers = problem.plate.model.space, np.flatnonzero(searched)
+    for era, factor in enumerate(space.indices("force_factor")):
+        relative[numbers == factor, :, era] += space.std[factor]
+    # What else is searched changes gain and field the opposite ways: sensors hear their product.
+    reads = space.of("sensor_scale", "sensor_place")[searched]
+    by_reading = np.tensordot(root[reads].T, relative[reads], axes=1)
+    common = np.nanmean(by_reading, axis=(1, 2), keepdims=True)
+    beside = by_reading - common
+    return Fit(
+        z,
+        noise,
+        used,
+        error,
+        gains,
+        np.abs(gains)
+        * np.sqrt(of_noise + (np.tensordot(root.T, relative.real, axes=1) ** 2).sum(axis=0)),
+        np.sqrt(of_noise + (np.array([beside.real, beside.imag]) ** 2).sum(axis=1)),
+        float(np.linalg.norm(common.real)),
+        gains[:, :, None] * model,
+        chi2,
+        _dampers(problem, found.x, root),
+    )
+
+
+def _errors(
+    problem: CalibrationProblem, found: Minimum, used: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, float]:
+    """Standard errors (p,), one of them along each direction (n, k), and chi²."""
+    searched, rows = problem.searched, int(used.any(axis=2).sum())
+    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
+    chi2 = float((found.residuals**2).sum()) / freedom
+    _, root, blind = _directions(found)
+    root = root * math.sqrt(max(chi2, 1.0))
+    error = np.zeros(len(found.x))
+    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
+    return error, root, chi2
+
+
+def _directions(found: Minimum) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Singular vectors (m, k) of the derivatives, and their standard errors in x (n, k).
+
+    The third is a mask (n,) of parameters that none of them determines.
+    """
+    size = np.linalg.norm(found.jacobian, axis=0)
+    size[size == 0] = 1e-300
+    rows, strength, columns = np.linalg.svd(found.jacobian / size, full_matrices=False)
+    seen = strength > 1e-9 * strength[0]
+    blind = (np.abs(columns[~seen]) > 1e-6).any(axis=0)
+    return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
+
+
+def _dampers(problem: CalibrationProblem, z: FloatArray, root: FloatArray) -> float:
+    """Relative error of the loss factor by a relative error of 1 of all dampers.
+
+    root (n, k): searched parameters by one standard error along each direction.
+    """
+    plate, moved = problem.plate, np.zeros((len(z), root.shape[1]))
+    moved[problem.searched] = root
+    kinds = np.array([each.kind for each in plate.rows])
+    values = plate.values(z) / plate.model.space.scale[plate.numbers]
+    relative = moved[plate.numbers] / np.where(values > 0, values, np.inf)[:, None]
+    dampers = relative[(kinds == "damping") & problem.free]
+    losses = relative[kinds == "loss_factor"][0]
+    slopes = np.linalg.lstsq(dampers @ dampers.T, dampers @ losses)[0]
+    return abs(float(slopes.sum()))
 
 
 def fit_with_gains(
@@ -191,571 +746,3 @@ def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
     inner = np.abs((model.conj() * values).sum(axis=-1)) ** 2
     power = (np.abs(values) ** 2).sum(axis=-1) * (np.abs(model) ** 2).sum(axis=-1)
     return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
-
-
-_LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
-STARTS = [
-    (modulus, stiffness)
-    for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
-    for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]).tolist()
-]
-"""Logarithms of factors on modulus and stiffnesses from which to search."""
-
-_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A value of a rig, such as is fitted: kind, and ERA, "" for the plate.
-
-    field: of the ERA, which an exciter may have another one of the kind; by default the kind. foot:
-    its name, "" for what is of no foot.
-    """
-
-    kind: str
-    era: str
-    field: str = ""
-    foot: str = ""
-
-    @property
-    def name(self) -> str:
-        """Name in reports."""
-        if self.foot:
-            return f"foot {self.foot} stiffness"
-        return f"{self.era or 'plate'} {self.field or self.kind}"
-
-    @property
-    def unit(self) -> str:
-        """Unit of its value."""
-        return VALUE_UNITS[self.kind]
-
-    @property
-    def is_factor(self) -> bool:
-        """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
-        return self.kind in ("modulus", "stiffness", "magnet_mass", "supports")
-
-    def of(self, rig: Rig) -> float:
-        """The value in a rig."""
-        if self.era:
-            era = rig.era(self.era)
-            return float(getattr(era, era.fields[self.kind]))
-        if self.foot:
-            return rig.masses[rig.feet[rig.foot_names.index(self.foot)]].stiffness
-        return (
-            rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class SensedPlate:
-    """A rig's plate with sensors at points, without the rig's gains, and what is fitted of the rig.
-
-    model: its space has the n fitted values, and form errors if there are any; all else is known.
-    Parameters z (p,) are those of the space, in standard deviations from the rig's values.
-    """
-
-    rig: Rig
-    model: ForwardModel
-
-    @cached_property
-    def rows(self) -> tuple[Parameter, ...]:
-        """The fitted values: modulus and loss factor, those of every ERA, of every foot, (n,)."""
-        of_eras = (
-            Parameter(kind, era.name, era.fields[kind])
-            for era in self.rig.eras
-            for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
-            if kind in era.fields
-        )
-        names = self.rig.foot_names if self.rig.uncertainty.supports else ()
-        feet = (Parameter("supports", "", foot=name) for name in names)
-        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras, *feet)
-
-    @cached_property
-    def held(self) -> NDArray[np.bool_]:
-        """Which fitted values (n,) a prior holds."""
-        return np.asarray(self.largest_errors != 1)
-
-    @cached_property
-    def largest_errors(self) -> FloatArray:
-        """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
-
-        Infinite for an exciter's coil and magnet, which its sheet holds; a prior holds feet, too.
-        """
-        by_sheet = [each for each in self.of_exciters if each.kind in ("bolt_mass", "magnet_mass")]
-        rows = self.rows
-        return np.array(
-            [math.inf if row in by_sheet else MAX_GUESSED if row.foot else 1.0 for row in rows]
-        )
-
-    @cached_property
-    def of_exciters(self) -> tuple[Parameter, ...]:
-        """The fitted values of exciters."""
-        exciters = {era.name for era in self.rig.eras if "force_factor" in era.fields}
-        return tuple(row for row in self.rows if row.era in exciters)
-
-    @property
-    def masses(self) -> FloatArray:
-        """Mass of the sensor at each point while it measures there, (s,) [kg]."""
-        return np.array([sensor.mass for sensor in self.model.sensors])
-
-    @cached_property
-    def numbers(self) -> IntArray:
-        """Where each fitted value is in the space, (n,)."""
-        names, groups = ["", *(era.name for era in self.rig.eras)], self.model.space.groups
-        feet = ["", *self.rig.foot_names]
-        return np.array(
-            [
-                groups[_KINDS.get(row.kind, row.kind)].start
-                + max(names.index(row.era) + feet.index(row.foot) - 1, 0)
-                for row in self.rows
-            ]
-        )
-
-    def of(self, rig: Rig) -> "SensedPlate":
-        """The same of a rig with other values of its plate's modulus, thickness and loss factor.
-
-        And of its ERAs and masses.
-        """
-        shifting = None
-        if self.model.form is not None:
-            natural = np.sqrt(np.maximum(self.model.modes.eigenvalues, 0)) / (2 * np.pi)
-            highest = _HIGHEST * self.model.frequencies.max()
-            lowest = _LOWEST * rig.plate.lowest_bending_frequency
-            shifting = int(((natural > lowest) & (natural < highest)).sum())
-        names = [sensor.name for sensor in self.model.sensors]
-        space = space_by_sheets(rig, names, shifting)
-        eras = tuple(replace(era, gains=()) for era in rig.eras)
-        return SensedPlate(rig, replace(self.model, rig=replace(rig, eras=eras), space=space))
-
-    def responses(self, z: FloatArray | None = None) -> ComplexArray:
-        """Acceleration per base displacement [1/s²] of each ERA, (f, e, s); of z, else the rig."""
-        z = np.zeros(self.model.space.size) if z is None else z
-        return np.swapaxes(self.model.at(z).responses, 1, 2)
-
-    def rig_at(self, z: FloatArray) -> Rig:
-        """The rig with the fitted values of z."""
-        own = np.zeros(len(z))
-        own[self.numbers] = z[self.numbers]
-        beside = self.model.space.groups["force_factor"]
-        own[beside] = z[beside]  # with the damping that was found beside it
-        values = Values.of(self.rig, self.model.space, own)
-        return rig_with(self.rig, values, self.rig.uncertainty)
-
-    def values(self, z: FloatArray) -> FloatArray:
-        """The fitted values at z in their units (n,)."""
-        rig = self.rig_at(z)
-        return np.array([row.of(rig) for row in self.rows])
-
-    def deviations(self, z: FloatArray) -> FloatArray:
-        """The fitted values at z (n,), in standard deviations of rigs as this one is written.
-
-        That is the larger of what data sheets leave and what its `uncertainty` states. Losses vary
-        by factors: of more than the rig has, the logarithm counts.
-        """
-        stated, std = self.rig.uncertainty, self.model.space.std[self.numbers]
-        factor = math.log(stated.damping)
-        of_kind = {
-            "modulus": math.hypot(2 * stated.thickness, stated.modulus),
-            "loss_factor": factor,
-            "stiffness": math.hypot(stated.stiffness, stated.thickness),
-            "magnet_mass": math.hypot(stated.stiffness, stated.thickness),
-            "damping": math.hypot(factor, KINDS["damping_each"].std),
-            "supports": stated.supports,
-        }
-        own = np.array([row.of(self.rig) for row in self.rows])
-        of_rig = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
-        is_lossy = (own > 0) & [row.kind in _KINDS for row in self.rows]
-        unit = std / np.where(is_lossy, own, 1.0)
-        size = unit * z[self.numbers]
-        is_more = is_lossy & (size > 0)
-        size, unit = (np.where(is_more, np.log1p(np.abs(each)), each) for each in (size, unit))
-        return np.asarray(size / np.maximum(unit, of_rig))
-
-    def errors(self, z: FloatArray, error: FloatArray) -> FloatArray:
-        """Standard errors of the fitted values at z in their units (n,), by those of z (p,)."""
-        is_factor = np.array([row.is_factor for row in self.rows])
-        slopes = self.model.space.std[self.numbers] * np.where(is_factor, self.values(z), 1.0)
-        return np.asarray(slopes * error[self.numbers])
-
-    def moved(self, modulus: float, stiffness: float) -> FloatArray:
-        """Parameters z of a modulus and stiffnesses by logarithms of factors on the rig's."""
-        space = self.model.space
-        found = np.zeros(space.size)
-        for kind, logarithm in (("modulus", modulus), ("stiffness", stiffness)):
-            found[space.groups[kind]] = logarithm / space.std[space.groups[kind]]
-        return found
-
-
-def sensed_plate(
-    rig: Rig,
-    points: FloatArray,
-    frequencies: FloatArray,
-    *,
-    masses: FloatArray | None = None,
-    has_form: bool = False,
-) -> SensedPlate:
-    """Solve a rig's free plate once, for sensors at points (s, 2) [m] and frequencies (f,) [Hz].
-
-    masses (s,) [kg]: of a sensor that is moved, as `Sensor.mass`, None for none; has_form: whether
-    the plate may have form errors. Raises InputError for frequencies too high for its
-    mesh.
-    """
-    rig.mesh.check_frequencies(rig.plate, frequencies)
-    loads = np.zeros(len(points)) if masses is None else masses
-    sensors = [
-        Sensor(f"sensor {n}", x=x, y=y, mass=mass)
-        for n, ((x, y), mass) in enumerate(zip(points.tolist(), loads.tolist(), strict=True))
-    ]
-    free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
-    form = reduced_modes(rig, free) if has_form else None
-    space = space_by_sheets(rig, (), None)
-    return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
-
-
-def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> SensedPlate:
-    """The plate of a rig at the sensors and frequencies of a measurement, as `sensed_plate`."""
-    return sensed_plate(
-        rig,
-        observation.points,
-        observation.frequencies,
-        masses=observation.masses,
-        has_form=has_form,
-    )
-
-
-_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_ROUNDS = 8
-_SETTLED = 0.1  # of the noise between two rounds
-_LEAST_LEFT = 0.1  # of a value's noise: residuals with less tell nothing of it
-_CLEAR = 3.0  # standard errors
-_HOLD = 1e3  # by which a mean of scales is held
-_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationProblem:
-    """The plate of a rig with its form errors, and the measured values (f, e, s), NaN where none.
-
-    searched (p,), free_scales (s,): masks of the parameters to be fitted, and of the scales without
-    a tolerance.
-    """
-
-    plate: SensedPlate
-    values: ComplexArray
-    searched: NDArray[np.bool_]
-    free_scales: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, plate: SensedPlate, values: ComplexArray) -> Self:
-        """Search everything but the gains of channels, with scales that no tolerance holds."""
-        space = plate.model.space
-        searched = space.uncertain & ~space.of("gain")
-        return cls(plate, values, searched, np.ones(values.shape[2], dtype=bool))
-
-    def without(self, sensors: NDArray[np.bool_]) -> Self:
-        """The same where some sensors (s,) measured nothing; what is theirs stays as it starts."""
-        groups, searched = self.plate.model.space.groups, self.searched.copy()
-        searched[groups["sensor_scale"]] &= ~sensors
-        searched[groups["sensor_place"]] &= np.repeat(~sensors, 2)
-        values = np.where(sensors, np.nan, self.values)
-        return replace(self, values=values, searched=searched)
-
-    def with_law_at(self, z: FloatArray) -> Self:
-        """The same where losses may be viscous, as at z (p,): that changes little with z."""
-        model = self.plate.model
-        model = replace(model, law=viscous_difference(replace(model, law=None), z))
-        return replace(self, plate=replace(self.plate, model=model))
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Mask of the rig's values that are searched (n,)."""
-        return self.searched[self.plate.numbers]
-
-    def scales(self, z: FloatArray) -> FloatArray:
-        """Scales of sensors (s,) of parameters z (p,)."""
-        return 1 + self.plate.model.space.values(z, "sensor_scale")
-
-    def scale_errors(self, fit: "Fit") -> FloatArray:
-        """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
-        return self.free_scales * self.plate.model.space.values(fit.error, "sensor_scale")
-
-    def at_scales(self, z: FloatArray, scales: FloatArray) -> FloatArray:
-        """Parameters z (p,) with other scales of sensors (s,)."""
-        space, found = self.plate.model.space, z.copy()
-        own = space.groups["sensor_scale"]
-        found[own] = (scales - 1) / space.std[own]
-        return found
-
-    def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, n) that hold what is searched of scales and form errors; their targets (m,)."""
-        space, held = self.plate.model.space, self.searched.copy()
-        held[self.plate.numbers] = self.free & self.plate.held
-        held[space.groups["sensor_scale"]] &= ~self.free_scales
-        rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
-        if self.free_scales.all():
-            # Gains determine a common scale; the mean is held.
-            mean = np.zeros((1, space.size))
-            own = space.groups["sensor_scale"]
-            mean[0, own] = _HOLD * (space.std * self.searched)[own] / len(self.free_scales)
-            rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
-        return rows[:, self.searched], targets
-
-
-@dataclass(frozen=True, eq=False)
-class FitStart:
-    """Where a fit begins.
-
-    z (p,): parameters; noise (f, e): standard deviation of a value; used (f, e, s): mask of values
-    without outliers.
-    """
-
-    z: FloatArray
-    noise: FloatArray
-    used: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Fit(FitStart):
-    """Result of a fit.
-
-    error (p,): standard errors of the parameters; gains, gains_error (f, e), NaN where unmeasured,
-    the latter of magnitudes; readings_error (2, f, e): of magnitudes, relative, and phases [rad] of
-    fields by what reads them alone, beside common_error, relative, of the magnitudes of all;
-    predicted (f, e, s): with gains and scales; chi2: sum of squares per degree of freedom; dampers:
-    what those of all ERAs do to the responses, relative to the plate's own losses.
-    """
-
-    error: FloatArray
-    gains: ComplexArray
-    gains_error: FloatArray
-    readings_error: FloatArray
-    common_error: float
-    predicted: ComplexArray
-    chi2: float
-    dampers: float
-
-
-def start_at(problem: CalibrationProblem, z: FloatArray) -> FitStart:
-    """Scales of sensors, outliers and noise by the plate at z (p,)."""
-    scales, noise, used = without_outliers(problem.values, problem.plate.responses(z))
-    return FitStart(problem.at_scales(z, scales), noise, used)
-
-
-def without_outliers(
-    values: ComplexArray, model: ComplexArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Scales of sensors (s,), noise (f, e) and the mask (f, e, s) of values without outliers.
-
-    values, model (f, e, s): measured, and by a plate, up to a gain of each frequency and ERA.
-    """
-    used, scales = np.isfinite(values), np.ones(values.shape[2])
-    heard = used.any(axis=(0, 1))
-    for _ in range(_ROUNDS):
-        weight = used / row_rms(values, used)[:, :, None]
-        gains, _ = project_gains(scales * model, values, weight)
-        predicted = np.nan_to_num(gains)[:, :, None] * model
-        share = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
-        scales[heard] = np.nanmedian(share.real[:, :, heard], axis=(0, 1))
-        scales = scales / np.median(scales)
-        raw = np.abs(values - scales * predicted)
-        noise = _noise_of(values, raw, used)
-        kept = _without_worst(raw / noise[:, :, None], used)
-        if (kept == used).all():
-            break
-        used, heard = kept, kept.any(axis=(0, 1))
-    return scales, noise, used
-
-
-def solve(problem: CalibrationProblem, start: FitStart) -> Fit:
-    """Fit parameters, scales and form errors."""
-    finite = np.isfinite(problem.values)
-    z, noise, used = start.z, start.noise, start.used & finite
-    for _ in range(_ROUNDS):
-        problem = problem.with_law_at(z)
-        weight, before = used / noise[:, :, None], noise
-        found = _search(problem, z, weight)
-        z = found.x
-        model = problem.plate.responses(z)
-        gains, _ = project_gains(model, problem.values, weight)
-        raw = np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
-        noise = _noise_of(problem.values, raw, used, _noise_left(model, found, weight))
-        # What form errors explain comes back.
-        kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
-        is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
-        used = kept
-        if is_settled:
-            break
-    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
-
-
-def clear(fit: Fit) -> NDArray[np.bool_]:
-    """Which parameters (p,) are off by several standard errors."""
-    return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
-
-
-def without_form(problem: CalibrationProblem, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Parameters z (p,) of the plate without form errors that explains best what was measured.
-
-    And standard errors (p,) of what was searched, for which form errors are noise. ERAs stay where
-    they clearly are. A rig cannot have form errors, which its field would lack; what they are like
-    of modulus and loss factor comes back, as a side is like another modulus.
-    """
-    space, z = problem.plate.model.space, fit.z.copy()
-    mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
-    form = space.of(*FORM, "mode_shifts") & ~mine
-    z[form | (space.of("place") & ~clear(fit))] = 0.0
-    part = replace(problem, searched=problem.searched & mine)
-    found = _search(part, z, fit.used / fit.noise[:, :, None])
-    return found.x, _errors(part, found, fit.used)[0]
-
-
-def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:
-    return fit_with_gains(
-        problem.plate.model,
-        problem.values,
-        weight,
-        start,
-        problem.searched,
-        prior=problem.tolerances(start),
-    )
-
-
-def _noise_left(model: ComplexArray, found: Minimum, weight: FloatArray) -> FloatArray:
-    """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
-
-    That is of its row's gain, and of all that is searched, for which tolerances leave less.
-    """
-    inside = weight > 0
-    by_gain = np.abs(weight * model) ** 2
-    total = by_gain.sum(axis=2, keepdims=True)
-    left = 1 - by_gain / np.where(total > 0, total, 1)
-    leverage = (_directions(found)[0] ** 2).sum(axis=1)
-    left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
-    return np.asarray(left)
-
-
-def _directions(found: Minimum) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Singular vectors (m, k) of the derivatives, and what each moves by one standard error (n, k).
-
-    Then a mask (n,) of what none of them determines.
-    """
-    size = np.linalg.norm(found.jacobian, axis=0)
-    size[size == 0] = 1e-300
-    rows, strength, columns = np.linalg.svd(found.jacobian / size, full_matrices=False)
-    seen = strength > 1e-9 * strength[0]
-    blind = (np.abs(columns[~seen]) > 1e-6).any(axis=0)
-    return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
-
-
-def _result(
-    problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
-) -> Fit:
-    z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
-    error, root, chi2 = _errors(problem, found, used)
-    model, by_z = responses_of(problem.plate.model, z, searched)
-    gains, _ = project_gains(model, problem.values, weight)
-    by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = by_gain / gains
-        of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
-    # A force factor is found with the gain: their product is what moves the plate.
-    space, numbers = problem.plate.model.space, np.flatnonzero(searched)
-    for era, factor in enumerate(space.indices("force_factor")):
-        relative[numbers == factor, :, era] += space.std[factor]
-    # What else is searched changes gain and field the opposite ways: sensors hear their product.
-    reads = space.of("sensor_scale", "sensor_place")[searched]
-    by_reading = np.tensordot(root[reads].T, relative[reads], axes=1)
-    common = np.nanmean(by_reading, axis=(1, 2), keepdims=True)
-    beside = by_reading - common
-    return Fit(
-        z,
-        noise,
-        used,
-        error,
-        gains,
-        np.abs(gains)
-        * np.sqrt(of_noise + (np.tensordot(root.T, relative.real, axes=1) ** 2).sum(axis=0)),
-        np.sqrt(of_noise + (np.array([beside.real, beside.imag]) ** 2).sum(axis=1)),
-        float(np.linalg.norm(common.real)),
-        gains[:, :, None] * model,
-        chi2,
-        _dampers(problem, found.x, root),
-    )
-
-
-def _errors(
-    problem: CalibrationProblem, found: Minimum, used: NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray, float]:
-    """Standard errors (p,), what is searched by one along each direction (n, k), and chi²."""
-    searched, rows = problem.searched, int(used.any(axis=2).sum())
-    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
-    chi2 = float((found.residuals**2).sum()) / freedom
-    _, root, blind = _directions(found)
-    root = root * math.sqrt(max(chi2, 1.0))
-    error = np.zeros(len(found.x))
-    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
-    return error, root, chi2
-
-
-def _dampers(problem: CalibrationProblem, z: FloatArray, root: FloatArray) -> float:
-    """By how much the loss factor is off, relative, where all dampers are by a share of theirs.
-
-    root (n, k): what is searched by one standard error along each direction.
-    """
-    plate, moved = problem.plate, np.zeros((len(z), root.shape[1]))
-    moved[problem.searched] = root
-    kinds = np.array([each.kind for each in plate.rows])
-    values = plate.values(z) / plate.model.space.scale[plate.numbers]
-    relative = moved[plate.numbers] / np.where(values > 0, values, np.inf)[:, None]
-    dampers = relative[(kinds == "damping") & problem.free]
-    losses = relative[kinds == "loss_factor"][0]
-    slopes = np.linalg.lstsq(dampers @ dampers.T, dampers @ losses)[0]
-    return abs(float(slopes.sum()))
-
-
-def _noise_of(
-    values: ComplexArray,
-    raw: FloatArray,
-    used: NDArray[np.bool_],
-    left: FloatArray | None = None,
-) -> FloatArray:
-    """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
-
-    From the medians of residuals raw (f, e, s), over rows from weak to strong. left (f, e, s):
-    share of noise power that a fit leaves in them; by default all but what a gain takes of its row.
-    """
-    size = row_rms(values, used)
-    sensors = used.sum(axis=2)
-    rows = np.flatnonzero((sensors >= 2).ravel())
-    floor = _SMALLEST_NOISE * size
-    if len(rows) < 4:
-        return floor
-    if left is None:
-        # A gain takes one of the row's values with it.
-        left = np.broadcast_to((1 - 1 / np.maximum(sensors, 2))[:, :, None], raw.shape)
-    telling = used & (left > _LEAST_LEFT)
-    power = np.full(raw.shape, np.nan)
-    power[telling] = raw[telling] ** 2 / left[telling] / 2
-    power = power.reshape(-1, used.shape[2])[rows]
-    order = np.argsort(size.ravel()[rows], kind="stable")
-    found, at = [], []
-    for group in np.array_split(order, min(12, len(rows) // 2)):
-        # The median of |z|² of complex noise with variance 2 is 2 log 2.
-        found.append(np.nanmedian(power[group]) / np.log(2))
-        at.append(np.median(size.ravel()[rows][group] ** 2))
-    scale = np.maximum(found, 1e-12 * np.array(at))
-    matrix = np.column_stack([1 / scale, np.array(at) / scale])
-    weight = np.linalg.norm(matrix, axis=0)
-    a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
-    return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
-
-
-def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Take the worst value out of each row that has one beyond bounds and others to stay."""
-    deviation = np.where(used, deviation / np.sqrt(2), 0)
-    worst = deviation.argmax(axis=2)
-    f, e = np.nonzero((deviation.max(axis=2) > _MAX_DEVIATION) & (used.sum(axis=2) > 2))
-    kept = used.copy()
-    kept[f, e, worst[f, e]] = False
-    return kept

@@ -1,22 +1,16 @@
-"""Measured responses: value by value, as an array over a rig's ERAs, and what a fit can use.
+"""Measured responses of a rig, their files, and the file of the accelerometers.
 
-Files of measured frequency responses: CSV with named columns, and UFF 58.
+A CSV file has the columns `COLUMNS`, one value a line, in any order. A UFF file has a function of
+type 4 for every sensor and ERA, acceleration over displacement, with the nodes' positions in
+dataset 15 or 2411; the reference node is the ERA, by its name or position. Responses to exciters
+are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions whose reference has the
+general data type (1) and the unit V. The mass of a sensor that is moved and the setting of a
+measurement are in columns of their own, or in the second line of free text of a function:
+`sensor_mass_g=2 setting=level 0.1`.
 
-A CSV file has exactly the columns below and one value a line, in any order. A UFF file has a
-function of type 4 for every sensor and ERA, acceleration over displacement, with the nodes'
-positions in dataset 15 or 2411; the reference node is the ERA, by its name or position.
-
-Responses to exciters are per volt: in columns `real_m_s2_v` and `imag_m_s2_v`, or in functions
-whose reference is of no type of its own (1), in V.
-
-The mass of a sensor that is moved and the setting of a measurement are in columns of their own, or
-in the second line of free text of a function: `sensor_mass_g=2 setting=level 0.1`.
-
-The file of a desk's accelerometers: a place, an input of the sound card, and a sensitivity each.
-
-CSV with the columns below, in any order; those of OPTIONAL may be left out, and all but PLACES
-where only places are read. Where all lines name one input, that is one sensor, which is moved from
-place to place.
+The file of accelerometers is CSV too: a place, an input of the sound card and a sensitivity a line.
+Columns of `OPTIONAL` may be left out, and all but `PLACES` where only places are read. Where all
+lines name one input, they are places of one sensor that is moved.
 """
 
 import logging
@@ -58,49 +52,90 @@ _EDGE_TOLERANCE = 1e-3
 _logger = logging.getLogger(__name__)
 _SILENT_SENSOR = 0.005  # of the loudest sensor, in the median over frequencies and ERAs
 LEAST_SENSORS = 3
+"""Fewest sensors with a signal of which a plate can be fitted."""
+
+COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
+_PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
+ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
+MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
+_NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
+MAX_SENSOR_MASS = 500.0
+"""Largest mass [g] of a sensor that is moved; a heavier one is not an accelerometer."""
+
+_UP = 3  # +z
+_GENERAL = 1  # a data type without one of its own
+# SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
+_ACCELERATION_UNITS = {
+    **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
+    **dict.fromkeys(("mm/s2", "mm/s/s"), 1e-3),
+    **dict.fromkeys(("g", "gs", "gn", "g0"), 9.80665),
+    **dict.fromkeys(("in/s2", "in/s/s", "inch/s2"), 0.0254),
+}
+_DISPLACEMENT_UNITS = {
+    **dict.fromkeys(("", "m", "meter", "metre"), 1.0),
+    **dict.fromkeys(("mm",), 1e-3),
+    **dict.fromkeys(("um", "micron"), 1e-6),
+    **dict.fromkeys(("in", "inch"), 0.0254),
+}
+_FREQUENCY_UNITS = {
+    **dict.fromkeys(("", "hz", "hertz", "1/s", "s-1", "cps"), 1.0),
+    "khz": 1e3,
+    "rad/s": 0.5 / math.pi,
+}
+_SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
+
+PLACES = ("sensor", "x_m", "y_m")
+SENSOR_FILE_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
+OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
 
 
 @dataclass(frozen=True)
 class MeasuredValue:
-    """Acceleration at one sensor per base displacement of one ERA [1/s²] at a frequency [Hz].
+    """Acceleration at one sensor per base displacement of one ERA, or per volt at an exciter.
 
-    Per volt at an exciter [m/s²/V], is_per_volt.
-
-    Phases as exp(+i omega t), upwards positive for both. era: name, or "" if only its position is
-    known; point, era_point: x, y [m], the latter None if unknown; place: file and line, for errors;
-    sensor_mass [kg]: as `Responses.masses`; setting: with what it was measured, in words, "" for
-    not known.
+    Phases as exp(+i omega t), upwards positive for both.
     """
 
     era: str
+    """Name of the ERA, "" if only its position is known."""
     sensor: str
     point: tuple[float, float]
+    """Position of the sensor x, y [m]."""
     era_point: tuple[float, float] | None
+    """Position of the ERA x, y [m], None if unknown."""
     frequency: float
+    """Frequency [Hz]."""
     value: complex
+    """Response [1/s²], per volt [m/s²/V]."""
     place: str
+    """File and line, for errors."""
     sensor_mass: float = 0.0
+    """Mass of a sensor that is moved [kg], as `Responses.masses`."""
     setting: str = ""
+    """Setting of the measurement in words, "" if unknown."""
     is_per_volt: bool = False
+    """Whether it is per volt at an exciter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Measured responses of a rig's plate, NaN where not measured.
-
-    sensors (s,) names; points (s, 2) [m]; frequencies (f,) [Hz]; values (f, eras, s) [1/s²];
-    has_phases: whether phases are relative to the drive; otherwise only phases between sensors are
-    known, and no polarity; skipped: number of values beyond the rig's limits of frequency. masses
-    (s,) [kg]: of a sensor that is moved, as `Sensor.mass`; None for none.
-    """
+    """Measured responses of a rig's plate, NaN where not measured."""
 
     sensors: tuple[str, ...]
+    """Names of the sensors (s,)."""
     points: FloatArray
+    """Places of the sensors (s, 2) [m]."""
     frequencies: FloatArray
+    """Frequencies (f,) [Hz]."""
     values: ComplexArray
+    """Responses (f, eras, s) [1/s²]."""
     has_phases: bool = True
+    """Whether phases are relative to the drive; otherwise only phases between sensors are known,
+    and no polarity."""
     skipped: int = 0
+    """Number of values beyond the rig's limits of frequency."""
     masses: FloatArray | None = None
+    """Masses (s,) [kg] of a sensor that is moved, as `Sensor.mass`; None for none."""
 
     def __post_init__(self) -> None:
         """Keep masses only where one is above 0."""
@@ -123,7 +158,7 @@ class Responses:
         return np.zeros(len(self.sensors)) if self.masses is None else self.masses
 
     def as_measurement(self) -> Measurement:
-        """The same for an identification, of drives that lag as actuators behind a card do."""
+        """Convert for an identification, of drives that lag as actuators behind a card do."""
         places = zip(self.sensors, self.points.tolist(), self.sensor_masses.tolist(), strict=True)
         sensors = [Sensor(name, x=x, y=y, mass=mass) for name, (x, y), mass in places]
         values = self.values.swapaxes(1, 2)
@@ -144,7 +179,7 @@ class Responses:
 def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
     """Join values into responses of a rig's plate.
 
-    What is beyond the rig's limits of frequency, as a spectrum's line of 0 Hz, is left out. Raises
+    Values beyond the rig's limits of frequency, as a spectrum's line of 0 Hz, are skipped. Raises
     InputError, with file and line, for points off the plate, unknown ERAs or positions, a response
     given twice, a sensor at two positions, and where nothing is left.
     """
@@ -254,16 +289,14 @@ def _shown(point: tuple[float, float]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """What a check of responses has found.
-
-    dead_eras (e,), dead_sensors (s,): masks of those that do not move the plate, and that hear next
-    to nothing; start (n,): the fitted values of the most likely plate, as `SensedPlate.numbers` are
-    in its space.
-    """
+    """Result of a check of responses, for a calibration."""
 
     dead_eras: NDArray[np.bool_]
+    """Mask (e,) of the ERAs that do not move the plate."""
     dead_sensors: NDArray[np.bool_]
+    """Mask (s,) of the sensors that hear next to nothing."""
     start: FloatArray
+    """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
 
 
 def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
@@ -290,37 +323,6 @@ def typical(values: NDArray[np.inexact]) -> float:
     """Median magnitude of finite values; NaN without any."""
     finite = np.abs(values)[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else float("nan")
-
-
-COLUMNS = ("era", "sensor", "x_m", "y_m", "frequency_hz", "real_1_s2", "imag_1_s2")
-_PER_VOLT = ("real_m_s2_v", "imag_m_s2_v")
-ERA_COLUMNS = ("era_x_m", "era_y_m")  # optional
-MASS, SETTING = "sensor_mass_g", "setting"  # optional, too
-_NOTE = re.compile(rf"\b{MASS}=(?P<mass>\S+)(?:\s+{SETTING}=(?P<setting>.*))?")
-MAX_SENSOR_MASS = 500.0
-"""g; of a sensor that is moved. One that weighs more is no accelerometer."""
-
-_UP = 3  # +z
-_GENERAL = 1  # a data type without one of its own
-# SI units by label, without blanks, brackets, powers' signs and the dot of abbreviations.
-_ACCELERATION_UNITS = {
-    **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
-    **dict.fromkeys(("mm/s2", "mm/s/s"), 1e-3),
-    **dict.fromkeys(("g", "gs", "gn", "g0"), 9.80665),
-    **dict.fromkeys(("in/s2", "in/s/s", "inch/s2"), 0.0254),
-}
-_DISPLACEMENT_UNITS = {
-    **dict.fromkeys(("", "m", "meter", "metre"), 1.0),
-    **dict.fromkeys(("mm",), 1e-3),
-    **dict.fromkeys(("um", "micron"), 1e-6),
-    **dict.fromkeys(("in", "inch"), 0.0254),
-}
-_FREQUENCY_UNITS = {
-    **dict.fromkeys(("", "hz", "hertz", "1/s", "s-1", "cps"), 1.0),
-    "khz": 1e3,
-    "rad/s": 0.5 / math.pi,
-}
-_SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
 
 
 def read_measured(path: Path) -> list[MeasuredValue]:
@@ -538,25 +540,19 @@ def sensor_mass(place: str, grams: float, *, column: str = MASS) -> float:
     return grams / 1e3
 
 
-PLACES = ("sensor", "x_m", "y_m")
-SENSOR_FILE_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
-OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
-
-
 @dataclass(frozen=True)
 class WiredSensor:
-    """An accelerometer at x, y [m] on an input of a sound card, counted from 1.
-
-    sensitivity: samples, in full scale, by acceleration [1/(m/s²)]; mass [kg]: of one that is
-    moved, as `model.identification.forward.Sensor.mass`.
-    """
+    """An accelerometer at x, y [m] on an input of a sound card."""
 
     name: str
     x: float
     y: float
     input: int
+    """Number of the input, from 1."""
     sensitivity: float
+    """Samples, in full scale, by acceleration [1/(m/s²)]."""
     mass: float = 0.0
+    """Mass [kg] of one that is moved, as `model.identification.forward.Sensor.mass`."""
 
 
 def read_places(path: Path, plate: Plate) -> dict[str, Point]:
@@ -590,12 +586,12 @@ def read_sensors(
 
 
 def are_places(sensors: Sequence[WiredSensor]) -> bool:
-    """Whether these are places of one sensor that is moved."""
+    """Whether the sensors are places of one that is moved."""
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 
 
 def _place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
-    """Name and place of a sensor, which the ones before do not have; raises InputError."""
+    """Name and place of a sensor; raises InputError for a name that one before has."""
     name = line.cells["sensor"]
     if not name or name in before:
         raise InputError(f"{line.place}: sensor must be a name that no other has, got {name!r}")

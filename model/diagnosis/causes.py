@@ -1,47 +1,31 @@
-"""Search for a single parameter of the rig that explains a measurement of another plate.
+"""Causes of a mismatch between a rig and a measurement, each with its own test.
 
-Each is varied over a range with the rest of the rig unchanged; for the best the rest may then vary
-within its priors (`model.diagnosis.plate_match`).
+A single value of the rig (`explain`) is varied over a range, and for the best ones the rest of the
+rig is fitted within its priors. Not tried: two values at once, plates that are not rectangles,
+further supports, and density, which cannot be distinguished from the others.
 
-Not tried: two causes at once, plates that are not rectangles, further supports, and density, which
-cannot be distinguished from the others.
+Beyond tolerances (`match_with_form`): the plate is matched once more with form errors, each held by
+its tolerance (`KINDS` in `model.identification.parameters`). They explain what builders and rulers
+do, but not a mass in one place near an edge. Loads are therefore sought where each would explain
+most, and named if they are beyond a tolerance. Of the rest, each kind of form error is judged by
+its sum of squares at an equal share of the false alarms. A plate that is thinner at one end moves
+more there, so that scales of sensors rise along it: that is its taper.
 
-What of a plate is beyond tolerances: masses, a finger, its thickness, or something unnamed.
+The wrong side: sensors at each other's places or noted from another side, and a grain along the
+other side, are other plates, for which no fit of values makes up. Both sides are fitted as coarsely
+as wiring is first looked at (`model.diagnosis.plate_match.match_shapes`): shapes of boards as
+bought leave a quarter of the response unexplained with the right side, half to nine tenths with the
+other.
 
-A plate is matched once more with form errors, each held by its tolerance (`KINDS` in
-`model.identification.parameters`): places of ERAs and sensors, scales of sensors, foreign mass,
-sides, Poisson's ratio, single modes. They explain what builders and rulers do, but for foreign mass
-in one place, above all near an edge: mass in the middles of cells does not have its field. What
-lies on the plate is therefore sought where it would explain most beside all of them, one after
-another, and named if it is beyond a tolerance. Of the rest each kind of form error is judged by its
-sum of squares, at equal shares of a stated false alarm, and a thickness at as much by itself. A
-plate that is thinner at one end moves more there, by as much as it is thinner: scales of sensors
-rise along it.
-
-Sensors at each other's places or noted from another side, by the responses that they read.
-
-A plate that is turned over is another one by a mirror, and no fit of its values makes up for it.
-Both are fitted as coarsely as wiring is first looked at (`model.diagnosis.plate_match`): shapes of
-boards as bought leave a quarter unexplained with the right side, nine tenths with another.
-
-Exciters whose glue is off: what comes through a spring between coil and plate.
+Loose glue (`behind_glue`): what comes through a spring z between coil and plate is
 
     g_f ~ G |z / (z + D(w_f))|
 
-g_f the gains with which a plate that fits explains a channel at its frequencies, D the dynamic
-stiffness of the exciter, z that of its glue: above the resonance of its magnet D falls, and the
-gain rises with frequency. A constant gain does not, nor does what its parts deviate by, which the
-fit has found. What all channels have in common is the amplifier's.
+with the gains g_f of a channel and the dynamic stiffness D of its exciter, which falls above the
+resonance of the magnet: the gain rises with frequency. What all channels have in common is the
+amplifier's.
 
-Which side a board's grain runs along, by the shapes in which it responds.
-
-Boards are cut both ways, and a file that names the wrong side describes another board: no modulus
-makes up for it. Both are fitted as coarsely as wiring is first looked at, with a gain of each
-channel and frequency and a few moduli and stiffnesses (`model.diagnosis.plate_match.match_shapes`).
-Boards as bought leave a quarter of their response unexplained in this way, or less, and half to
-three quarters with their grain turned.
-
-Detection of dead channels and unusable sensors.
+Channels are dead, and sensors unusable, by the size of their responses.
 """
 
 import math
@@ -97,18 +81,59 @@ _REFINED_CAUSES = 2  # of these, whose value is refined
 _REFINEMENTS = 7  # values
 _CORRELATION = 4.0  # errors of a model are correlated over sensors and frequencies
 
+MAX_FORM_ERROR = 0.05
+"""Largest unexplained share of the responses of a plate that form errors explain."""
+
+_NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit is weighted by
+_FIRST_NOISE = 0.02
+_LOAD_GRID = Grid(32, 24)  # where loads are sought
+_MAX_LOADS = 2
+_HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
+_LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
+_MIN_SHOWN = 1e-6  # of a variance
+_CLEAR_LOAD = 40.0  # reduction of half the sum of squares
+
+_THICKNESS = "thickness"
+_WORDS = {
+    "place": "places of ERAs",
+    "mode_shifts": "natural frequencies",
+    "sensor_scale": "scales of sensors",
+    "sensor_place": "places of sensors",
+    "foreign_mass": "distribution of mass",
+    "side": "length and width",
+    "poisson": "Poisson's ratio",
+}
+
+_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of an exchanged sensor, at most and at least
+_CLEARLY = 0.6  # of the error as written
+_MAX_COARSE_ERROR = 0.45  # of a coarse fit of the right board that has a fault
+_X, _Y, _FREQUENCY = "x", "y", "frequency"
+
+_GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
+_RISES = 0.2  # of the logarithm of a gain over the frequencies
+_EXPLAINS = 0.6  # of the median deviation without glue
+_MIN_CHANNELS = 3  # of which a median shows what is the amplifier's
+
+_DEAD = 0.03  # of the response that the rig predicts
+_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
+_NO_SHAPE = 0.6  # MAC
+_SENSOR_SCALE = (0.7, 1.4)
+_MUTE = 0.1  # of the others' scale
+_UPSIDE_DOWN = -0.5
+
 
 @dataclass(frozen=True)
 class Cause:
-    """A value of the rig that may differ: of the plate, or of one ERA or all, "" for all.
-
-    factors: by which it is tried; of bolts shares of the plate's mass, which are added.
-    """
+    """A value of the rig that may differ: of the plate, of one ERA or of all."""
 
     key: str
+    """Key in the rig file."""
     what: str
+    """Kind of value, as a key of `VALUE_UNITS`."""
     factors: tuple[float, ...]
+    """Factors by which it is tried; of bolts shares of the plate's mass, which are added."""
     era: str = ""
+    """Name of the ERA, "" for all or for the plate."""
 
     @property
     def unit(self) -> str:
@@ -157,13 +182,17 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A cause with its best value, the plate with it, and its share 0..1 of the likelihood."""
+    """A cause with its best value."""
 
     cause: Cause
     value: float
+    """Best value."""
     expected: float
+    """Value in the rig."""
     match: Match
+    """The plate with the best value."""
     share: float
+    """Share 0..1 of the likelihood among the explanations."""
 
 
 def causes_of(rig: Rig) -> list[Cause]:
@@ -297,47 +326,23 @@ def _stretched(rig: Rig, along_x: float, along_y: float) -> Rig:
     return replace(rig, plate=plate, eras=eras, masses=masses, mesh=mesh)
 
 
-MAX_ERROR = 0.05
-"""Share of a response that form errors leave unexplained at most, if they explain the plate."""
-
-_NOISE = (0.01, 0.05)  # of a row's rms: least and largest that a fit is weighted by
-_FIRST_NOISE = 0.02
-_SCANNED = Grid(32, 24)
-_MAX_LOADS = 2
-_HEAVY = 0.02  # of the plate's mass, all masses together: twice the tolerance of foreign mass
-_LIGHT, _FIRM = 0.3, 3.0  # of a fingertip
-_LEAST_SHOWN = 1e-6  # of a variance
-_CLEAR = 40.0  # of half the sum of squares
-
-_THICKNESS = "thickness"
-_WORDS = {
-    "place": "places of ERAs",
-    "mode_shifts": "natural frequencies",
-    "sensor_scale": "scales of sensors",
-    "sensor_place": "places of sensors",
-    "foreign_mass": "distribution of mass",
-    "side": "length and width",
-    "poisson": "Poisson's ratio",
-}
-
-
 @dataclass(frozen=True, eq=False)
 class BeyondTolerances:
-    """What is not as written.
-
-    loads: what lies on the plate, masses or a finger; farthest: the form error that is least
-    likely, in words; deviation: its rms in standard deviations, 0 where none is too large; chance:
-    in how many of all plates as written one is as unlikely, at most; error: of the response,
-    unexplained; taper: how much thicker the plate is at the ends of x and of y than in the middle,
-    relative, None where that is not what is farthest.
-    """
+    """What deviates from the rig by more than tolerances."""
 
     loads: tuple[PointLoad | FingertipLoad, ...]
+    """Loads on the plate, masses or a finger."""
     farthest: str
+    """Least likely form error, in words."""
     deviation: float
+    """Its rms in standard deviations, 0 where none is too large."""
     chance: float
+    """Upper limit of the share of plates as written with one as unlikely."""
     error: float
+    """Share of the response that is unexplained."""
     taper: tuple[float, float] | None = None
+    """Relative rise of the thickness from the middle to the ends of x and of y, None where that is
+    not what deviates most."""
 
     @property
     def kind(self) -> str:
@@ -350,9 +355,9 @@ class BeyondTolerances:
 def match_with_form(
     plate: SensedPlate, observation: Responses, values: ComplexArray, drives: Sequence[int]
 ) -> tuple[Match, BeyondTolerances | None]:
-    """Match values (f, e, s) of channels that drive ERAs with form errors, and with a load.
+    """Match values (f, e, s) of channels with a plate with form errors and loads.
 
-    Return also what of the plate is beyond tolerances, None for nothing.
+    Returns the match, and what of the plate is beyond tolerances, None for nothing.
     """
 
     def matched(loads: Sequence[PointLoad | FingertipLoad], noise: float) -> Match:
@@ -367,7 +372,7 @@ def match_with_form(
     while further and len(loads) < _MAX_LOADS:
         tried = [(each, matched((*loads, each), noise)) for each in further]
         load, found = best_by(tried, lambda each: -each[1].cost)
-        if found.cost > best.cost - _CLEAR:
+        if found.cost > best.cost - _CLEAR_LOAD:
             break
         best, loads = found, [*loads, load]
         further, fitted = _loads(best, values, drives, noise)
@@ -379,7 +384,7 @@ def match_with_form(
         return best, BeyondTolerances(named, "", 0.0, 1.0, best.error)
     rises, slopes = _along_plate(best, observation.points, fitted)
     farthest, deviation, chance = _farthest(best, rises)
-    if best.error <= MAX_ERROR and not deviation:
+    if best.error <= MAX_FORM_ERROR and not deviation:
         return best, None
     taper = slopes if farthest == _THICKNESS else None
     return best, BeyondTolerances((), farthest, deviation, chance, best.error, taper)
@@ -402,10 +407,10 @@ def _farthest(match: Match, rises: FloatArray) -> tuple[str, float, float]:
 def _along_plate(
     match: Match, points: FloatArray, fitted: Linearization
 ) -> tuple[FloatArray, tuple[float, float]]:
-    """What of the scales of sensors rises along the sides (2,), in standard deviations.
+    """Rise of the scales of sensors along both sides (2,), and the taper that explains it.
 
-    And the thickness that does this, relative, at the ends of x and of y. A fit holds scales back,
-    so that those of sound plates vary by less than they are, in the mean by as much.
+    The rise is in standard deviations, the taper relative at the ends of x and of y. The prior of a
+    fit reduces scales, so that those of sound plates vary by less than their tolerance.
     """
     space, plate = match.plate.model.space, match.plate.rig.plate
     own = space.of("sensor_scale")[_searched(match)]
@@ -413,7 +418,7 @@ def _along_plate(
     along = 2 * points / [plate.length, plate.width] - 1
     basis = np.linalg.qr(np.column_stack([np.ones(len(points)), along]))[0][:, 1:]
     shown = np.eye(len(points)) - linalg.inv(fitted.information)[np.ix_(own, own)]
-    shown, rises = basis.T @ shown @ basis + _LEAST_SHOWN * np.eye(2), basis.T @ scales
+    shown, rises = basis.T @ shown @ basis + _MIN_SHOWN * np.eye(2), basis.T @ scales
     thinner = basis @ linalg.solve(shown, rises) * space.std[space.groups["sensor_scale"]]
     x, y = -np.linalg.lstsq(along - along.mean(axis=0), thinner)[0]
     return linalg.solve(linalg.cholesky(shown, lower=True), rises), (float(x), float(y))
@@ -428,16 +433,16 @@ def _searched(match: Match) -> NDArray[np.bool_]:
 def _loads(
     match: Match, values: ComplexArray, drives: Sequence[int], noise: float
 ) -> tuple[list[PointLoad | FingertipLoad], Linearization]:
-    """A mass and a finger where each would explain most, the latter if it is of a size that counts.
+    """A mass and a finger where each would explain most, and the linearised match beside them.
 
-    And the match beside which they were sought.
+    A finger lighter than a share of a fingertip is skipped.
     """
     plate, of_eras = match.plate, list(drives)
     model, mass = plate.model, plate.rig.plate.mass
     tip = plate.rig.fingertip or Fingertip()
     searched = _searched(match)
     found, by_x = responses_of(model, match.x, searched)
-    points = _SCANNED.centres(plate.rig.plate)
+    points = _LOAD_GRID.centres(plate.rig.plate)
     by_mass = by_mass_at(model.at(match.x), points).transpose(3, 0, 2, 1)[:, :, of_eras]
     found, by_x = found[:, of_eras], by_x[:, :, of_eras]
     kept = np.isfinite(values) & ~match.outliers
@@ -463,17 +468,12 @@ def _loads(
     return heaviest, fitted
 
 
-_OWN_PLACE, _OTHER_PLACE = 0.8, 0.9  # coherence of a sensor that is elsewhere
-_CLEARLY = 0.6  # of the error as written
-_MAX_ERROR = 0.45  # of a coarse fit of the right board, a fault beside
-_X, _Y, _FREQUENCY = "x", "y", "frequency"
-
-
 @dataclass(frozen=True)
 class ExchangedSensors:
-    """Pairs of a sensor and the one at whose place it is, which is elsewhere too."""
+    """Sensors that are at each other's places."""
 
     pairs: Sequence[tuple[str, str]]
+    """Each sensor with the one at whose place it is."""
 
     label = "PLACES"
 
@@ -495,17 +495,16 @@ class ExchangedSensors:
 
 @dataclass(frozen=True)
 class ReversedAxes:
-    """Axes along which a measurement is noted the wrong way round.
-
-    axes: "x", "y" or both of the places, or "frequency"; error, error_as_written: shares of the
-    responses that coarse fits of either leave unexplained; is_wiring: whether exchanged channels
-    explain them as well.
-    """
+    """Axes along which a measurement is noted the wrong way round."""
 
     axes: tuple[str, ...]
+    """"x", "y" or both of the places, or "frequency"."""
     error: float
+    """Share of the responses that a coarse fit leaves unexplained."""
     error_as_written: float
+    """The same as written."""
     is_wiring: bool
+    """Whether exchanged channels explain the responses as well."""
 
     label = "PLACES"
 
@@ -536,12 +535,13 @@ class ReversedAxes:
 def reversed_axes(
     plate: SensedPlate, shapes: ShapeMatch, observation: Responses
 ) -> ReversedAxes | None:
-    """Find the axes whose other direction is clearly the measured one, of a rig's own wiring.
+    """Find the axes whose other direction clearly explains an observation better.
 
-    shapes: of the observation, by the rig's plate. None where that is right to a fault.
+    Channels drive the ERAs of the rig. shapes: match of the observation with the rig's plate. None
+    where that is good enough.
     """
     as_written = shapes.error_as_wired
-    if not as_written > _MAX_ERROR:
+    if not as_written > _MAX_COARSE_ERROR:
         return None
     tried = []
     for axes in ((_X,), (_Y,), (_X, _Y), (_FREQUENCY,)):
@@ -550,11 +550,11 @@ def reversed_axes(
         is_wiring = shapes.error * _CLEARLY < error
         tried.append(ReversedAxes(axes, error, as_written, is_wiring))
     found = best_by(tried, lambda each: -each.error)
-    return found if found.error < min(_MAX_ERROR, _CLEARLY * as_written) else None
+    return found if found.error < min(_MAX_COARSE_ERROR, _CLEARLY * as_written) else None
 
 
 def exchanged_sensors(observation: Responses, model: ComplexArray) -> ExchangedSensors | None:
-    """Find the sensors that read what the model (f, e, s) has at another's place."""
+    """Find the sensors whose responses are those of the model (f, e, s) at another's place."""
     values = observation.values
     weight = np.isfinite(values) / row_rms(values)[:, :, None]
     gains, _ = project_gains(model, values, weight)
@@ -583,12 +583,6 @@ def _coherence(
     return np.asarray(inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300)))
 
 
-_GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
-_RISES = 0.2  # of the logarithm of a gain over the frequencies
-_EXPLAINS = 0.6  # of the median deviation without glue
-_LEAST_CHANNELS = 3
-
-
 def behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> NDArray[np.bool_]:
     """Mask (e,) of the channels whose exciters clearly act through a spring of glue.
 
@@ -602,7 +596,7 @@ def behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> ND
     sizes[~np.isfinite(sizes)] = np.nan
     driven = np.isfinite(sizes).any(axis=0)
     found = np.zeros(len(drives), dtype=bool)
-    if driven.sum() < _LEAST_CHANNELS:
+    if driven.sum() < _MIN_CHANNELS:
         return found
     sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
     omega = match.plate.model.omega
@@ -628,17 +622,18 @@ def _is_behind_glue(sizes: FloatArray, stiffness: ComplexArray) -> bool:
 
 @dataclass(frozen=True)
 class TurnedGrain:
-    """A board whose grain runs along the other side than in its rig.
-
-    rig: with its grain; along, as_written: the sides, `length` and `width`; error,
-    error_as_written: shares of the responses that the coarse fits of either leave unexplained.
-    """
+    """A board whose grain runs along the other side than in its rig."""
 
     rig: Rig
+    """The rig with the right grain."""
     along: str
+    """Side along which the grain runs, `length` or `width`."""
     as_written: str
+    """The side in the rig."""
     error: float
+    """Share of the responses that a coarse fit leaves unexplained."""
     error_as_written: float
+    """The same as written."""
 
     label = "GRAIN"
 
@@ -655,9 +650,9 @@ class TurnedGrain:
 def turned_grain(
     plate: SensedPlate, shapes: ShapeMatch, observation: Responses
 ) -> TurnedGrain | None:
-    """Find the board with its grain along the other side where that is clearly the measured one.
+    """Find the board with the grain along the other side, if that clearly explains more.
 
-    shapes: of the observation, by the rig's plate. None for a board without a grain.
+    shapes: match of the observation with the rig's plate. None for a board without a grain.
     """
     rig = plate.rig
     if rig.plate.material.orthotropy is None:
@@ -667,27 +662,20 @@ def turned_grain(
     other = replace(other, mesh=solved_for(other, rig.limits.frequency_max).mesh)
     sensed = plate_of(other, observation)
     error = match_shapes(sensed, observation.values).error
-    if error > min(_MAX_ERROR, _CLEARLY * shapes.error):
+    if error > min(_MAX_COARSE_ERROR, _CLEARLY * shapes.error):
         return None
     as_written = rig.grain
     along = "length" if as_written == "width" else "width"
     return TurnedGrain(other, along, as_written, error, shapes.error)
 
 
-_DEAD = 0.03  # of the response that the rig predicts
-_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
-_NO_SHAPE = 0.6  # MAC
-_SENSOR_SCALE = (0.7, 1.4)
-_MUTE = 0.1  # of the others' scale
-_UPSIDE_DOWN = -0.5
-
-
 @dataclass(frozen=True)
 class BadSensor:
-    """A sensor that is left out, by what it reads of what the others say, 0 for nothing."""
+    """A sensor that is left out."""
 
     name: str
     scale: float
+    """Its reading relative to what the others say, 0 for no signal."""
 
     @property
     def is_mute(self) -> bool:
@@ -712,7 +700,7 @@ def dead_channels(
 ) -> NDArray[np.bool_]:
     """Mask (e,) of driven channels with a response far below the model's.
 
-    shapes: with these also of weak channels without the shape of an ERA, whose response is noise.
+    shapes: if given, weak channels without the shape of an ERA, whose response is noise, count too.
     """
     share = np.abs(observation.values / plate.responses())
     dead = np.zeros(observation.values.shape[1], dtype=bool)
@@ -728,7 +716,7 @@ def dead_channels(
 def usable_sensors(
     observation: Responses, dead: NDArray[np.bool_]
 ) -> tuple[Responses, tuple[BadSensor, ...]]:
-    """Remove sensors without a signal from any live channel; return them, too.
+    """Remove sensors without a signal from any live channel, and return these as well.
 
     Raises InputError if too few are left.
     """
@@ -742,7 +730,7 @@ def usable_sensors(
 
 
 def off_scale(observation: Responses, values: ComplexArray, match: Match) -> list[BadSensor]:
-    """Sensors with a scale unlike that of the others, if the plate fits."""
+    """Find sensors with a scale unlike that of the others, if the plate fits."""
     if match.median_error > MAX_FIT_ERROR:
         return []
     finite = np.isfinite(values) & np.isfinite(match.predicted) & ~match.outliers

@@ -32,7 +32,7 @@ _MIN_SHARE = 0.05  # likelihood of a reported explanation
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:
-    """Lines of findings with their remedies, and one that all is well where nothing is amiss."""
+    """Lines of findings with their remedies, or one that all is well."""
     by_era = {channel.era: channel for channel in verdict.channels}
     rows = [f"{each.label}: {each}" for each in verdict.corrections]
     for cycle in verdict.swapped:
@@ -93,7 +93,7 @@ def verdict_rows(verdict: Verdict) -> list[str]:
 
 
 def difference_rows(verdict: Verdict) -> list[str]:
-    """Line on how far the plate is from the rig and what it keeps; none if it keeps enough."""
+    """Line on a plate that keeps too little of the rig's promises; empty if it keeps enough."""
     kept = verdict.kept_share
     if verdict.changes is None or kept is None or kept >= MIN_KEPT_SHARE:
         return []
@@ -114,7 +114,7 @@ def difference_rows(verdict: Verdict) -> list[str]:
 
 
 def _beyond_rows(beyond: BeyondTolerances) -> list[str]:
-    """Lines on what lies on a plate, or one on what is beyond tolerances without a name."""
+    """Lines on loads of the plate, or one on another deviation beyond tolerances."""
     if beyond.loads:
         return [_load_row(load) for load in beyond.loads]
     if beyond.taper is not None:
@@ -178,7 +178,7 @@ def _plate_rows(verdict: Verdict) -> list[str]:
 
 
 def explains(explanation: Explanation) -> bool:
-    """Whether the rest of the rig is then within its priors."""
+    """Whether the rest of the rig is within its priors with an explanation."""
     return explanation.match.error <= MAX_FIT_ERROR and explanation.match.chance >= FALSE_ALARM
 
 
@@ -323,7 +323,7 @@ def _row(channel: ChannelVerdict, state: ChannelState) -> str:
 
 
 def _common_row(channels: Sequence[ChannelVerdict], state: ChannelState) -> str:
-    """Line on what is too strong or too weak at nearly all channels, as a sensor makes it."""
+    """Line on nearly all channels being strong or weak, most likely by the sensors."""
     found = {each.era: each.gain for each in channels if state in each.states and each.gain}
     return (
         f"{state.upper()}: the channels of {', '.join(found)} play {min(found.values()):.2f} to "

@@ -1,16 +1,15 @@
-"""Maximum a posteriori fit of a rig's plate to responses of its channels, and what it differs by.
+"""Match of a rig's plate to responses of its channels, up to gain and phase of each channel.
 
     d_fes ~ m_fe exp(i phi_fe) a_fes(x) + noise,   m_fe near G_e
 
-d measured, a of the model, G_e the gain of a channel. Magnitudes m vary about G_e with frequency as
-those of real actuators do; phases phi are free, since they need not have been measured. Both follow
-from x and G, so only these are searched (variable projection). Gaussian priors hold x, the
-parameters of the rig, near its values: a large deviation is evidence against the rig.
+d are measured values, a those of the model, G_e the gain of a channel. Magnitudes m vary about G_e
+with frequency as those of real actuators do; phases phi are free, since they need not have been
+measured. Both follow from x and G, so that only these are searched (variable projection). Gaussian
+priors hold the parameters x near the rig's values: a large deviation is evidence against the rig.
 
-What channels drive: ERAs by the modal assurance criterion (MAC) of shapes; polarity by phases.
-
-MAC is 1 for the same shape with any gain and phase, about one over the number of sensors for noise.
-"""
+Which ERA a channel drives follows from the modal assurance criterion (MAC) of shapes: 1 for the
+same shape with any gain and phase, about one over the number of sensors for noise. Polarity follows
+from phases."""
 
 import math
 from collections.abc import Sequence
@@ -35,37 +34,43 @@ from model.rig.rig import Rig
 
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself
 FALSE_ALARM = 0.01
-"""Share of plates as written that are called another for a value, their form or their thickness."""
+"""Share of plates as written that a test of values, form or thickness calls wrong."""
 
 MAX_FIT_ERROR = 0.2  # largest relative rms error of an acceptable plate
 MODEL_ERROR = 0.05  # of a row's rms: scales and positions of sensors, and what is not modelled
 _ROBUST = 2.0  # standard deviations
 _MAX_OUTLIERS = 0.05  # of all values; of a plate 3 % longer than its rig's a tenth look like some
 
+_MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
+_LEAST_MISFIT = 0.02  # below it sensors' errors dominate
+
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """The best fit of a plate.
-
-    plate: of the rig; x (p,): all its parameters; z (n,): deviation of each of its fitted values as
-    `SensedPlate.deviations`; gains (e,): magnitude of each channel, NaN if not used; cost:
-    half the sum of squares of robust residuals and of z; error, median_error: rms and median of
-    residuals relative to the rms of their row; responses (f, e, s) of the ERAs; predicted (f, e,
-    s): of those that the channels drive, with gains; outliers (f, e, s): mask of values that no
-    error counts.
-    """
+    """The best fit of a plate to values of channels."""
 
     rig: Rig
+    """The rig with the fitted values."""
     plate: SensedPlate
+    """The plate of the rig before the fit."""
     x: FloatArray
+    """All parameters (p,)."""
     z: FloatArray
+    """Deviation of each fitted value (n,), as `SensedPlate.deviations`."""
     gains: FloatArray
+    """Magnitude of the gain of each channel (e,), NaN if not used."""
     cost: float
+    """Half the sum of squares of robust residuals and of z."""
     error: float
+    """Rms of the residuals relative to the rms of their row."""
     median_error: float
+    """Median of the same."""
     responses: ComplexArray
+    """Responses of the ERAs (f, e, s)."""
     predicted: ComplexArray
+    """Responses of the ERAs that the channels drive, with gains (f, e, s)."""
     outliers: NDArray[np.bool_]
+    """Mask of values that no error counts (f, e, s)."""
 
     @property
     def worst(self) -> float:
@@ -74,7 +79,7 @@ class Match:
 
     @property
     def chance(self) -> float:
-        """In how many of all plates as written a value is at least as far off, at most."""
+        """Upper limit of the share of plates as written with a value at least as far off."""
         return float(2 * len(self.z) * ndtr(-self.worst))
 
 
@@ -150,10 +155,10 @@ def match_plate(
 
 
 def _outliers(values: ComplexArray, predicted: ComplexArray) -> NDArray[np.bool_]:
-    """Mask of those values (f, e, s) that a calibration would leave out.
+    """Mask of the values (f, e, s) that a calibration would leave out as outliers.
 
-    None where these are too many, and none of a sensor that they are the most of: such values are
-    no accident, but tell that the plate, its wiring or the sensor's place is another one.
+    Empty where they are too many, and for a sensor most of whose values they are: such values are
+    not accidental, but show that the plate, its wiring or the sensor's place is another one.
     """
     measured = np.isfinite(values)
     found = measured & ~without_outliers(values, predicted)[-1]
@@ -162,9 +167,9 @@ def _outliers(values: ComplexArray, predicted: ComplexArray) -> NDArray[np.bool_
 
 
 def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
-    """By how much the most probable plate differs from a rig's, relative, by kind of value.
+    """Relative differences of the most probable plate from a rig's, by kind of value.
 
-    Of ERAs the mean; bolts are left out, with none in most rigs.
+    For ERAs it is their mean; bolts are skipped, since most rigs have none.
     """
     changes = {}
     for kind in ("modulus", "loss_factor", "stiffness", "damping"):
@@ -178,24 +183,19 @@ def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
     return changes
 
 
-_MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
-_LEAST_MISFIT = 0.02  # below it sensors' errors dominate
-
-
 @dataclass(frozen=True, eq=False)
 class ShapeMatch:
-    """MAC of channels and ERAs on the most similar plate.
-
-    mac (f, e, e): of the channel that the rig wires to the first ERA with the second ERA, NaN if
-    not driven; start: logarithms of that plate's factors on modulus and stiffnesses.
-    """
+    """MAC of channels and ERAs on the most similar plate."""
 
     mac: FloatArray
+    """MAC (f, e, e) of the channel that the rig wires to the first ERA with the second ERA, NaN if
+    not driven."""
     start: tuple[float, float]
+    """Logarithms of that plate's factors on modulus and stiffnesses."""
 
     @property
     def starts(self) -> tuple[tuple[float, float], ...]:
-        """Logarithms of factors from which to search: none, and those of that plate."""
+        """Logarithms of factors from which to search: 0, and those of that plate."""
         return tuple(dict.fromkeys([(0.0, 0.0), self.start]))
 
     @property
@@ -214,12 +214,12 @@ class ShapeMatch:
 
     @property
     def error(self) -> float:
-        """Share of the responses, rms over them, that is not of the shapes of the nearest ERAs."""
+        """Share of the responses, rms, that the shapes of the nearest ERAs leave unexplained."""
         return self._error(self.nearest)
 
     @property
     def error_as_wired(self) -> float:
-        """The same, of the shapes of the ERAs that the rig says."""
+        """The same for the shapes of the ERAs to which the rig wires the channels."""
         return self._error(range(self.mac.shape[1]))
 
     def _error(self, eras: Sequence[int]) -> float:
@@ -268,14 +268,14 @@ def match_responses(
 
 @dataclass(frozen=True)
 class ChannelPhase:
-    """Phase error of a channel [degrees], None if unknown.
-
-    sign: 1 or -1, 0 if unknown; confidence 0..1.
-    """
+    """Phase error of a channel."""
 
     degrees: float | None = None
+    """Phase error [degrees], None if unknown."""
     sign: int = 0
+    """1 or -1, 0 if unknown."""
     confidence: float = 0.0
+    """Confidence 0..1 in the phase."""
 
 
 def phases_of_drive(observation: Responses, predicted: ComplexArray) -> list[ChannelPhase]:

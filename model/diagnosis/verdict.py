@@ -1,27 +1,20 @@
-"""Diagnosis of a rig's plate and channels by measured responses.
+"""Diagnosis of a rig's plate and channels by measured responses, and checks before a calibration.
 
-Which resonance the file of exciters gives: of the light coil alone, or of the glued magnet.
+`diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring,
+and gives a `Verdict` with a state for each channel. `judged_by_promises` adds how many of the rig's
+promises the plate keeps that the measurement is most like: contrast tells whether a deviation
+matters.
 
-An exciter pushes a plate against its magnet: well above the resonance of that on the glued coil by
-its whole force, far below it hardly, and with the opposite sign. A file that takes a sheet's
-`free` resonance for the `mounted` one thus describes exciters of which all look reversed, and weak
-by another factor at each frequency. With both meanings the plate is fitted as coarsely as for its
-grain (`model.diagnosis.plate_match.match_shapes`); of twelve boards as bought the gains that are
-left vary over frequency by 0.15 to 0.43 (standard deviation of their logarithms) with the right
-one, and by 1.2 or more with the other.
+`check_consistency` refuses responses that are not what they claim to be. A fit can absorb almost
+any error of a measurement: gains take wrong units, springs a swapped plug, outlier rejection whole
+sensors. Each check looks for one such error alone, in what the fit would leave free, and names it.
 
-What a rig's file says the wrong way round of two, found before anything is fitted to it.
-
-What a rig's table promises, and what of it the plate keeps that a measurement is most like.
-
-Whatever is off, contrast tells whether it matters.
-
-Checks of measured responses before a rig is fitted to them: are they what they claim to be?
-
-A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped plug,
-outlier rejection whole sensors. Each check here looks for one such error alone, in what the fit
-would leave free, and names it.
-"""
+A misread resonance: an exciter pushes a plate against its magnet, well above the resonance of the
+magnet on the glued coil with its whole force, far below it hardly, and with the opposite sign. A
+file that takes a sheet's `free` resonance for the `mounted` one thus describes exciters that all
+look reversed, and weak by another factor at each frequency. On twelve boards as bought the gains
+left by a coarse fit vary over frequency by 0.15 to 0.43 (standard deviation of their logarithms)
+with the right meaning, and by 1.2 or more with the other."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +31,7 @@ from model.calibration.calibrate import wrong_size
 from model.calibration.fit import SensedPlate, plate_of, project_gains, row_rms
 from model.calibration.responses import LEAST_SENSORS, Responses, Screening, check_enough_sensors
 from model.diagnosis.causes import (
-    MAX_ERROR,
+    MAX_FORM_ERROR,
     BadSensor,
     BeyondTolerances,
     ExchangedSensors,
@@ -76,108 +69,18 @@ from model.study.contrast_maps import random_contacts
 from model.study.verification import draw_plates, felt_on
 from model.table.table_file import build_table
 
-_OTHER = {"free": "mounted", "mounted": "free"}
-_VARYING = 0.8  # standard deviation of logarithms of gains, as no drive has it
-_CLEARLY = 0.5  # of that as written
-
-
-@dataclass(frozen=True)
-class MisreadResonance:
-    """Exciters whose resonance in the rig is the other one.
-
-    rig: with the right ones; meant, as_written: `free` and `mounted`, by exciter; frequency: of the
-    glued magnet [Hz] by exciter; variation, variation_as_written: of gains over frequency, standard
-    deviations of their logarithms.
-    """
-
-    rig: Rig
-    meant: Mapping[str, str]
-    frequency: Mapping[str, float]
-    variation: float
-    variation_as_written: float
-
-    label = "RESONANCE"
-
-    def __str__(self) -> str:
-        """What is wrong, and what to do."""
-        (meant, *_), (glued, *_) = self.meant.values(), self.frequency.values()
-        names = ", ".join(self.meant)
-        return (
-            f"resonance_is of {names} must be {meant}, got {_OTHER[meant]}: with it {meant} a "
-            f"glued magnet resonates at {glued:.0f} Hz, and gains vary by a factor of "
-            f"{math.exp(self.variation):.2g} over frequency, as written by "
-            f"{math.exp(self.variation_as_written):.2g}; correct the rig"
-        )
-
-
-def misread_resonance(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
-) -> MisreadResonance | None:
-    """Find exciters with the other meaning of their resonances where that is clearly the measured.
-
-    shapes: of the observation, by the rig's plate. None without a resonance in the file.
-    """
-    rig = plate.rig
-    as_written = {
-        name: str(section.values["resonance_is"])
-        for name, section in sections_of(rig).items()
-        if not section.stiffness
-    }
-    if not as_written:
-        return None
-    variation_as_written = _variation(plate, shapes, observation)
-    if not variation_as_written > _VARYING:
-        return None
-    for which in dict.fromkeys(as_written.values()):
-        meant = {name: _OTHER[which] for name, own in as_written.items() if own == which}
-        other = rig.replaced(eras={name: {"resonance_is": each} for name, each in meant.items()})
-        sensed = plate_of(other, observation)
-        found = _variation(sensed, match_shapes(sensed, observation.values), observation)
-        if found < _CLEARLY * variation_as_written:
-            glued = {e.name: e.magnet_frequency for e in exciters_of(other) if e.name in meant}
-            return MisreadResonance(other, meant, glued, found, variation_as_written)
-    return None
-
-
-def _variation(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> float:
-    """Standard deviation over frequency of the logarithm of gains, the median channel's."""
-    model = plate.responses(plate.moved(*shapes.start))[:, list(shapes.nearest)]
-    values = observation.values
-    weight = np.isfinite(values) / row_rms(values)[:, :, None]
-    gains, _ = project_gains(model, values, weight)
-    driven = np.isfinite(gains).sum(axis=0) > 1
-    with np.errstate(divide="ignore"):
-        sizes = np.log(np.abs(gains[:, driven]))
-    return float(np.median(np.nanstd(sizes, axis=0))) if driven.any() else 0.0
-
-
-OtherMeaning: TypeAlias = TurnedGrain | MisreadResonance
-"""A rig with the other of two values, of which the measurement clearly is."""
-
-
-def other_meaning(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
-) -> OtherMeaning | None:
-    """Find what the rig of a plate says the wrong way round, the grain first; None for nothing.
-
-    shapes: of the observation, by that plate.
-    """
-    return turned_grain(plate, shapes, observation) or misread_resonance(plate, shapes, observation)
-
-
-def check_meaning(rig: Rig, observation: Responses) -> None:
-    """Raise InputError for a rig that clearly says something the wrong way round."""
-    plate = plate_of(rig, observation)
-    found = other_meaning(plate, match_shapes(plate, observation.values), observation)
-    if found:
-        raise InputError(str(found))
-
+_OTHER_MEANING = {"free": "mounted", "mounted": "free"}
+_MAX_VARIATION = 0.8  # standard deviation of logarithms of gains; no drive has more
+_CLEARLY = 0.5  # of the variation as written
 
 MISSED_DB = 1.0
-"""By which half of a table's answers may miss their promises [dB]."""
+"""Largest miss of the promises of a table by half of its answers [dB]."""
 
 STRONG = 1.25
-"""Gain of a channel: 2 dB either way, four times what a drive varies."""
+"""Gain from which a channel is strong, or weak below its inverse: 2 dB.
+
+That is four times the variation of drives.
+"""
 
 _GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
 LOOSE = 0.7
@@ -189,8 +92,69 @@ _MIN_CONFIDENCE = 0.99  # in another ERA than the rig's
 _MIN_COST_REDUCTION = 20.0  # by another wiring than the rig's
 _MAX_PHASE_ERROR = 45.0  # degrees
 
+_ANSWERS = 30  # ten each with one, two and three quiet fingers
+
+GRAVITY = 9.80665  # m/s², standard
+_MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
+_MAX_FREQUENCIES = 16  # ample for every check
+_CLEAR = 20.0  # difference of costs
+
+_QUANTITIES = (
+    ("g", f"multiply by {GRAVITY}", 1 / GRAVITY, 0),
+    ("mm/s² per m", "divide by 1000", 1e3, 0),
+    ("m/s² per mm", "multiply by 1000", 1e-3, 0),
+    ("m/s² per µm", "multiply by 1000000", 1e-6, 0),
+    ("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY, 0),
+    ("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY, 0),
+    ("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
+    ("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
+    ("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
+    ("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
+    ("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
+)
+"""Quantities that responses may be by mistake: name, remedy, factor and power.
+
+They are factor * (i omega)^power times acceleration per displacement.
+"""
+
+
+@dataclass(frozen=True)
+class MisreadResonance:
+    """Exciters whose resonance in the rig is the other one of `free` and `mounted`."""
+
+    rig: Rig
+    """The rig with the right ones."""
+    meant: Mapping[str, str]
+    """The right one of `free` and `mounted` by exciter."""
+    frequency: Mapping[str, float]
+    """Resonance of the glued magnet by exciter [Hz]."""
+    variation: float
+    """Standard deviation over frequency of the logarithms of gains, with the right ones."""
+    variation_as_written: float
+    """The same as written."""
+
+    label = "RESONANCE"
+
+    def __str__(self) -> str:
+        """What is wrong, and what to do."""
+        (meant, *_), (glued, *_) = self.meant.values(), self.frequency.values()
+        written = _OTHER_MEANING[meant]
+        names = ", ".join(self.meant)
+        return (
+            f"resonance_is of {names} must be {meant}, got {written}: with it {meant} "
+            f"a glued magnet resonates at {glued:.0f} Hz, and gains vary by a factor of "
+            f"{math.exp(self.variation):.2g} over frequency, as written by "
+            f"{math.exp(self.variation_as_written):.2g}; correct the rig"
+        )
+
+
+OtherMeaning: TypeAlias = TurnedGrain | MisreadResonance
+"""A rig with the other of two values, which clearly explains the measurement better."""
+
+
 Check: TypeAlias = Callable[[SensedPlate, ShapeMatch, Responses], None]
-"""Of responses at usable sensors, by the plate there and what its shapes are most like."""
+"""Checks responses at usable sensors, with the plate there and the match of its shapes."""
+
 
 ChannelState: TypeAlias = Literal[
     "well",
@@ -207,51 +171,54 @@ ChannelState: TypeAlias = Literal[
 
 @dataclass(frozen=True)
 class ChannelVerdict:
-    """A channel: the ERA to which the rig wires it, the one that it drives, and its states.
-
-    states: "well" alone if nothing is wrong; drives: None for a channel that is dead or was not
-    driven; gain: relative to the command and the rig's gains; phase [degrees], None if unknown;
-    mac_own, mac_found: median MAC with the rig's ERA and with the one found; confidence 0..1 in
-    drives and states.
-    """
+    """A channel: the ERA to which the rig wires it, the one that it drives, and its states."""
 
     era: str
+    """ERA to which the rig wires it."""
     channel: Channel
     states: tuple[ChannelState, ...]
+    """What is wrong with it; "well" alone if nothing is."""
     drives: str | None
+    """ERA that it drives, None for a dead channel or one that was not driven."""
     gain: float | None
+    """Gain relative to the command and the rig's gains."""
     phase: float | None
+    """Phase error [degrees], None if unknown."""
     mac_own: float | None
+    """Median MAC with the rig's ERA."""
     mac_found: float | None
+    """Median MAC with the ERA that it drives."""
     confidence: float
+    """Confidence 0..1 in `drives` and `states`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Result of a diagnosis.
-
-    plate_matches: whether the rig's plate within its priors explains the measurement; match: that
-    plate; explanations: other plates that do, most likely first, if it does not; bad_sensors: left
-    out; swapped: cycles of channels by their ERAs; changes: see `plate_changes`, None without a
-    plate that fits; sensors: names of those that were not left out; beyond: what of a plate that
-    matches is beyond tolerances, None for nothing or where it was not sought; promise_margins: by
-    what that plate exceeds the contrasts that the rig's table promises [dB], none where they were
-    not compared; corrections: what the files say wrongly of the board or of places of sensors; all
-    else is of the corrected ones.
-    """
+    """Result of a diagnosis."""
 
     channels: tuple[ChannelVerdict, ...]
     plate_matches: bool
+    """Whether the rig's plate within its priors explains the measurement."""
     match: Match | None
+    """That plate."""
     explanations: tuple[Explanation, ...]
+    """Other plates that explain it if the rig's does not, most likely first."""
     bad_sensors: tuple[BadSensor, ...]
+    """Sensors left out."""
     swapped: tuple[tuple[str, ...], ...]
+    """Cycles of channels by their ERAs."""
     changes: dict[str, float] | None
+    """Relative differences from the rig as `plate_changes`, None without a plate that fits."""
     sensors: tuple[str, ...]
+    """Names of the sensors that were used."""
     frequencies: FloatArray
     beyond: BeyondTolerances | None = None
+    """What of a plate that matches is beyond tolerances, None for nothing or if not sought."""
     promise_margins: tuple[float, ...] = ()
+    """Margins [dB] of the plate's contrasts over those that the rig's table promises; empty if they
+    were not compared."""
     corrections: tuple[OtherMeaning | ExchangedSensors | ReversedAxes, ...] = ()
+    """Errors in the files; all else is found with these corrected."""
 
     @property
     def wiring_matches(self) -> bool:
@@ -260,7 +227,7 @@ class Verdict:
 
     @property
     def common_state(self) -> ChannelState | None:
-        """Strong or weak where nearly all channels are, of which a sensor is the likelier cause."""
+        """Strong or weak where nearly all channels are, most likely by the sensors."""
         driven = [channel.states for channel in self.channels if channel.gain]
         states: tuple[ChannelState, ...] = ("strong", "weak")
         for state in states:
@@ -298,7 +265,7 @@ class Verdict:
 
     @property
     def missed_db(self) -> float:
-        """By how much half of the table's answers miss their promises [dB]; 0 if not compared."""
+        """Median miss of the table's promises [dB]; 0 if they were not compared."""
         return -float(np.median(self.promise_margins)) if self.promise_margins else 0.0
 
     @property
@@ -317,11 +284,11 @@ def diagnose(
 ) -> Verdict:
     """Compare a measurement with the rig's prediction.
 
-    false_alarm: share of plates as written of which a value may be called wrong; check: that
-    responses are what they claim, before channels are judged by their size; then corrections are
-    errors; has_form: whether the
-    plate may have form errors, and what is beyond them is sought, by sensors of known scale.
-    Raises InputError for fewer than three usable sensors or four frequencies.
+    false_alarm: share of plates as written with a value that may be called wrong; check: raises
+    InputError for responses that are not what they claim, before channels are judged by their size;
+    with it corrections are errors, too; has_form: whether the plate may have form errors, so that
+    deviations beyond their tolerances are sought, by sensors of known scale. Raises InputError for
+    fewer than three usable sensors or four frequencies.
     """
     if not observation.measured.any():
         raise InputError("no channel was driven; drive each in turn and measure again")
@@ -396,7 +363,7 @@ def diagnose(
     beyond = None
     if has_form:
         with_form, beyond = match_with_form(plate, observation, values, drives)
-        if with_form.error <= MAX_ERROR:
+        if with_form.error <= MAX_FORM_ERROR:
             match = with_form
     # Values that stand in for a form error that is less likely say nothing of themselves.
     limit = min(false_alarm, beyond.chance if beyond else 1.0)
@@ -448,7 +415,7 @@ def best_wiring(
 ) -> tuple[Match, tuple[int, ...]]:
     """Best plate and wiring for values (f, e, s): the rig's unless another is clearly better.
 
-    shapes: what they are most like.
+    shapes: match of the values with the plate.
     """
     own = tuple(range(values.shape[1]))
     nearest = tuple(
@@ -518,9 +485,9 @@ def _channel(
 def _loose(
     channel: ChannelVerdict, rig: Rig, match: Match, explanations: Sequence[Explanation]
 ) -> ChannelVerdict:
-    """The same, loose where its exciter is what is farthest off, or the likeliest explanation.
+    """Mark a channel as loose if its exciter deviates most, or is the likeliest explanation.
 
-    And acts with less than it would.
+    It must act with less than its own stiffness.
     """
     drives = channel.drives
     if drives is None or isinstance(rig.era(drives), Era):
@@ -535,7 +502,7 @@ def _loose(
 
 
 def _as_loose(channel: ChannelVerdict) -> ChannelVerdict:
-    """The same, loose, which makes it weak as well."""
+    """Mark a channel as loose, in place of weak."""
     others = (each for each in channel.states if each not in ("well", "weak", "loose"))
     return replace(channel, states=("loose", *others))
 
@@ -566,13 +533,11 @@ def _cycles(
     return tuple(found)
 
 
-_ANSWERS = 30  # ten each with one, two and three quiet fingers
-
-
 def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
-    """The verdict with what the plate keeps of the promises to random fingers, solved exactly.
+    """Add the margins of promises to random fingers on the matched plate, solved exactly.
 
-    As it is where no plate fits, and for a rig that makes no table or has no room for four fingers.
+    The verdict stays as it is where no plate fits, and for a rig that has no table or no room for
+    four fingers.
     """
     if verdict.match is None or verdict.changes is None:
         return verdict
@@ -601,42 +566,8 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
     return replace(verdict, promise_margins=tuple(margins))
 
 
-GRAVITY = 9.80665  # m/s², standard
-_MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
-_MAX_FREQUENCIES = 16  # ample for every check
-_CLEAR = 20.0  # difference of costs
-
-
-@dataclass(frozen=True)
-class _Quantity:
-    """What responses may be instead of acceleration per displacement: name, remedy, and factor.
-
-    factor * (i omega)^power times that is recorded.
-    """
-
-    name: str
-    remedy: str
-    factor: float
-    power: int = 0
-
-
-_QUANTITIES = (
-    _Quantity("g", f"multiply by {GRAVITY}", 1 / GRAVITY),
-    _Quantity("mm/s² per m", "divide by 1000", 1e3),
-    _Quantity("m/s² per mm", "multiply by 1000", 1e-3),
-    _Quantity("m/s² per µm", "multiply by 1000000", 1e-6),
-    _Quantity("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY),
-    _Quantity("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY),
-    _Quantity("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
-    _Quantity("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
-    _Quantity("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
-    _Quantity("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
-    _Quantity("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
-)
-
-
 def check_consistency(rig: Rig, responses: Responses) -> Screening:
-    """Refuse responses that are not what they claim; return what of them a fit can use.
+    """Check that responses are what they claim to be, and screen them for a fit.
 
     Raises InputError that names the cause: too few sensors or frequencies, another quantity or
     unit, a grain along the other side, the other meaning of a resonance, conjugated phases, sensors
@@ -678,7 +609,7 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Respons
     omega = 2 * np.pi * observation.frequencies[:, None]
 
     def distance(factor: float, power: int) -> float:
-        """Of gains from those of a quantity, by size and by phase."""
+        """Distance of gains from those of a quantity, by size and by phase."""
         expected = factor * (1j * omega) ** power
         off = np.abs(size - np.log(np.abs(expected)))[known]
         phase = np.angle(gains / expected)[known]
@@ -686,14 +617,14 @@ def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, observation: Respons
 
     level = float(np.median(size[known]))
     own = distance(1.0, 0)
-    nearest = best_by(_QUANTITIES, lambda each: -distance(each.factor, each.power))
-    gap = distance(nearest.factor, nearest.power)
+    name, remedy, factor, power = best_by(_QUANTITIES, lambda each: -distance(*each[2:]))
+    gap = distance(factor, power)
     if abs(level) < np.log(_MAX_GAIN) or own < gap:
         return
     if gap < np.log(_MAX_GAIN):
         raise InputError(
-            f"responses must be acceleration per base displacement in 1/s², got {nearest.name}, as "
-            f"it looks: all are {np.exp(level):.3g} of what the rig predicts; {nearest.remedy}"
+            f"responses must be acceleration per base displacement in 1/s², got {name}, as "
+            f"it looks: all are {np.exp(level):.3g} of what the rig predicts; {remedy}"
         )
     raise InputError(
         f"responses must be those of the rig to a factor of {_MAX_GAIN:g}, got "
@@ -750,3 +681,62 @@ def _check_size(verdict: Verdict) -> None:
 
 def _joined(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def check_meaning(rig: Rig, observation: Responses) -> None:
+    """Raise InputError for a rig whose grain or resonances are clearly the wrong ones."""
+    plate = plate_of(rig, observation)
+    found = other_meaning(plate, match_shapes(plate, observation.values), observation)
+    if found:
+        raise InputError(str(found))
+
+
+def other_meaning(
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+) -> OtherMeaning | None:
+    """Find a value that the rig of a plate has the wrong way round, the grain first.
+
+    shapes: match of the observation with that plate. None if neither is clearly wrong.
+    """
+    return turned_grain(plate, shapes, observation) or misread_resonance(plate, shapes, observation)
+
+
+def misread_resonance(
+    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+) -> MisreadResonance | None:
+    """Find exciters whose other resonance clearly explains the observation better.
+
+    shapes: match of the observation with the rig's plate. None without a resonance in the file.
+    """
+    rig = plate.rig
+    as_written = {
+        name: str(section.values["resonance_is"])
+        for name, section in sections_of(rig).items()
+        if not section.stiffness
+    }
+    if not as_written:
+        return None
+    variation_as_written = _variation(plate, shapes, observation)
+    if not variation_as_written > _MAX_VARIATION:
+        return None
+    for which in dict.fromkeys(as_written.values()):
+        meant = {name: _OTHER_MEANING[which] for name, own in as_written.items() if own == which}
+        other = rig.replaced(eras={name: {"resonance_is": each} for name, each in meant.items()})
+        sensed = plate_of(other, observation)
+        found = _variation(sensed, match_shapes(sensed, observation.values), observation)
+        if found < _CLEARLY * variation_as_written:
+            glued = {e.name: e.magnet_frequency for e in exciters_of(other) if e.name in meant}
+            return MisreadResonance(other, meant, glued, found, variation_as_written)
+    return None
+
+
+def _variation(plate: SensedPlate, shapes: ShapeMatch, observation: Responses) -> float:
+    """Standard deviation over frequency of the logarithm of gains, the median channel's."""
+    model = plate.responses(plate.moved(*shapes.start))[:, list(shapes.nearest)]
+    values = observation.values
+    weight = np.isfinite(values) / row_rms(values)[:, :, None]
+    gains, _ = project_gains(model, values, weight)
+    driven = np.isfinite(gains).sum(axis=0) > 1
+    with np.errstate(divide="ignore"):
+        sizes = np.log(np.abs(gains[:, driven]))
+    return float(np.median(np.nanstd(sizes, axis=0))) if driven.any() else 0.0

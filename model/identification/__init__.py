@@ -1,1 +1,1 @@
-"""Identification of a rig in place: parameters from responses at its ERAs, and their errors."""
+"""Identification of a rig in place: its parameters and their errors, from measured responses."""

@@ -1,10 +1,9 @@
-"""Derivatives of the responses of a plate by all of its parameters, and by a mass anywhere.
+"""Derivatives of a plate's responses by all of its parameters, and by a mass at any point.
 
-With L = 1 - T Z, changes dA of the free receptance and dZ of what is attached change the receptance
-T of the plate on its attachments by L dA L^T - T dZ T: a mode, a place or an attachment by a rank
-of one or two (`model.identification.forward`). A sensor of mass m that is on the plate while it
-measures sees l dT_sj + l² w² m T_sj dT_ss.
-"""
+With L = 1 - T Z, a change dA of the free receptance and dZ of what is attached change the
+receptance T of the plate on its attachments by L dA L^T - T dZ T. For a mode, a place or an
+attachment that is a change of rank one or two (symbols as in `model.identification.forward`). A
+sensor of mass m that is on the plate while it measures adds l² w² m T_sj dT_ss to l dT_sj."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.forward import LEAST_LOSS, PlateAt
+from model.identification.forward import MIN_LOSS_FACTOR, PlateAt
 from model.identification.parameters import EXCITER_KINDS
 from model.reduction.free_plate import TERMS, combined
 from model.structure.plate import LOSS_FREQUENCY
@@ -44,7 +43,7 @@ def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:
 
 
 def reach_to(plate: PlateAt, points: FloatArray) -> ComplexArray:
-    """How forces at points (p, 2) [m] move what is attached, (f, a, p)."""
+    """Motion of what is attached by forces at points (p, 2) [m], (f, a, p)."""
     modes, functions = plate.model.modes, plate.functions
     truncated = modes.truncated_terms(plate.located.footprints, points)
     by_modes = plate.reach @ modes.shapes_at(points).T
@@ -56,12 +55,12 @@ Columns: TypeAlias = dict[str, ComplexArray]
 
 
 def _by_plate(plate: PlateAt) -> Columns:
-    """By thickness, modulus and loss factor of the whole plate."""
+    """Derivatives by thickness, modulus and loss factor of the whole plate."""
     functions, reach = plate.functions, plate.reach
     seen, driven = reach[:, plate.model.observed], reach[:, _pushed(plate)].swapaxes(1, 2)
 
     def responses(of_modes: ComplexArray | float, of_rest: ComplexArray | float) -> ComplexArray:
-        """By what changes logarithms of the stiffness of modes (f, r), and of all else (f,)."""
+        """Derivatives by a change of the log stiffness of modes (f, r) and of all else (f,)."""
         change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
         if plate.bending is not None:
             change += seen @ (plate.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
@@ -77,7 +76,7 @@ def _by_plate(plate: PlateAt) -> Columns:
         "thickness": 2 * by_stiffness - by_mass[..., None],
         "modulus": by_stiffness,
         "loss": by_loss,
-        "loss_added": by_loss / max(plate.values.loss_factor, LEAST_LOSS),
+        "loss_added": by_loss / max(plate.values.loss_factor, MIN_LOSS_FACTOR),
         "loss_exponent": powers * by_loss,
     }
 
@@ -101,7 +100,7 @@ def _by_modes(plate: PlateAt) -> Columns:
 
 
 def _by_form(plate: PlateAt) -> Columns:
-    """By foreign mass and what stretches the plate, which couple its modes, and their losses."""
+    """Derivatives by form errors: foreign mass and sides, which couple modes, and the loss law."""
     model, functions = plate.model, plate.functions
     if model.form is None:
         return {}
@@ -124,7 +123,7 @@ def _by_form(plate: PlateAt) -> Columns:
 
 
 def _by_places(plate: PlateAt) -> Columns:
-    """By the places of ERAs, and by additional masses and theirs.
+    """Derivatives by the places of ERAs and sensors, and by additional masses and their places.
 
     A place changes the receptance in its row and its column.
     """
@@ -150,7 +149,7 @@ def _by_places(plate: PlateAt) -> Columns:
 
 
 def _by_attachments(plate: PlateAt) -> Columns:
-    """By the values of ERAs, which also drive through them, by feet and the parts of fingers."""
+    """Derivatives by the values of ERAs, which also drive through them, by feet and by fingers."""
     model, values, Y = plate.model, plate.values, plate.responses
     n = plate.force.shape[1]
     eras, slopes = np.arange(n), [each.slopes(model.omega) for each in plate.sources]
@@ -197,7 +196,7 @@ def _by_gains(plate: PlateAt) -> Columns:
 
 
 def _by_scale(plate: PlateAt) -> ComplexArray:
-    """By the scale of each sensor, which may be zero."""
+    """Derivatives by the scale of each sensor, which may be zero."""
     count = len(plate.values.sensor_scales)
     plain = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late
     return np.asarray(
@@ -221,8 +220,14 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "fingers",
     ),
     _by_gains: (
-        *("gain", "phase", "inertia", "drag", "delay"),
-        *("sensor_gain", "sensor_phase", "sensor_scale"),
+        "gain",
+        "phase",
+        "inertia",
+        "drag",
+        "delay",
+        "sensor_gain",
+        "sensor_phase",
+        "sensor_scale",
     ),
 }
 

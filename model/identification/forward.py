@@ -1,21 +1,20 @@
-"""Responses of a rig's plate at its sensors for a vector of parameters.
+"""Forward model: responses of a rig's plate at its sensors for a vector of parameters.
 
-With A the receptance of the free plate between all attachments and sensors, Z the dynamic stiffness
-of what is attached there (0 at a sensor) and T = A (1 + Z A)^-1, a sensor s answers to the drive of
-ERA j, which by its gain g_j pushes with F_j g_j on a plate that is held, (k_j + i w c_j) g_j for a
-base, with
+A is the receptance of the free plate between all attachments and sensors, Z the dynamic stiffness
+of what is attached there (0 at a sensor), and T = A (1 + Z A)^-1 the receptance of the plate on its
+attachments. ERA j, whose gain is g_j, drives a plate that is held by the force F_j g_j, which is
+(k_j + i w c_j) g_j for a moving base. Sensor s then reads
 
-    Y_sj = -w² sigma_s l_s T_sj F_j g_j,    l_s = 1 / (1 - w² m_s T_ss).
+    Y_sj = -w² sigma_s l_s T_sj F_j g_j,    l_s = 1 / (1 - w² m_s T_ss),
 
-A sensor of mass m_s loads the plate only while it measures: one that is moved from place to place.
+with its gain sigma_s. A sensor of mass m_s loads the plate only while it measures, like one that is
+moved from place to place.
 
-What changes in a plate's responses where its losses are viscous, not hysteretic.
-
-A loss factor that is the same at every frequency, (1 + i eta) K, is not causal. The other extreme
-loses in each mode j of the plate on its supports as the loss factor does at its own resonance, but
-in proportion to frequency, eta omega / omega_j. Both agree at the resonances alone, and most tones
-are beside them: a fit of the wrong law finds a loss factor that is off by more than noise and form
-errors make it. What lies between them is a form error of its own, of which a fit finds the share.
+Losses are hysteretic: a loss factor that is the same at every frequency, (1 + i eta) K, which is
+not causal. At the other extreme they are viscous: each mode j of the plate on its supports loses in
+proportion to frequency, eta omega / omega_j. Both agree at the resonances alone, while most tones
+are beside them, so that a fit of the wrong law finds a loss factor that is off by more than noise
+and form errors explain. A plate with form errors has a parameter between both laws, 0 to 1.
 """
 
 from collections.abc import Sequence
@@ -54,29 +53,30 @@ from model.structure.plate import LOSS_FREQUENCY
 SENSOR_FOOT = 5e-3
 """Radius of the disc on which a sensor's mass acts [m]: under a point a plate is soft."""
 
-LEAST_LOSS = 1e-9
-"""Loss factor that counts for none, so that there are derivatives by its logarithm."""
+MIN_LOSS_FACTOR = 1e-9
+"""Least loss factor, so that there are derivatives by its logarithm."""
+
+_SLOWEST = 2 * np.pi  # rad/s; of slower modes the frequency of losses is taken as this
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of acceleration: at the bolt of an ERA, or at x, y [m] where era is "".
-
-    amplifier: on whose clock its phases count, "" for that of none; mass [kg]: on the plate only
-    while this sensor measures, as that of one sensor moved from place to place.
-    """
+    """A sensor of acceleration, at the bolt of an ERA or at a point of the plate."""
 
     name: str
     era: str = ""
+    """Name of the ERA at whose bolt it is, "" for one at x, y [m]."""
     x: float = 0.0
     y: float = 0.0
     amplifier: str = ""
+    """Amplifier on whose clock its phases count, "" for that of no amplifier."""
     mass: float = 0.0
+    """Mass [kg] on the plate while this sensor measures, as of one that is moved."""
 
 
 @dataclass(frozen=True)
 class RestingFinger:
-    """A finger that rests at x, y [m], as far as its load is known."""
+    """A finger that rests at x, y [m], with the load that is known of it."""
 
     x: float
     y: float
@@ -85,28 +85,31 @@ class RestingFinger:
 
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
-    """A rig's plate, as it was solved, on its attachments, with sensors and fingers.
+    """A rig's plate on its attachments, with sensors and fingers, as a function of parameters.
 
-    frequencies (f,) [Hz]; free: of the rig's plate, solved for its own thickness and modulus or
-    others; space: what may differ; form: the plate in coordinates in which it may have form errors;
-    amplifiers: those whose clocks may be off, in the order of the delays; law (f, s, n): change of
-    the receptance where losses are viscous, None for none.
     Raises InputError for a plate that does not scale with a thickness or modulus that may differ.
     """
 
     rig: Rig
     sensors: Sequence[Sensor]
     frequencies: FloatArray
+    """Frequencies of the tones (f,) [Hz]."""
     space: Space
+    """Parameters, those that may differ from the rig's values among them."""
     free: FreePlate
+    """The free plate, solved for the rig's thickness and modulus or for others."""
     fingers: Sequence[RestingFinger] = ()
     form: ReducedModes | None = None
+    """The plate in coordinates in which it may have form errors."""
     amplifiers: Sequence[str] = ()
+    """Names of the amplifiers whose clocks may be off, in the order of the delays."""
     law: ComplexArray | None = None
+    """Change of the receptance (f, s, n) [m/N] where losses are viscous, None to leave it out."""
     last_places: dict[bytes, AttachmentPoints] = field(default_factory=dict)
+    """The last solution for all attachments, by their footprints."""
 
     def __post_init__(self) -> None:
-        """Refuse a plate of which neither responses nor slopes would be right."""
+        """Raise InputError for a plate whose responses and slopes would be wrong."""
         stds = (self.space.std[self.space.groups[kind]] for kind in ("thickness", "modulus"))
         check_scales(self.rig.plate, *(1 + std for std in stds), remedy=WITHOUT_PART)
 
@@ -122,7 +125,7 @@ class ForwardModel:
 
     @cached_property
     def observed(self) -> IntArray:
-        """Where each sensor is among the attachments, (s,)."""
+        """Indices of the sensors among the attachments, (s,)."""
         names = [era.name for era in self.rig.eras]
         after = len(names) + len(self.rig.masses) + self.mass_count + len(self.fingers)
         found = []
@@ -133,9 +136,9 @@ class ForwardModel:
 
     @cached_property
     def lateness(self) -> FloatArray:
-        """By which a response to an ERA is late by a clock that is, (s, n, amplifiers).
+        """Sign of the delay of each response by the clock of each amplifier, (s, n, amplifiers).
 
-        1 where its amplifier plays, -1 where it hears, since what it hears seems early.
+        1 where the amplifier plays, -1 where it hears, since what it hears seems early.
         """
         names = [*self.amplifiers]
         plays = [self.rig.wiring[era.name].amplifier for era in self.rig.eras]
@@ -145,7 +148,7 @@ class ForwardModel:
 
     @property
     def modes(self) -> Modes:
-        """The modes that the plate moves in."""
+        """The modes of the free plate, or its coordinates with form errors."""
         return self.form or self.free.modes
 
     @cached_property
@@ -211,9 +214,10 @@ class ForwardModel:
         return PlateAt(self, x)
 
     def places(self, values: Values) -> AttachmentPoints:
-        """Solution for all attachments where they are; the last one is kept.
+        """Solve for all attachments at their places; the last solution is kept.
 
-        Of a plate with form errors by slopes from the rig's places, which may leave the plate.
+        A plate with form errors is extrapolated from the rig's places by the slopes of its shapes,
+        since places may leave it.
         """
         footprints = self._footprints(values)
         if self.form is not None:
@@ -234,7 +238,7 @@ class ForwardModel:
         return np.array([self.rig.plate.length, self.rig.plate.width])
 
     def _footprints(self, values: Values) -> FloatArray:
-        """Of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
+        """Footprints of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
         feet = [era.foot for era in self.rig.eras]
         fingers = np.array([(each.x, each.y) for each in self.fingers]).reshape(-1, 2)
         points = np.vstack([values.masses[:, 1:], fingers])
@@ -251,17 +255,9 @@ class ForwardModel:
 
 
 class PlateAt:
-    """The plate of a forward model for one vector of parameters x (p,), a attachments on it.
+    """The plate of a forward model for one vector of parameters x (p,), with a attachments.
 
-    values: of x; located: where all is; functions: of frequency; by_loss, by_mode_loss (f, r) and
-    by_loss_of_rest (f,): change of the logarithm of their stiffness with that of the plate's loss
-    factor, and of all that a mode loses; eta (f,): loss factor; modulus: relative to that solved;
-    further (f, r, r): stiffness between modes beside all else [rad²/s²], None for none; bending
-    (f, r, r), added (r, r): stiffness and mass between modes by form errors; sources: the ERAs;
-    force (f, n): of each on a plate that is held, per unit of its drive; stiffness (f, a): of what
-    is attached; free_receptance A, receptance T, of the plate with its attachments, and left factor
-    L (f, a, a); moved (f, r, a): coordinates of the free plate by a force at each; finger_slopes:
-    by finger, derivatives of its dynamic stiffness by its parts (f, 4).
+    further (f, r, r): stiffness [rad²/s²] between its r modes that is added to theirs.
     """
 
     def __init__(
@@ -270,16 +266,21 @@ class PlateAt:
         self.model, self.values = model, Values.of(model.rig, model.space, x)
         self.further = further
         self.functions = self._functions()
+        """The free plate's modal receptance and truncated sums as functions of frequency."""
         self.located = model.places(self.values)
+        """Shapes at all attachments."""
         w, values = model.omega[:, None], self.values
         self.sources = values.sources(model.rig)
+        """The ERAs with their values."""
         self.full_levels = np.array([each.full_level for each in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
+        """Force of each ERA on a plate that is held, per unit of its drive, (f, n)."""
         loads = [
             _finger(each.fingertip, logs, model.omega)
             for each, logs in zip(model.fingers, values.fingers, strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
+        """Derivatives of each finger's dynamic stiffness by its parts, (f, 4)."""
         fixed = model.fixed_stiffness.copy()
         fixed[:, list(model.rig.feet)] += (values.supports - 1) * model.springs
         held = [
@@ -290,6 +291,7 @@ class PlateAt:
             np.zeros((len(w), len(model.pads))),
         ]
         self.stiffness = Z = np.concatenate(held, axis=1)
+        """Dynamic stiffness of what is attached (f, a) [N/m]."""
         shapes, moved = self.located.shapes, self.solved(self.located.shapes)
         A = shapes @ moved + combined(self.functions.truncated(TERMS), self.located.truncated)
         # Nothing holds the plate at the sensors, the last ones.
@@ -298,12 +300,17 @@ class PlateAt:
         reaction = A[:, :, :count] @ forces * Z[:, None, :count]
         self.left = np.repeat(np.eye(Z.shape[1], dtype=complex)[None], len(w), axis=0)
         self.left[:, :, :count] -= reaction
+        """L = 1 - T Z (f, a, a)."""
         self.receptance = A - reaction @ A[:, :count]
-        self.free_receptance, self.moved = A, moved
+        """T, of the plate with its attachments (f, a, a) [m/N]."""
+        self.free_receptance = A
+        """A, of the free plate (f, a, a) [m/N]."""
+        self.moved = moved
+        """Coordinates of the free plate by a force at each attachment (f, r, a) [s²/kg]."""
 
     @cached_property
     def reach(self) -> ComplexArray:
-        """How a force on each mode of the free plate moves what is attached, (f, a, r) [s²/kg]."""
+        """Motion of what is attached by a force on each free mode (f, a, r) [s²/kg]."""
         return self.left @ self.moved.swapaxes(1, 2)
 
     def solved(self, shapes: FloatArray) -> ComplexArray:
@@ -332,7 +339,7 @@ class PlateAt:
 
     @cached_property
     def scale(self) -> ComplexArray:
-        """What turns T at sensors and ERAs into responses, (f, s, n)."""
+        """Factors from T at sensors and ERAs to responses, (f, s, n)."""
         gains = self.values.sensor_gains
         if len(self.values.sensor_scales):
             gains = gains * self.values.sensor_scales
@@ -354,7 +361,7 @@ class PlateAt:
 
     @cached_property
     def seen(self) -> ComplexArray:
-        """The same of a plate whose losses follow the law that x says (f, s, n) [m/N]."""
+        """`loaded` with losses between hysteretic and viscous, as x has them (f, s, n) [m/N]."""
         if self.model.law is None:
             return self.loaded
         return np.asarray(self.loaded + self.values.loss_law * self.model.law)
@@ -379,7 +386,7 @@ class PlateAt:
         model, values = self.model, self.values
         modes, theory = model.shifted_modes, model.elasticity
         eta = (
-            max(values.loss_factor, LEAST_LOSS)
+            max(values.loss_factor, MIN_LOSS_FACTOR)
             * (model.frequencies / LOSS_FREQUENCY) ** values.loss_exponent
         )
         eigenvalues, relative = theory.eigenvalues.copy(), theory.relative_loss.copy()
@@ -400,9 +407,16 @@ class PlateAt:
             np.divide(1j * each, lossy, out=np.zeros(lossy.shape, dtype=complex), where=lossy != 0)
             for each in (own, own + further)
         )
+        """Change of the logarithm of each mode's stiffness with that of the plate's loss factor,
+        and with that of all that the mode loses (f, r)."""
         self.by_loss_of_rest = np.asarray(1j * eta / (1 + 1j * eta))
-        self.eta, self.modulus = eta, modulus
+        """The same of all but the modes, with the loss factor (f,)."""
+        self.eta = eta
+        """Loss factor (f,)."""
+        self.modulus = modulus
+        """Modulus relative to the solved plate's."""
         self.bending: ComplexArray | None = None
+        """Stiffness between modes with form errors (f, r, r) [rad²/s²]; `added` is their mass."""
         if model.form is not None:
             stretched = np.einsum("g,grq->rq", values.stretch, model.form.stiffening)
             self.bending = ((1 + 1j * eta) * modulus)[:, None, None] * stretched
@@ -415,9 +429,9 @@ class PlateAt:
 def _finger(
     tip: Fingertip, logs: FloatArray, omega: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Dynamic stiffness (f,) of a finger whose parts are larger, and derivatives by each (f, 4).
+    """Dynamic stiffness (f,) of a finger with scaled parts, and its derivatives by each (f, 4).
 
-    logs (4,): of the factors of contact mass, pulp, phalanx and joint.
+    logs (4,): logarithms of the factors on contact mass, pulp, phalanx and joint.
     """
     mass, pulp, phalanx, joint = np.exp(logs)
     w = omega
@@ -431,13 +445,10 @@ def _finger(
     return D, np.column_stack([Zm, by_pulp * Zp, by_bone * Zb, by_bone * Zj])
 
 
-_LEAST = 2 * np.pi  # rad/s; slower modes have no losses of the plate
-
-
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:
     """Change of the receptance (f, s, n) [m/N] between sensors and ERAs where losses are viscous.
 
-    Of a plate with form errors, at x (p,).
+    For a plate with form errors, at parameters x (p,).
     """
     plate = model.at(x)
     own, viscous = _lossy(plate), _viscous(plate)
@@ -468,6 +479,6 @@ def _viscous(plate: PlateAt) -> FloatArray:
     stiffness = lossy + (on_plate.T * springs) @ on_plate / h
     mass = np.eye(len(lossy)) + (on_plate.T * masses) @ on_plate / h
     eigenvalues, modes = linalg.eigh(stiffness, mass)
-    roots = np.maximum(eigenvalues, _LEAST**2) ** 0.25
+    roots = np.maximum(eigenvalues, _SLOWEST**2) ** 0.25
     weighted = mass @ modes / roots
     return np.asarray(weighted @ (modes.T @ lossy @ modes) @ weighted.T)

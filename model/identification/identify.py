@@ -1,11 +1,7 @@
-"""Identification of a rig by responses measured in place.
+"""Identification of a rig by responses measured in place, the contrast it gives, and its report.
 
-The contrast that an identified rig gives, on plates within its uncertainty solved exactly.
-
-The report of a fit, the same whatever was fitted to: values, uncertainty, held-out check.
-
-Report of an identification, as text and as JSON.
-"""
+The contrast to expect is that of answers on plates within the remaining uncertainty, solved
+exactly. Reports are made as text and as JSON."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +18,7 @@ from model.errors import InputError
 from model.identification.least_squares import Measurement
 from model.identification.parameters import KINDS, MAX_GUESSED, Space, Values, rig_with
 from model.identification.stages import (
-    SHARE,
+    HELD_OUT_FOLDS,
     FittedModel,
     HeldOutPaths,
     Posterior,
@@ -44,41 +40,60 @@ from model.study.verification import draw_plates, felt_on
 from model.table.table_file import build_table
 
 MAX_CHI2 = 2.0
-"""chi² beyond which a model does not explain a measurement, and nothing is promised from it."""
+"""Largest chi² of a model that explains a measurement, so that answers may be promised from it."""
 
 MAX_MODE_SHIFT = 2.0
-"""Root mean square of the shifts of the lowest modes, in standard deviations, beyond which a
-measurement tells too little of a plate: its fields are others, whatever its sensors hear."""
+"""Largest rms shift of the lowest modes, in standard deviations, of a plate that is known well:
+beyond it fields between the sensors are others, whatever these hear."""
 
-# How far a drive repeats from one day to the next, which no measurement tells.
+# Repeatability of a drive from one day to the next, which no measurement shows.
 _DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 
-_LEAST_VALUES = 16
-_GAIN_STDS = 5.0
-_LEAST_GAIN, _LEAST_PHASE = 0.3, math.radians(20)  # what gains are allowed at least
+_MIN_VALUES = 16
+_GAIN_STDS = 5.0  # beyond which a gain is wrong
+_GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
+
+_PLATES = 60
+_MARGIN = 0.013  # m, of fingers from the edges
+
+_MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters
+_CLOCK_STDS = 4.0  # beyond which a clock is not as stated
+_LISTED_STDS = 2.0  # from the rig's value, beyond which a parameter is listed
+
+_ALWAYS_LISTED = (
+    "thickness",
+    "modulus",
+    "stiffness",
+    "damping",
+    "loss",
+    "gain",
+    "phase",
+    "supports",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """A rig as its responses show it.
-
-    before: the rig as written; rig: with identified values and, where the model explains the
-    measurement, their uncertainty; values: of the parameters, gains of sensors among them;
-    posterior: their distribution, wider by what paths disagree in; chi2: squared residuals per
-    value; mode_shift: rms by which the lowest modes had to shift, in standard deviations; held_out:
-    how well unseen paths are predicted, None where there are too few; seed: of the contacts that a
-    promise draws.
-    """
+    """A rig as its responses show it."""
 
     before: Rig
+    """The rig as written."""
     rig: Rig
+    """The rig with identified values and, where the model explains the measurement, their
+    uncertainty."""
     values: Values
+    """Values of the parameters, gains of sensors among them."""
     posterior: Posterior
+    """Distribution of the parameters, wider by the disagreement of held-out paths."""
     chi2: float
+    """Squared residuals per degree of freedom."""
     mode_shift: float
+    """Rms by which the lowest modes had to shift, in standard deviations."""
     held_out: HeldOutPaths | None
+    """Prediction of unseen paths, None where there are too few."""
     fitted: FittedModel
     seed: int
+    """Seed of the contacts that a promise draws."""
 
     @property
     def is_explained(self) -> bool:
@@ -87,7 +102,7 @@ class Identification:
 
     @property
     def is_known_well(self) -> bool:
-        """Whether modes are those of the rig's plate, so that fields between sensors are, too."""
+        """Whether the modes are those of the rig's plate, and with them fields between sensors."""
         return self.mode_shift <= MAX_MODE_SHIFT
 
 
@@ -99,8 +114,8 @@ def identify(
     progress: called with the fits done and all, one of everything and one of each held-out share.
     Raises InputError for a rig with a part that does not scale, for a plate that was not linear or
     has changed during the measurement, for gains that no drive or sensor has (another unit, a wrong
-    sign), and where it leaves unknown what answers depend on, with the tone and the sensor that
-    would show it.
+    sign), and where a quantity that answers depend on stays unknown, with the tone and the sensor
+    that would show it.
     """
     _check(rig, measurement)
     before, free = rig, solved_for(rig, float(measurement.frequencies[-1]))
@@ -109,7 +124,15 @@ def identify(
     values = Values.of(rig, fitted.space, fitted.best.x)
     posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
     found = Identification(
-        *(before, rig, values, posterior, chi2(fitted), shift, None, fitted, seed)
+        before=before,
+        rig=rig,
+        values=values,
+        posterior=posterior,
+        chi2=chi2(fitted),
+        mode_shift=shift,
+        held_out=None,
+        fitted=fitted,
+        seed=seed,
     )
     if found.is_explained:
         _check_gains(rig, measurement, values, fitted.space)
@@ -127,15 +150,9 @@ def identify(
     if held_out:
         covariance = posterior.covariance + held_out.disagreement
         posterior = replace(posterior, covariance=covariance)
-    progress(1 + SHARE, 1 + SHARE)
+    progress(1 + HELD_OUT_FOLDS, 1 + HELD_OUT_FOLDS)
     known = rig_with(rig, values, uncertainty)
     return replace(found, rig=known, posterior=posterior, held_out=held_out)
-
-
-def _mode_shift(fitted: FittedModel) -> float:
-    """Root mean square of the shifts of modes in standard deviations, 0 without any."""
-    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
-    return float(np.sqrt((shifts**2).mean())) if len(shifts) else 0.0
 
 
 def _check(rig: Rig, measurement: Measurement) -> None:
@@ -150,9 +167,9 @@ def _check(rig: Rig, measurement: Measurement) -> None:
             raise InputError(
                 f"sensor {sensor.name} must be on the plate, got ({sensor.x:g}, {sensor.y:g}) m"
             )
-    if measurement.count < _LEAST_VALUES:
+    if measurement.count < _MIN_VALUES:
         raise InputError(
-            f"a measurement must have at least {_LEAST_VALUES} values, got {measurement.count}; "
+            f"a measurement must have at least {_MIN_VALUES} values, got {measurement.count}; "
             "play more tones"
         )
     limits, tones = rig.limits, measurement.frequencies
@@ -172,6 +189,12 @@ def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
         # Places move freely only where a plate is solved in functions over all of it.
         mesh = mesh_of("auto", rig.plate, frequency_max=rig.limits.frequency_max)
     return solve_free_plate(rig.plate, mesh, frequency_max=max(frequency_max, 200.0))
+
+
+def _mode_shift(fitted: FittedModel) -> float:
+    """Root mean square of the shifts of modes in standard deviations, 0 without any."""
+    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
+    return float(np.sqrt((shifts**2).mean())) if len(shifts) else 0.0
 
 
 def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Space) -> None:
@@ -199,27 +222,22 @@ def _wrong_gains(names: list[str], logarithms: FloatArray, space: Space, whose: 
     return [
         f"{name} {math.exp(one.real):.2f} at {math.degrees(one.imag):.0f}°"
         for name, one in zip(names, logarithms.tolist(), strict=True)
-        if abs(one.real) > max(_LEAST_GAIN, _GAIN_STDS * gain)
-        or abs(one.imag) > max(_LEAST_PHASE, _GAIN_STDS * phase)
+        if abs(one.real) > max(_GAIN_ALLOWED, _GAIN_STDS * gain)
+        or abs(one.imag) > max(_PHASE_ALLOWED, _GAIN_STDS * phase)
     ]
-
-
-_PLATES = 60
-_MARGIN = 0.013  # m, of fingers from the edges
 
 
 @dataclass(frozen=True)
 class ExpectedContrast:
-    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts.
-
-    before, after: what half of the plates like the identified one give with the answers of the rig
-    as written and as identified; promised: what nine of ten give with the latter.
-    """
+    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts."""
 
     quiet: int
     before: float
+    """Given by half of the plates like the identified one, with answers of the rig as written."""
     after: float
+    """The same with answers of the identified rig."""
     promised: float
+    """Given by nine of ten of these plates with answers of the identified rig."""
 
 
 def expected_contrast(
@@ -227,8 +245,9 @@ def expected_contrast(
 ) -> list[ExpectedContrast]:
     """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
 
-    frequencies (f,) [Hz]: of the tables, by default those of any. Nothing is promised, an empty
-    list, where chi² is beyond what explains a measurement or too few sensors were there.
+    frequencies (f,) [Hz]: of the tables, by default the usual ones. Returns an empty list, since
+    nothing can be promised, where the model does not explain the measurement or too few paths were
+    measured to hold any out.
     """
     if not found.is_explained or found.held_out is None:
         return []
@@ -265,50 +284,24 @@ def expected_contrast(
     return expected
 
 
-def value_rows(changes: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Table of values: name, before, and after with its standard error, as texts with units."""
-    width = max((len(name) for name, _, _ in changes), default=0)
-    return [f"{name:{width}}  {before} -> {after}" for name, before, after in changes]
-
-
-def quality_rows(
-    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
-) -> list[str]:
-    """Lines of the uncertainty that the new rig states, and of the prediction of what was left out.
-
-    held_out: what was; error: of its prediction, relative to the response, None where too little
-    was measured to leave any out; beside: what else is known of the fit's errors.
-    """
-    found = (
-        f"{held_out} predicted within {percent(error)} of the response"
-        if error is not None
-        else "too few sensors to leave any out"
-    )
-    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
-
-
-_MISTAKEN = 0.01  # unexplained, beyond which a plate is not quite the rig's
-_LYING = 4.0  # standard errors
-_SHOWN = 2.0  # standard errors from the rig's value, beyond which a form error is listed
-
-_ALWAYS = ("thickness", "modulus", "stiffness", "damping", "loss", "gain", "phase", "supports")
-
-
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """A parameter: its value less the rig's, standard error, standard deviation before; unit.
+    """A parameter less its value in the rig; per cent are those of the rig's value.
 
-    Per cent are those of the rig's value; places of a mass count from the middle of the plate. key:
-    the unit in words.
+    Places of a mass count from the middle of the plate.
     """
 
     name: str
     kind: str
     difference: float
     error: float
+    """Standard error of the difference."""
     before: float
+    """Standard deviation before the measurement."""
     unit: str
+    """Unit for people."""
     key: str
+    """Unit for programs."""
 
 
 def estimates(found: Identification) -> list[ParameterEstimate]:
@@ -334,24 +327,23 @@ def estimates(found: Identification) -> list[ParameterEstimate]:
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """By which an amplifier's clock is late against the first one's, as the plate shows it [us].
-
-    error: standard one; stated: rms of both, as they and their lines state.
-    """
+    """Delay of an amplifier's clock against the first one's, as the plate shows it."""
 
     amplifier: str
     delay_us: float
     error_us: float
+    """Standard error of the delay."""
     stated_us: float
+    """Rms error of both clocks, as they and their lines state."""
 
     @property
     def is_believed(self) -> bool:
-        """Whether what is stated explains it, but for one in 16 000 that are true."""
-        return abs(self.delay_us) <= _LYING * math.hypot(self.error_us, self.stated_us)
+        """Whether the stated errors explain the delay; one true statement in 16 000 fails."""
+        return abs(self.delay_us) <= _CLOCK_STDS * math.hypot(self.error_us, self.stated_us)
 
 
 def clock_estimates(found: Identification) -> list[ClockEstimate]:
-    """Clocks of all amplifiers but the first, by name, whose clocks are held to its own."""
+    """Delays of all amplifiers' clocks to that of the first one by name."""
     stated = found.fitted.problem.measurement.clock_errors
     first, *others = sorted(stated) or [""]
     part = found.posterior.space.groups["delay"]
@@ -362,38 +354,6 @@ def clock_estimates(found: Identification) -> list[ClockEstimate]:
         if name != first
     ]
     return [each for each in estimated if math.isfinite(each.stated_us)]
-
-
-def clock_rows(found: Identification) -> list[str]:
-    """Lines of clocks that are off, which the rig's gains take off, and of those that lie."""
-    rows = []
-    for each in clock_estimates(found):
-        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
-        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
-        if not each.is_believed:
-            rows.append(
-                f"amplifier {each.amplifier} or the first one must be within "
-                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
-                "or its output is late otherwise than that of its product"
-            )
-    return rows
-
-
-def parameter_rows(found: Identification) -> list[str]:
-    """Table of what a rig file states, and of all else that differs from it significantly.
-
-    By how much, those of the plate first and then ERA by ERA.
-    """
-    places = {era.name: place for place, era in enumerate(found.rig.eras)}
-    rows = []
-    for each in estimates(found):
-        if each.kind in _ALWAYS or abs(each.difference) > _SHOWN * each.error:
-            unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
-            after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
-            if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
-                after = "not identified"
-            rows.append((each.name, f"± {each.before:.2g}{unit}", after))
-    return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))
 
 
 def fit_rows(found: Identification) -> list[str]:
@@ -426,6 +386,38 @@ def fit_rows(found: Identification) -> list[str]:
     return rows
 
 
+def parameter_rows(found: Identification) -> list[str]:
+    """Table of parameters: those that a rig file states, and all others that clearly differ.
+
+    Those of the plate come first, then ERA by ERA.
+    """
+    places = {era.name: place for place, era in enumerate(found.rig.eras)}
+    rows = []
+    for each in estimates(found):
+        if each.kind in _ALWAYS_LISTED or abs(each.difference) > _LISTED_STDS * each.error:
+            unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
+            after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
+            if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
+                after = "not identified"
+            rows.append((each.name, f"± {each.before:.2g}{unit}", after))
+    return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))
+
+
+def clock_rows(found: Identification) -> list[str]:
+    """Lines of the clocks' delays, which the rig's gains correct, and of unbelievable ones."""
+    rows = []
+    for each in clock_estimates(found):
+        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
+        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
+        if not each.is_believed:
+            rows.append(
+                f"amplifier {each.amplifier} or the first one must be within "
+                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
+                "or its output is late otherwise than that of its product"
+            )
+    return rows
+
+
 def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
     """Lines of the contrast to expect before and after, and of what is promised."""
     if not expected:
@@ -437,6 +429,28 @@ def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
             f"dB; nine of ten plates {each.promised:.1f} dB"
         )
     return rows
+
+
+def value_rows(changes: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Table of values: name, before, and after with its standard error, as texts with units."""
+    width = max((len(name) for name, _, _ in changes), default=0)
+    return [f"{name:{width}}  {before} -> {after}" for name, before, after in changes]
+
+
+def quality_rows(
+    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
+) -> list[str]:
+    """Lines of the uncertainty that the new rig states, and of the held-out prediction.
+
+    held_out: what was held out; error: of its prediction, relative to the response, None where too
+    little was measured to hold any out; beside: a further note on the fit's errors.
+    """
+    found = (
+        f"{held_out} predicted within {percent(error)} of the response"
+        if error is not None
+        else "too few sensors to leave any out"
+    )
+    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
 
 
 def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict[str, Any]:

@@ -1,20 +1,16 @@
-"""A plate that stays known while it plays: every settled pattern updates it.
+"""A table in service that learns its plate: settled patterns in, corrected answers out.
 
-The parameters of an identification drift; an update moves them together with the fingers of its
-pattern, which are dropped afterwards. Where innovations are unlikely the state goes back to where
-they began, since an update smears a jump over all parameters, and is held until the patterns since
-then are explained together by one change (`model.identification.settled_patterns`). Such a change
-is followed; after one that nothing explains, as by a crack or a hand that rests on it, the plate
-counts as changed, until patterns are those of the plate as it was.
+The parameters of an identification drift. Each settled pattern updates them, together with the
+loads of its fingers, which are dropped afterwards (`model.identification.settled_patterns`). An
+update would smear a sudden change over all parameters: when innovations become unlikely, the state
+goes back to where they began and is held, until the patterns since then are explained by one
+change, which is then followed. Without an explanation, as for a crack or a hand that rests on the
+plate, the plate counts as changed until patterns fit it again as it was.
 
-The file of a learned plate: parameters and covariance, beside the table that they correct.
+Answers follow the plate as known after each pattern. While it counts as changed they are those of
+the plate as last known, with the errors of a plate that was not measured.
 
-A table that learns its plate: settled patterns in, corrected answers out.
-
-Answers follow the plate as it is known after each pattern. From an alarm on they wait for its
-explanation. Where the plate has changed in a way that its parameters do not follow they become
-those of the plate as last known, with errors as wide as those of a plate that nobody measured,
-until it is again as it was.
+The file of a learned plate holds parameters and covariance, beside the table that they correct.
 """
 
 import hashlib
@@ -51,52 +47,61 @@ from model.structure.modal_elasticity import lowest_elastic
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following
 
-_EARLY, _HELD = 4, 6  # patterns that are explained together, at first and at last
+_MIN_EXPLAINED, _MAX_EXPLAINED = 4, 6  # patterns that are explained together
 _AFTER_ALARM = 2  # patterns before a change counts as unexplained
-_CERTAIN = 12.0  # of the cost: by how much an early explanation is better than any other
+_CERTAIN = 12.0  # lead in cost of an explanation that is accepted early
 _EVALUATIONS = 20
 _FINGER = KINDS["fingers"].std
 
 _NOT_STATED = (
-    *("modulus", "damping_each", "loss_exponent", "bolt_mass"),
-    *("place", "mode_shifts", "mode_losses"),
+    "modulus",
+    "damping_each",
+    "loss_exponent",
+    "bolt_mass",
+    "place",
+    "mode_shifts",
+    "mode_losses",
 )
+"""Kinds whose uncertainty a rig does not state."""
+
+_VERSION = 2
+_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
+_MAX_BYTES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
 class PatternReport:
-    """What one pattern has shown.
-
-    nis: squared innovation in its covariance, of `count` numbers; alarm: whether it began one, none
-    while the plate counts as changed; is_held: whether the state waits for an explanation;
-    explanation: where one was found now.
-    """
+    """Result of one settled pattern."""
 
     nis: float
+    """Squared innovation in its covariance."""
     count: int
+    """Number of real numbers in the innovation."""
     alarm: bool
+    """Whether it began an alarm; not while the plate counts as changed."""
     is_held: bool
+    """Whether the state waits for an explanation."""
     explanation: PlateChange | None
+    """The change that explains the held patterns, if it was found now."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlateEstimate:
-    """What is known of a plate in service.
-
-    before: the rig that parameters count from; uncertainty: of the rig as known; model: with a
-    spare mass; is_explained: whether an identification explains it, so that it may be updated, or
-    there are only alarms; time [s]: of the state, from which it has drifted since, None before the
-    first pattern; change: how it has changed in a way that its parameters do not follow, "" where
-    it has not.
-    """
+    """What is known of a plate in service."""
 
     before: Rig
+    """The rig that parameters count from."""
     uncertainty: Uncertainty
+    """Of the rig as known."""
     model: ForwardModel
+    """Forward model with a spare mass."""
     state: State
     is_explained: bool = True
+    """Whether an identification explains the plate, so that patterns update it, not only alarm."""
     time: float | None = None
+    """Time of the state [s], from which it has drifted since; None before the first pattern."""
     change: str = ""
+    """How it has changed in a way that its parameters do not follow, "" where it has not."""
 
     @property
     def rig(self) -> Rig:
@@ -106,9 +111,9 @@ class PlateEstimate:
 
     @classmethod
     def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
-        """What a rig says of itself by its `uncertainty`; gains of the sensors are not known.
+        """Start from a rig's `uncertainty`; gains of the sensors are not known.
 
-        What it does not state is known the better, the better its thickness is: by identification.
+        What the rig does not state counts as known as well as its thickness, as by identification.
         """
         free = solved_for(rig, rig.limits.frequency_max)
         # Counted in the deviations of a plate that was not measured, which steps are limited by.
@@ -126,10 +131,11 @@ class PlateEstimate:
 
 
 class LivePlate:
-    """An identified plate in service; known: what is known of it now."""
+    """An identified plate in service, updated by settled patterns."""
 
     def __init__(self, known: PlateEstimate) -> None:
         self.known = known
+        """What is known of the plate now."""
         self._alarm = Alarm()
         self._places = PLACES.centres(known.before.plate)
         self._noise = NoiseLevel()
@@ -168,13 +174,13 @@ class LivePlate:
         self._held, self._suspects = [each.model for each in suspect], len(suspect)
 
     def _explained(self, time: float) -> PatternReport:
-        """Explain what was held, early if it is certain."""
+        """Explain the held patterns, early if the explanation is certain."""
         count, drifted = len(self._held), self._drifted(time)
-        is_full = count >= max(_HELD, self._suspects + _AFTER_ALARM)
-        found = explain(drifted, self._held) if count >= _EARLY else None
+        is_full = count >= max(_MAX_EXPLAINED, self._suspects + _AFTER_ALARM)
+        found = explain(drifted, self._held) if count >= _MIN_EXPLAINED else None
         if is_full and found and not found.name:
             # The first of them may be from before the change.
-            later = explain(drifted, self._held[-_EARLY:])
+            later = explain(drifted, self._held[-_MIN_EXPLAINED:])
             found = later if later.name else found
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
             return PatternReport(np.nan, 0, False, True, None)
@@ -187,12 +193,12 @@ class LivePlate:
 
     @cached_property
     def _theory(self) -> FloatArray:
-        """Variances (p,) of what the theory gets wrong, which patterns at other tones show anew."""
+        """Variances (p,) of the theory's errors, which patterns at other tones show anew."""
         space = self.known.model.space
         return (space.of_kinds(lambda kind: kind.theory) / space.scale) ** 2
 
     def _drifted(self, time: float) -> State:
-        """The state at a time [s], less certain by what drifted since it was updated."""
+        """The state at a time [s], less certain by the drift since its last update."""
         state, since, space = self.known.state, self.known.time, self.known.model.space
         hours = 0.0 if since is None else max(time - since, 0.0) / 3600
         drift, widest = (
@@ -204,7 +210,7 @@ class LivePlate:
 
 
 def widest(uncertainty: Uncertainty) -> Uncertainty:
-    """Of each standard deviation the larger one of these and a plate's that was not measured."""
+    """The larger of each standard deviation and that of a plate that was not measured."""
     built = Uncertainty()
     return Uncertainty(
         **{
@@ -214,27 +220,23 @@ def widest(uncertainty: Uncertainty) -> Uncertainty:
     )
 
 
-_VERSION = 2
-_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
-_MAX_BYTES = 1 << 24
-
-
 class OtherPlate(InputError):
-    """A learned plate of another table, or of other parameters."""
+    """The file is of another table, or of other parameters."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedPlate:
-    """A state of parameters by name, counted from a rig; table, base: fingerprints of both.
-
-    change: how the plate has changed since in a way that its parameters do not follow, or nothing.
-    """
+    """The content of the file of a learned plate."""
 
     table: str
+    """Fingerprint of the table that it corrects."""
     base: str
+    """Fingerprint of the rig that parameters count from."""
     names: tuple[str, ...]
+    """Names of the parameters."""
     state: State
     change: str = ""
+    """How the plate has changed since in a way that its parameters do not follow, or ""."""
 
 
 def save_learned(learned: LearnedPlate, file: Path) -> None:
@@ -311,17 +313,19 @@ def _digest(text: str, x: np.ndarray, covariance: np.ndarray) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class LearningStep:
-    """What a pattern has led to: its report, and the table from now on, None for the same."""
+    """Result of a pattern for a table in service."""
 
     report: PatternReport
+    """Report of the pattern."""
     table: LocalizationTable | None
+    """The table from now on, None if it stays the same."""
 
 
 class LearnedTable:
-    """A table in service, corrected by what its plate shows.
+    """A table in service, corrected by the settled patterns of its plate.
 
-    table: of the rig as known when service began, never changed; file: where what is learned is
-    kept, None for nowhere.
+    table: that of the rig as known when service began, which is never changed; file: keeps what was
+    learned, None to keep nothing.
     """
 
     def __init__(
@@ -334,7 +338,7 @@ class LearnedTable:
 
     @classmethod
     def resumed(cls, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> Self:
-        """A table with what was learned of it before, if its file is there.
+        """Resume with what the file holds, if it exists.
 
         Raises InputError for another kind of file, OtherPlate for one of another table or of other
         parameters.
@@ -355,14 +359,14 @@ class LearnedTable:
 
     @property
     def change(self) -> str:
-        """How the plate has changed in a way that its parameters do not follow, or nothing."""
+        """How the plate has changed in a way that its parameters do not follow, or ""."""
         return self.live.known.change
 
     def take(self, pattern: SettledPattern) -> LearningStep:
         """Take a settled pattern, and correct the table by it.
 
-        Raises InputError or another ValueError for a pattern that leads to no plate that a table
-        can follow; the state then is that before, and what was suspect of it is forgotten.
+        Raises InputError or another ValueError for a pattern that leads to a plate that no table
+        can follow; the state before it is restored, suspect patterns are discarded.
         """
         if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
             raise InputError("readings must be finite and not all 0, got others")
@@ -387,7 +391,7 @@ class LearnedTable:
         )
 
     def save(self) -> None:
-        """Write what was learned, atomically, and whether the plate has changed since."""
+        """Write what was learned, atomically."""
         if self._file is None:
             return
         known = self.live.known

@@ -1,8 +1,7 @@
-"""Nonlinear least squares with exact derivatives and priors, for every fit of a plate.
+"""Nonlinear least squares with exact derivatives and priors, and the measurements that are fitted.
 
-And the most likely parameters of measured responses by it.
-
-Responses that were measured on a rig in place, with their errors and repetitions.
+`search` serves every fit of a plate. `solve` finds the most likely parameters of a forward model
+for a `Measurement`: responses of sensors to ERAs on the rig in place, with errors and repetitions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,46 +28,52 @@ NONLINEAR = 0.02
 DRIFTED = 0.01
 """Relative difference of the first tone, played last again, beyond which a plate has changed."""
 
-_FLOOR = 0.1  # of a sensor's rms: where its error no longer falls with the response
+_FLOOR = 0.1  # of a sensor's rms: below it an error no longer falls with the response
+
+_MEASURER = "era_haptics.lab.measuring.measure:measure_plate"
+"""Named, not imported: the model does not depend on the lab."""
+
+_CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1
 
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """One tone measured twice: frequency [Hz], responses at all sensors (s,) [1/s²].
-
-    era: name of the one that played it, or of several that did together.
-    """
+    """One tone measured twice."""
 
     era: str
+    """Name of the ERA that played it, or of several that did together."""
     frequency: float
+    """Frequency [Hz]."""
     values: ComplexArray
+    """Responses at all sensors (s,) [1/s²]."""
     repeated: ComplexArray
+    """The same, measured again (s,) [1/s²]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Responses of s sensors to n ERAs, at some of their paths and frequencies.
-
-    frequencies (f,) [Hz], ascending; values (f, s, n): acceleration per base displacement at full
-    gain [1/s²], phases as exp(+i omega t), NaN where not measured; std (f, s, n): of the real and
-    of the imaginary part. half_level: tones repeated at half the level, per base displacement as
-    well; at_end: the first tones, played last again; of both those that are loud beside noise,
-    which nothing is allowed for. clock_errors: of the amplifiers that played and heard, by name, as
-    their lines and they state, rms [s]; empty where all have one clock. drives_lag: whether bases
-    follow what was played with an unknown lag, as actuators do behind an amplifier of voltage.
-    """
+    """Responses of s sensors to n ERAs, at some of their paths and frequencies."""
 
     sensors: tuple[Sensor, ...]
     frequencies: FloatArray
+    """Ascending (f,) [Hz]."""
     values: ComplexArray
+    """Acceleration per base displacement at full gain (f, s, n) [1/s²], phases as
+    exp(+i omega t), NaN where not measured."""
     std: FloatArray
+    """Standard error of the real and of the imaginary part (f, s, n)."""
     half_level: tuple[Repeat, ...] = ()
+    """Loud tones repeated at half the level, per base displacement as well."""
     at_end: tuple[Repeat, ...] = ()
+    """The first tones, as far as they are loud, played last again."""
     drives_lag: bool = False
+    """Whether bases follow what is played with an unknown lag, as behind voltage amplifiers."""
     clock_errors: Mapping[str, float] = field(default_factory=dict)
+    """Errors of the clocks of the amplifiers that played and heard, rms [s], by name, as they and
+    their lines state; empty where all have one clock."""
 
     def __post_init__(self) -> None:
-        """Refuse values without an error, none at all, and frequencies in another order."""
+        """Raise InputError for unordered frequencies, missing values or values without an error."""
         if not (np.diff(self.frequencies) > 0).all():
             raise InputError("measurement: frequencies must ascend, each once")
         if not self.known.any():
@@ -86,7 +91,7 @@ class Measurement:
         *,
         noise: float = 0.01,
     ) -> Self:
-        """Of responses (f, s, n) [1/s²] at frequencies (f,) [Hz], NaN where not measured.
+        """Make a measurement of responses (f, s, n) [1/s²], NaN where not measured.
 
         noise: error of each part, relative to a response and to a tenth of its sensor's root mean
         square together: never relative alone, since a response may vanish.
@@ -99,7 +104,7 @@ class Measurement:
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
-        """Which responses were measured, (f, s, n)."""
+        """Mask (f, s, n) of the responses that were measured."""
         return np.isfinite(self.values)
 
     @property
@@ -115,7 +120,7 @@ class Measurement:
         return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
 
     def part(self, kept: NDArray[np.bool_]) -> Self:
-        """Some of the values (f, s, n)."""
+        """Keep the values of a mask (f, s, n)."""
         return replace(self, values=np.where(kept, self.values, np.nan))
 
     def check(self) -> None:
@@ -134,43 +139,39 @@ class Measurement:
                     )
 
 
-"""Called with what is done and all."""
-
-
 @dataclass(frozen=True, eq=False)
 class MeasuredPlate:
-    """A measurement with how it came about.
-
-    level: of what played, 0..1 of full stroke, and duration [s], None for not known; sensors: the
-    ones used, for programs; notes: lines for people; details: keys and values for programs.
-    """
+    """A measurement and the circumstances in which it was made."""
 
     measurement: Measurement
     level: float | None
+    """Level of what was played, 0..1 of full stroke, None if unknown."""
     duration: float | None
+    """Duration [s], None if unknown."""
     sensors: tuple[Mapping[str, object], ...]
+    """The sensors used, for programs."""
     notes: tuple[str, ...]
+    """Lines for people."""
     details: Mapping[str, object]
+    """Further keys and values for programs."""
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceSettings:
-    """What `era rig identify --device` was given.
-
-    sensors_file: of accelerometers; device: that plays and records; frequencies (f,) [Hz], level:
-    None for the usual ones; periods: seconds of each run that count; seed: of the phases.
-    """
+    """Settings of `era rig identify --device`."""
 
     device: str
+    """Sound card that plays and records."""
     sensors_file: Path
+    """File of the accelerometers."""
     frequencies: FloatArray | None
+    """Tones (f,) [Hz], None for the usual ones."""
     level: float | None
+    """Level of the tones, None for the usual one."""
     periods: int
+    """Seconds of each run that count."""
     seed: int
-
-
-_MEASURER = "era_haptics.lab.measuring.measure:measure_plate"
-"""By name: this package does not import the one beside it."""
+    """Seed of the phases."""
 
 
 def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
@@ -179,21 +180,19 @@ def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress)
     return found
 
 
-_CONVERGED = 1e-7  # of the cost, whose changes by one standard deviation are 1
-
-
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a search ended: x (p,), and half the sum of squares that it minimised.
-
-    residuals (2 m + k,), jacobian (2 m + k, n): real parts of all m values, imaginary parts, then
-    the k rows of the prior, by the n searched; without robust weights.
-    """
+    """End of a search."""
 
     x: FloatArray
+    """All parameters (p,)."""
     cost: float
+    """Half the sum of squares that was minimised."""
     residuals: FloatArray
+    """Real parts of all m values, imaginary parts, then the k rows of the prior (2 m + k,), without
+    robust weights."""
     jacobian: FloatArray
+    """Derivatives of the residuals by the n searched parameters (2 m + k, n)."""
 
 
 def search(
@@ -269,10 +268,10 @@ def search(
 def single_changes(
     slopes: FloatArray, curvatures: FloatArray, std: float
 ) -> list[tuple[int, float]]:
-    """Which of m changes explain most, each alone, the most telling first, with its size above 0.
+    """Sizes of the changes that explain most, each alone: number and size above 0, best first.
 
-    slopes, curvatures (m,): of half the sum of squares by each where all else has followed, the
-    slopes downwards; std: of the sizes beforehand.
+    slopes, curvatures (m,): downward slope and curvature of half the sum of squares by each change,
+    where all else follows it; std: prior standard deviation of the sizes.
     """
     curvatures = curvatures + std**-2
     sizes = slopes / curvatures
@@ -316,7 +315,7 @@ class Linearization:
         return np.asarray(self.jacobian.T @ self.residuals + self.x)
 
     def further(self, columns: FloatArray) -> list[tuple[int, float]]:
-        """`single_changes` of a standard deviation of 1, beside which all x follow.
+        """Find `single_changes` of prior standard deviation 1, which all x follow.
 
         columns (2 n, m): derivatives of the residuals by each.
         """
@@ -328,11 +327,12 @@ class Linearization:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationProblem:
-    """A model of a measurement; extra_noise (f, 1, 1): of each part beside its error."""
+    """A forward model and the measurement that it is fitted to."""
 
     model: ForwardModel
     measurement: Measurement
     extra_noise: FloatArray | None = None
+    """Noise of each part (f, 1, 1) beside the error of the measurement."""
 
     @cached_property
     def std(self) -> FloatArray:
@@ -347,7 +347,7 @@ class IdentificationProblem:
         return (plate.responses - measurement.values)[measurement.known] / self.std, J
 
     def linearised(self, x: FloatArray) -> Linearization:
-        """The same in real and imaginary parts."""
+        """Linearise at x (p,), in real and imaginary parts."""
         found, J = self.residuals(x)
         residuals = np.concatenate([found.real, found.imag])
         return Linearization(x, residuals, np.concatenate([J.real, J.imag]))

@@ -1,14 +1,14 @@
-"""The vector of parameters x, in prior standard deviations, and the values that it stands for.
+"""Parameters of a rig that a fit may change: their kinds, their space, and the values they stand
+for.
 
-What makes a plate not quite the one of its rig, in a few dozen coordinates.
+A vector x has one number for each parameter, in standard deviations of what is known beforehand.
+`Space` names them, `Values` converts x to springs, places, masses, losses and gains of the rig, and
+`rig_with` writes these to a rig.
 
-A rig file has no words for a cable glued to the plate, or sides that are not cut to size. Left out,
-such form errors bias what is fitted by far more than noise does, and no residual shows by how much.
-They change the stiffness and the mass between the modes of the free plate, and so their shapes.
-
-What a vector of parameters says of a rig: springs, places, masses, losses, gains.
-
-Shapes and truncated sums at attachments and sensors, and their changes by their places.
+A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
+that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
+residual shows by how much. They change stiffness and mass between the modes of the free plate, and
+so its mode shapes (`ReducedModes`).
 """
 
 import math
@@ -40,98 +40,82 @@ from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FA
 
 MASS_CELLS = Grid(8, 6)
 
-
-@dataclass(frozen=True, eq=False)
-class ReducedModes:
-    """A plate's modes and residual vectors at all that is attached, as if no others were truncated.
-
-    cells (c, r): shapes where foreign mass may lie; stiffening (3, r, r): derivatives of the
-    stiffness between them by length and width (relative), and by Poisson's ratio [rad²/s²].
-    """
-
-    plate: ReducedPlate
-    cells: FloatArray
-    stiffening: FloatArray
-
-    @property
-    def eigenvalues(self) -> FloatArray:
-        """omega² (r,) [rad²/s²]."""
-        return np.asarray(self.plate.omega**2)
-
-    @property
-    def losses(self) -> FloatArray:
-        """Their imaginary part beside the plate's own loss factor (r,)."""
-        return self.plate.losses
-
-    @property
-    def dispersion(self) -> Dispersion | None:
-        """How they change with frequency, None where they do not."""
-        return self.plate.dispersion
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points or footprints [m], (n, r)."""
-        return self.plate.at(points)
-
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums over truncated modes: zero, (TERMS, n, m)."""
-        return np.zeros((TERMS, len(points), len(others)))
-
-
-def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
-    """Reduce a rig's free plate to coordinates in which it may have form errors."""
-    plate = rig.plate
-    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
-    cells = MASS_CELLS.centres(plate)
-    unknowns = reduced.unknowns()
-    if isinstance(free.mesh, Mesh):
-        stiffening = element_slopes(plate, free.mesh, unknowns[0])
-    else:
-        degrees = free.mesh.nx, free.mesh.ny
-        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
-        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
-    return ReducedModes(reduced, reduced.at(cells), stiffening)
-
-
 MODE_SHIFTS = 12
-"""Of so many of the lowest elastic modes eigenvalue and loss factor may differ from the model's."""
+"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
 
 FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
-"""Groups of a finger's load that vary on their own."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What is known beforehand of all parameters of a kind.
-
-    std: standard deviation in the unit of `Values`, of a plate that was not measured; unit, key,
-    per_unit: how reports write it, for people and for programs, and how many of it are one in
-    `Values`: by default per cent of logarithms; drift: how far it walks in an hour in service,
-    drifts_to: how uncertain it becomes at most, by default as before it was measured; theory: what
-    another theory of the plate changes in values that are fitted to it. sheet, bound: standard
-    deviation where data sheets alone describe a plate, by default std, and the largest deviation;
-    own_share: of what is added to a rig's value, that std in shares of the value where it is more.
-    """
-
-    std: float
-    unit: str = "%"
-    key: str = "percent"
-    per_unit: float = 100.0
-    drift: float = 0.0
-    drifts_to: float = 0.0
-    theory: float = 0.0
-    sheet: float = 0.0
-    bound: float = math.inf
-    own_share: float = 0.0
-
-    @property
-    def widest(self) -> float:
-        """How uncertain drift makes it at most."""
-        return self.drifts_to or self.std
-
+"""Parts of a finger's load that vary independently."""
 
 _BUILT = Uncertainty()
 _PHASE = ("°", "deg", math.degrees(1))
 _LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
+
+EXCITER_KINDS = ("magnet_mass", "force_factor")
+"""Kinds whose parameters only exciters have."""
+
+FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
+"""Kinds whose parameters only a plate with form errors has."""
+
+COIL_DEVIATES = 0.2
+"""Assumed standard deviation of the mass of an exciter's coil by its sheet, relative."""
+
+MAX_GUESSED = math.sqrt(0.5)
+"""Standard error of a parameter with a prior, in its deviations, beyond which the prior determines
+it more than the data do."""
+
+VALUE_UNITS = {
+    "length": "m",
+    "width": "m",
+    "thickness": "m",
+    "modulus": "Pa",
+    "loss_factor": "",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "bolt_mass": "kg",
+    "magnet_mass": "kg",
+    "supports": "N/m",
+}
+"""Units of the values of a rig that parameters change."""
+
+_AT_EDGE = 1e-6  # m
+
+Number: TypeAlias = float | FloatArray
+"""One number for all parameters of a kind, or one for each."""
+
+_MIN_MASS = 1e-5  # kg; a lighter one is not written to a rig
+_GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Prior knowledge of all parameters of a kind, and how reports write them."""
+
+    std: float
+    """Standard deviation for a plate that was not measured, in the unit of `Values`."""
+    unit: str = "%"
+    """Unit in reports for people; logarithms of factors are written as per cent."""
+    key: str = "percent"
+    """Unit in reports for programs."""
+    per_unit: float = 100.0
+    """Number of report units in one unit of `Values`."""
+    drift: float = 0.0
+    """Standard deviation by which it walks in an hour of service."""
+    drifts_to: float = 0.0
+    """Largest standard deviation by drift, 0 for `std`."""
+    theory: float = 0.0
+    """Change of the fitted value by another theory of the plate."""
+    sheet: float = 0.0
+    """Standard deviation where data sheets alone describe a plate, 0 for `std`."""
+    bound: float = math.inf
+    """Largest deviation."""
+    own_share: float = 0.0
+    """Least `sheet` of what is added to a rig's value, as a share of that value."""
+
+    @property
+    def widest(self) -> float:
+        """Largest standard deviation that drift leads to."""
+        return self.drifts_to or self.std
+
 
 KINDS = {
     "thickness": Kind(_BUILT.thickness, drift=0.01),
@@ -178,57 +162,26 @@ KINDS = {
     # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.forward`).
     "loss_law": Kind(1.0, "", "", 1.0),
 }
-"""Kinds of parameters; of some a rig's `uncertainty` states the standard deviation instead.
+"""Kinds of parameters; for some a rig's `uncertainty` states the standard deviation instead.
 
-theory: on plates of 1.5 mm without shear deformation, with viscous losses
-(docs/measured/identification.md). No measurement tells of it, and answers do not depend on it.
+`theory` is that of plates of 1.5 mm without shear deformation, with viscous losses
+(docs/measured/identification.md). No measurement shows it, and answers do not depend on it.
 """
-
-EXCITER_KINDS = ("magnet_mass", "force_factor")
-"""Kinds of which exciters alone have parameters; a rig without any has none."""
-
-FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
-"""Kinds of which a plate with form errors alone has parameters."""
-
-COIL_DEVIATES = 0.2
-"""Standard deviation of the mass of an exciter's coil by its sheet, relative: assumed."""
-
-MAX_GUESSED = math.sqrt(0.5)
-"""Standard error of what a prior holds, in its deviations, beyond which data tell less than it."""
-
-VALUE_UNITS = {
-    "length": "m",
-    "width": "m",
-    "thickness": "m",
-    "modulus": "Pa",
-    "loss_factor": "",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "bolt_mass": "kg",
-    "magnet_mass": "kg",
-    "supports": "N/m",
-}
-"""Units of the values of a rig that parameters change."""
-
-_AT_EDGE = 1e-6  # m
-
-Number: TypeAlias = float | FloatArray
-"""Of all parameters of a kind, or of each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Names of all p parameters, and standard deviations, bounds of x and groups of them.
-
-    std (p,), in the units of `Values`, 0 where a parameter is known; lower, upper (p,): of x;
-    groups: by kind, where its parameters are.
-    """
+    """Names of all p parameters with their standard deviations, bounds and kinds."""
 
     names: tuple[str, ...]
     std: FloatArray
+    """Standard deviations (p,) in the units of `Values`, 0 where a parameter is known."""
     lower: FloatArray
+    """Lower bounds of x (p,)."""
     upper: FloatArray
+    """Upper bounds of x (p,)."""
     groups: dict[str, slice]
+    """Slice of the parameters of each kind."""
 
     @property
     def size(self) -> int:
@@ -242,11 +195,11 @@ class Space:
 
     @cached_property
     def uncertain(self) -> NDArray[np.bool_]:
-        """Which are not known beforehand, (p,)."""
+        """Mask (p,) of the parameters that are not known beforehand."""
         return np.asarray(self.std > 0)
 
     def of(self, *kinds: str) -> NDArray[np.bool_]:
-        """Which are of these kinds and uncertain, (p,)."""
+        """Mask (p,) of the uncertain parameters of some kinds."""
         chosen = np.zeros(self.size, dtype=bool)
         for kind in kinds:
             chosen[self.groups[kind]] = True
@@ -260,7 +213,7 @@ class Space:
         lower: ArrayLike = -np.inf,
         upper: ArrayLike = np.inf,
     ) -> "Space":
-        """The same with further parameters of a kind at its end; std: by default the kind's."""
+        """Append parameters of a kind; std: by default the kind's."""
         own = KINDS[kind].std if std is None else std
         further = [np.broadcast_to(each, len(names)) for each in (own, lower, upper)]
         return Space(
@@ -272,7 +225,7 @@ class Space:
         )
 
     def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
-        """What is known of the kind of each parameter, in its unit (p,), 0 where it is known."""
+        """A property of the kind of each parameter, in its unit (p,), 0 for known ones."""
         found = np.zeros(self.size)
         for kind, part in self.groups.items():
             found[part] = known(KINDS[kind])
@@ -280,7 +233,7 @@ class Space:
 
     @cached_property
     def as_built(self) -> "Space":
-        """The same of a plate that was not measured, where the rig states less."""
+        """The space of a plate that was not measured: `KINDS` where the rig states less."""
         return replace(self, std=np.maximum(self.std, self.of_kinds(lambda kind: kind.std)))
 
     def indices(self, kind: str) -> range:
@@ -288,12 +241,12 @@ class Space:
         return range(*self.groups[kind].indices(self.size))
 
     def values(self, x: FloatArray, kind: str) -> FloatArray:
-        """What x (p,) makes of the parameters of a kind, from their values in the rig."""
+        """Deviations of the parameters of a kind from the rig, in their units, for x (p,)."""
         part = self.groups[kind]
         return np.asarray(self.std[part] * x[part])
 
     def index(self, name: str) -> int:
-        """Where the parameter of a name is; raises ValueError for an unknown one."""
+        """Number of the parameter of a name; raises ValueError for an unknown one."""
         return self.names.index(name)
 
 
@@ -486,55 +439,63 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
     return np.where(space.uncertain, moved, x)
 
 
-_LEAST_MASS = 1e-5  # kg; less is none
-_GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
-
-
 @dataclass(frozen=True, eq=False)
 class Values:
-    """A rig's plate with n ERAs, m additional masses and k fingers, in units of the model.
+    """Values of a rig's plate with n ERAs, m additional masses, k fingers and s sensors.
 
-    thickness, modulus: factors; loss_factor at LOSS_FREQUENCY, loss_exponent; stiffness [N/m],
-    damping [N s/m], bolt_mass [kg] (n,) and places (n, 2) [m] of the ERAs, bolts of exciters their
-    coils; magnet_mass, force_factor (n,): of exciters, factors; supports (q,): of the stiffness of
-    each foot, factors; masses (m, 3): kg and x,
-    y [m]; mode_shifts, mode_losses: logarithms of the factors of the lowest modes' eigenvalues and
-    loss factors beside the rig's; drive_gains (n,), sensor_gains (s,): complex, those of the drives
-    beside the rig's; fingers (k, 4): logarithms of FINGER_PARTS; inertia [1/kHz²], drag [1/kHz]
-    (n,): of the drives, by which they lag; delays [s]: of the clocks of amplifiers, in the order of
-    their names, to the first; none where they agree. Of a plate with form errors, else empty:
-    sensor_scales (s,), real, sensor_places (s, 2) [m]: how far sensors are from theirs;
-    foreign_mass (c,): in cells, as shares of the plate's and none in all; stretch (3,): of length
-    and width, relative,
-    and what is added to Poisson's ratio. loss_law: 0 for losses that are hysteretic, 1 for viscous
-    ones.
+    Arrays of form errors are empty for a plate without them.
     """
 
     thickness: float
+    """Factor on the rig's."""
     modulus: float
+    """Factor on the rig's."""
     loss_factor: float
+    """At LOSS_FREQUENCY."""
     loss_exponent: float
+    """Power of frequency that the loss factor follows."""
     stiffness: FloatArray
+    """Of the ERAs (n,) [N/m]."""
     damping: FloatArray
+    """Of the ERAs (n,) [N s/m]."""
     bolt_mass: FloatArray
+    """Of the ERAs, of exciters the coil (n,) [kg]."""
     magnet_mass: FloatArray
+    """Factors of exciters (n,)."""
     force_factor: FloatArray
+    """Factors of exciters (n,)."""
     supports: FloatArray
+    """Factors on the stiffness of each foot (q,)."""
     places: FloatArray
+    """Of the ERAs (n, 2) [m]."""
     masses: FloatArray
+    """Additional masses [kg] with x and y [m] (m, 3)."""
     mode_shifts: FloatArray
+    """Logarithms of factors on the eigenvalues of the lowest modes."""
     mode_losses: FloatArray
+    """Logarithms of factors on the loss factors of the lowest modes."""
     drive_gains: ComplexArray
+    """Complex gains (n,) beside those of the rig."""
     sensor_gains: ComplexArray
+    """Complex gains (s,)."""
     fingers: FloatArray
+    """Logarithms of factors on FINGER_PARTS (k, 4)."""
     inertia: FloatArray
+    """By which drives lag (n,) [1/kHz²]."""
     drag: FloatArray
+    """By which drives lag (n,) [1/kHz]."""
     delays: FloatArray
+    """Of the amplifiers' clocks behind the first one's [s], by name; empty where they agree."""
     sensor_scales: FloatArray
+    """Real gains of sensors, a form error (s,)."""
     sensor_places: FloatArray
+    """Distances of sensors from their places (s, 2) [m]."""
     foreign_mass: FloatArray
+    """Of each cell, as a share of the plate's; the sum is zero (c,)."""
     stretch: FloatArray
+    """Deviations of length and width, relative, and of Poisson's ratio (3,)."""
     loss_law: float
+    """0 for hysteretic losses, 1 for viscous ones."""
 
     @classmethod
     def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
@@ -610,22 +571,6 @@ class Values:
         return np.asarray(1 / (1 - self.inertia * f**2 + 1j * self.drag * f))
 
 
-def plate_with(plate: Plate, values: Values) -> Plate:
-    """The plate with identified thickness, modulus, losses and modes."""
-    count = max(len(plate.mode_deviations), len(values.mode_shifts))
-    deviations = np.zeros((count, 2))
-    deviations[: len(plate.mode_deviations)] = np.reshape(plate.mode_deviations, (-1, 2))
-    deviations[: len(values.mode_shifts)] += np.column_stack(
-        [values.mode_shifts, values.mode_losses]
-    )
-    return replace(
-        plate.scaled(modulus=values.modulus, thickness=values.thickness),
-        loss_factor=values.loss_factor,
-        loss_exponent=values.loss_exponent,
-        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
-    )
-
-
 def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     """The rig with identified values; additional masses come after its own."""
     places = np.clip(values.places, 0, [rig.plate.length, rig.plate.width])
@@ -652,19 +597,36 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     )
 
 
+def plate_with(plate: Plate, values: Values) -> Plate:
+    """The plate with identified thickness, modulus, losses and modes."""
+    count = max(len(plate.mode_deviations), len(values.mode_shifts))
+    deviations = np.zeros((count, 2))
+    deviations[: len(plate.mode_deviations)] = np.reshape(plate.mode_deviations, (-1, 2))
+    deviations[: len(values.mode_shifts)] += np.column_stack(
+        [values.mode_shifts, values.mode_losses]
+    )
+    return replace(
+        plate.scaled(modulus=values.modulus, thickness=values.thickness),
+        loss_factor=values.loss_factor,
+        loss_exponent=values.loss_exponent,
+        mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
+    )
+
+
 def additional_masses(values: Values) -> Sequence[PointLoad]:
-    """The masses that were found on the plate, without those that weigh nothing."""
+    """The additional masses on the plate, without those that weigh nothing."""
     return [
         PointLoad(float(x), float(y), mass=float(mass))
         for mass, x, y in values.masses
-        if mass > _LEAST_MASS
+        if mass > _MIN_MASS
     ]
 
 
 def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
-    """Measured gains times what was identified; of an ERA without any at one frequency.
+    """Gains of an ERA: those of the rig times what was identified.
 
-    Over the rig's frequencies where the drive lags, and where the clock of its amplifier does.
+    An ERA without measured gains gets one at a single frequency, or some over the rig's frequencies
+    where its drive or the clock of its amplifier lags.
     """
     era = rig.eras[number]
     lags, delay = values.inertia[number] or values.drag[number], _delay(era.name, rig, values)
@@ -685,11 +647,64 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
 
 
 def _delay(era: str, rig: Rig, values: Values) -> float:
-    """By which an ERA is late with its amplifier's clock [s]."""
+    """Delay of an ERA by its amplifier's clock [s]."""
     if not len(values.delays):
         return 0.0
     names = sorted({channel.amplifier for channel in rig.wiring.values()})
     return float(values.delays[names.index(rig.wiring[era].amplifier)])
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModes:
+    """A plate's modes and residual vectors at all that is attached, for one with form errors.
+
+    No further modes count as truncated.
+    """
+
+    plate: ReducedPlate
+    cells: FloatArray
+    """Shapes where foreign mass may lie (c, r)."""
+    stiffening: FloatArray
+    """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
+    (relative) and Poisson's ratio."""
+
+    @property
+    def eigenvalues(self) -> FloatArray:
+        """omega² (r,) [rad²/s²]."""
+        return np.asarray(self.plate.omega**2)
+
+    @property
+    def losses(self) -> FloatArray:
+        """Their imaginary part beside the plate's own loss factor (r,)."""
+        return self.plate.losses
+
+    @property
+    def dispersion(self) -> Dispersion | None:
+        """How they change with frequency, None where they do not."""
+        return self.plate.dispersion
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points or footprints [m], (n, r)."""
+        return self.plate.at(points)
+
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums over truncated modes: zero, (TERMS, n, m)."""
+        return np.zeros((TERMS, len(points), len(others)))
+
+
+def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
+    """Reduce a rig's free plate to coordinates in which it may have form errors."""
+    plate = rig.plate
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
+    cells = MASS_CELLS.centres(plate)
+    unknowns = reduced.unknowns()
+    if isinstance(free.mesh, Mesh):
+        stiffening = element_slopes(plate, free.mesh, unknowns[0])
+    else:
+        degrees = free.mesh.nx, free.mesh.ny
+        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
+        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
+    return ReducedModes(reduced, reduced.at(cells), stiffening)
 
 
 Modes: TypeAlias = FreeModes | ReducedModes
@@ -697,18 +712,18 @@ Modes: TypeAlias = FreeModes | ReducedModes
 
 @dataclass(frozen=True, eq=False)
 class AttachmentPoints:
-    """Points of attachment and observation, a of them, of which v may move along x and y.
-
-    footprints (a, 3) [m]; shapes (a, r); truncated (TERMS, a, a): sums over truncated modes;
-    shape_slopes (2 v, r), truncated_slopes (TERMS, 2 v, a): their derivatives by the place of the
-    first, x and y of one point after the other [1/m].
-    """
+    """Shapes at a points of attachment and observation, v of which may move along x and y."""
 
     footprints: FloatArray
+    """Place and radius of each (a, 3) [m]."""
     shapes: FloatArray
+    """Mode shapes (a, r)."""
     truncated: FloatArray
+    """Sums over truncated modes (TERMS, a, a)."""
     shape_slopes: FloatArray
+    """Derivatives of the shapes by x and y of each movable point in turn (2 v, r) [1/m]."""
     truncated_slopes: FloatArray
+    """Derivatives of the sums by the place of the first point (TERMS, 2 v, a) [1/m]."""
 
     def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
         """The same for other footprints (a, 3), by the slopes of the shapes alone."""

@@ -1,19 +1,17 @@
-"""Settled patterns as measurements of the plate that plays them, and its update by these.
+"""Settled patterns as measurements of the plate that plays them: updates, alarms and explanations.
 
-The fingers of each pattern are estimated with the plate, and its noise from what updates leave.
+An update estimates the loads of a pattern's fingers together with the plate; the noise of readings
+follows from what updates leave.
 
-When a plate is no longer the one that is known, and what may have happened to it at once.
+An alarm means that some of the last innovations are unlikely together, or along one change: a
+spring, a gain, the thickness, or a mass in one of many places. The latter is a generalised
+likelihood ratio test, which finds what fingers and noise hide in the sum (M. Basseville, I. V.
+Nikiforov, Detection of Abrupt Changes, 1993, section 2.4.3). One pattern alone raises no alarm,
+since a finger may be unlike any other, but it does not update the state either.
 
-An alarm: some of the last innovations are unlikely together, or along one change: a spring, a gain,
-the thickness, or a mass in one of many places. The latter is the test of a generalised likelihood
-ratio, which finds what fingers and noise hide in the sum (M. Basseville, I. V. Nikiforov, Detection
-of Abrupt Changes, 1993, section 2.4.3). One pattern alone raises none, since a finger may be unlike
-any other, but no state is updated by it either.
-
-Its explanation: one spring, one gain, the thickness or a mass: each is a wide prior of the
-parameters that would have changed. The most likely one is that whose batch estimate over the last
-patterns costs least, a further cost for each parameter that changed; where even that leaves
-residuals that chance does not, the plate has changed in a way not known.
+An explanation is one such change, as a wide prior of the parameters that would have changed. The
+most likely one costs least in a batch estimate over the last patterns, plus a cost for each changed
+parameter. Where it still leaves residuals beyond chance, the change is of an unknown kind.
 """
 
 from collections import deque
@@ -32,27 +30,54 @@ from model.identification.forward import ForwardModel, PlateAt, RestingFinger
 from model.identification.least_squares import search, single_changes
 from model.identification.parameters import FINGER_PARTS, Space
 
-_OWN = 0.5  # of a finger's deviation as a whole
+_PART_SHARE = 0.5  # deviation of each part of a finger, in that of the whole
 _NOISE, _FLOOR = 0.01, 0.1
-"""Of a reading at most, relative to its size; of those near zero, to the mean of all sensors."""
+"""Largest noise of a reading relative to its size, and its floor relative to the sensors' rms."""
+
+_MIN_VARIANCE = 1e-14  # of the largest
+_INSIDE = 0.1  # standard deviations from a bound, of a start
+_NOISE_PATTERNS = 60  # of which the noise is estimated
+_FIRST_NOISE = 8.0  # numbers for which the first noise counts
+_MIN_NOISE = 0.3  # relative to the largest
+
+WINDOW: Final = 8
+_UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
+_ALONG_REST = 8.0  # without the pattern that deviates most
+_ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
+_REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
+PLACES: Final = Grid(9, 7)
+"""Cells in whose middles masses are looked for."""
+
+_KINDS = ("stiffness", "gain", "phase", "thickness")
+
+_SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
+_MASS = 5e-3
+_COST_OF_CHANGE = 4.0
+_UNLIKELY = 1e-4
+_STARTS = 3
+_FIRST_EVALUATIONS, _EVALUATIONS = 10, 40
+BY_MASS = "a mass"
+_WITHIN_REACH = 300.0  # of the least cost
+_FOLLOWED = 3  # of the least cost after the first evaluations
 
 
 @dataclass(frozen=True, eq=False)
 class SettledPattern:
-    """A tone that has settled: time [s], frequency [Hz], and what it was played and measured with.
-
-    bases (n,): amplitude of each ERA's base as commanded [m]; values (s,): acceleration at each
-    sensor [m/s²], phases as exp(+i omega t); fingers: on the plate, as far as they are known.
-    has_phase: whether phases of values count from those of bases; otherwise one phase is unknown,
-    the same for all sensors, and no update depends on it.
-    """
+    """A tone that has settled, as it was played and measured."""
 
     time: float
+    """Time of the measurement [s]."""
     frequency: float
+    """Frequency of the tone [Hz]."""
     bases: ComplexArray
+    """Amplitude of each ERA's base as commanded (n,) [m]."""
     values: ComplexArray
+    """Acceleration at each sensor (s,) [m/s²], phases as exp(+i omega t)."""
     fingers: tuple[RestingFinger, ...] = ()
+    """Fingers on the plate, as far as they are known."""
     has_phase: bool = True
+    """Whether phases of values count from those of bases; otherwise one phase, common to all
+    sensors, is unknown, and no update depends on it."""
 
     @property
     def std(self) -> FloatArray:
@@ -79,22 +104,21 @@ def finger_covariance(patterns: Sequence[SettledPattern]) -> FloatArray:
     beside that: parts that varied on their own only would make a heavy finger as unlikely as four.
     """
     parts = len(FINGER_PARTS)
-    own = _OWN**2 * np.eye(parts) + np.ones((parts, parts))
+    own = _PART_SHARE**2 * np.eye(parts) + np.ones((parts, parts))
     return np.asarray(np.kron(np.eye(finger_count(patterns) // parts), own), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class PatternModel:
-    """The plate of a forward model under the fingers of one pattern.
-
-    space: of the model, which has no fingers of its own; forward: the model with the fingers;
-    noise: of the pattern's readings, relative to its largest.
-    """
+    """The plate of a forward model under the fingers of one pattern."""
 
     pattern: SettledPattern
     space: Space
+    """Space of the model without the fingers."""
     forward: ForwardModel
+    """The model with the fingers."""
     noise: float = 1.0
+    """Noise of the pattern's readings, relative to the largest."""
 
     @classmethod
     def of(
@@ -159,42 +183,39 @@ class PatternModel:
         )
 
 
-_LEAST = 1e-14  # of the largest variance
-_INSIDE = 0.1  # standard deviations
-_PATTERNS = 60
-_FIRST_NOISE = 8.0
-_LEAST_NOISE = 0.3
-
-
 @dataclass(frozen=True, eq=False)
 class State:
-    """Parameters x (p,) of a plate with their covariance (p, p)."""
+    """Parameters of a plate as known at a time."""
 
     x: FloatArray
+    """Parameters (p,)."""
     covariance: FloatArray
+    """Covariance (p, p) of x."""
 
 
 @dataclass(frozen=True, eq=False)
 class StateUpdate:
-    """A state after some patterns.
-
-    nis: normalised innovation squared before the update, of `count` real numbers; cost: squared
-    residuals and changes after it, in standard deviations; misfit: squared residuals alone, of
-    `freedom` numbers that plate and fingers do not take up; fingers (q,): parameters of all of
-    them; innovation (count,): at the slopes (count, p) by the plate where the update ended;
-    precision (count, count): the inverse of its covariance, what the theory gets wrong included.
-    """
+    """A state after some patterns."""
 
     state: State
     nis: float
+    """Normalised innovation squared before the update."""
     count: int
+    """Number of real numbers in the innovation."""
     cost: float
+    """Squared residuals and changes after the update, in standard deviations."""
     misfit: float
+    """Squared residuals alone."""
     freedom: float
+    """Number of residuals that plate and fingers do not take up."""
     fingers: FloatArray
+    """Parameters of all fingers (q,)."""
     innovation: FloatArray
+    """Innovation (count,) with the slopes where the update ended."""
     slopes: FloatArray
+    """Derivatives of the numbers by the plate there (count, p)."""
     precision: FloatArray
+    """Inverse covariance of the innovation, the theory's errors included (count, count)."""
 
 
 def update(
@@ -205,11 +226,11 @@ def update(
     start: FloatArray | None = None,
     theory: FloatArray | None = None,
 ) -> StateUpdate:
-    """Most likely state after patterns within its bounds, from the state or from a start.
+    """Find the most likely state after patterns, within its bounds.
 
-    evaluations: of the model, at most; start: of the plate (p,), or of plate and fingers (p + q,);
-    theory (p,): variances of what the theory gets wrong, which count in how unlikely an innovation
-    is, and only there.
+    evaluations: largest number of those of the model; start: of the plate (p,), or of plate and
+    fingers (p + q,), by default the state before; theory (p,): variances of the theory's errors,
+    which count only in the likelihood of the innovation.
     """
     space = patterns[0].space
     settled = [each.pattern for each in patterns]
@@ -220,7 +241,7 @@ def update(
     std = np.concatenate([each.std for each in patterns])
     loose = np.diagonal(prior) > 0
     variance, axes = np.linalg.eigh(prior[np.ix_(loose, loose)])
-    rows = (axes / np.sqrt(np.maximum(variance, _LEAST * variance.max()))).T
+    rows = (axes / np.sqrt(np.maximum(variance, _MIN_VARIANCE * variance.max()))).T
     at = centre.copy()
     if start is not None:
         at[: len(start)] = start
@@ -297,43 +318,32 @@ class NoiseLevel:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[float, float]] = deque(maxlen=_PATTERNS)
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_NOISE_PATTERNS)
         self.relative = 1.0
 
     def take(self, updated: StateUpdate) -> None:
         """Take what an update by a pattern of this noise has left of it."""
         self._recent.append((self.relative**2 * updated.misfit, updated.freedom))
         misfit, freedom = np.array(self._recent).sum(axis=0) + _FIRST_NOISE
-        self.relative = float(np.clip(np.sqrt(misfit / freedom), _LEAST_NOISE, 1.0))
-
-
-WINDOW: Final = 8
-_UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
-_ALONG_REST = 8.0  # without the pattern that deviates most
-_ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
-_REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
-PLACES: Final = Grid(9, 7)
-"""Cells in whose middles masses are looked for."""
-
-_KINDS = ("stiffness", "gain", "phase", "thickness")
+        self.relative = float(np.clip(np.sqrt(misfit / freedom), _MIN_NOISE, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A pattern with the state before it, when that was updated [s], and its innovation.
-
-    slopes, curvatures (d,): by a change along each direction, of half its squared innovation;
-    the last `masses` directions can only be upwards.
-    """
+    """A pattern with the state before it and its innovation, along d directions of change."""
 
     model: PatternModel
     before: State
     time: float | None
+    """When that state was updated [s]."""
     nis: float
     count: int
     slopes: FloatArray
+    """Slope of half the squared innovation by each direction (d,)."""
     curvatures: FloatArray
+    """Curvature of the same (d,)."""
     masses: int
+    """Number of the last directions, masses, which can only grow."""
 
     @classmethod
     def of(
@@ -344,7 +354,7 @@ class Observation:
         found: StateUpdate,
         at: FloatArray,
     ) -> "Observation":
-        """That of a pattern after its update; at (m, 2) [m]: places of masses."""
+        """Make it of a pattern and its update; at (m, 2) [m]: places of masses."""
         space = model.space
         own = np.flatnonzero(space.of(*_KINDS))
         plate = model.forward.at(np.concatenate([found.state.x, found.fingers]))
@@ -356,9 +366,9 @@ class Observation:
 
 
 class Alarm:
-    """The last patterns of a plate, and whether they are those of the plate as known.
+    """The last patterns of a plate, tested for being those of the plate as known.
 
-    By chi² with `scipy.special`: `scipy.stats` takes a second to load.
+    chi² is computed with `scipy.special`: `scipy.stats` takes a second to load.
     """
 
     def __init__(self) -> None:
@@ -366,15 +376,15 @@ class Alarm:
 
     @property
     def is_full(self) -> bool:
-        """Whether as many patterns as it looks at have come without an alarm."""
+        """Whether a whole window of patterns has come without an alarm."""
         return len(self._recent) == WINDOW
 
     def clear(self) -> None:
-        """Forget the patterns."""
+        """Discard the patterns."""
         self._recent.clear()
 
     def take(self, observation: Observation) -> list[Observation] | None:
-        """Take a pattern; those since the plate has changed, by the last, None if it has not."""
+        """Take a pattern; return the last patterns since the plate changed, None if it did not."""
         self._recent.append(observation)
         last = list(self._recent)[::-1]
         along, confirmed = self._along(last)
@@ -402,9 +412,9 @@ class Alarm:
 
     @staticmethod
     def _along(last: list[Observation]) -> tuple[FloatArray, FloatArray]:
-        """Most squared deviations along a direction, by the number of the last patterns.
+        """Largest squared deviation along a direction, by the number of last patterns.
 
-        Of any direction, and of those along which the rest deviates without any one of them.
+        The second is that of directions along which the others deviate without any one pattern.
         """
         slopes = np.array([each.slopes for each in last])
         curvatures = np.array([each.curvatures for each in last])
@@ -427,30 +437,20 @@ def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatAr
     return np.divide(up**2, curvatures, out=np.zeros_like(up), where=curvatures > 1e-12)
 
 
-_SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
-_MASS = 5e-3
-_COST_OF_CHANGE = 4.0
-_UNLIKELY = 1e-4
-_STARTS = 3
-_FIRST_EVALUATIONS, _EVALUATIONS = 10, 40
-BY_MASS = "a mass"
-_WITHIN_REACH = 300.0  # of the least cost
-_FOLLOWED = 3  # of the least cost after the first evaluations
-
-
 @dataclass(frozen=True, eq=False)
 class PlateChange:
-    """What explains some patterns: its name, "" for nothing known, and the state it leads to.
-
-    change: of the parameter, a mass in kg, others as the logarithm of a factor; lead: by how much
-    the next best costs more; resembles: what explains most of it, though not enough.
-    """
+    """Explanation of some patterns by one change of the plate."""
 
     name: str
+    """Name of the change, "" if none explains them."""
     change: float
+    """Size of the change: of a mass in kg, of others the logarithm of a factor."""
     lead: float
+    """Further cost of the next best explanation."""
     state: State
+    """State of the plate after the change."""
     resembles: str = ""
+    """Name of the change that explains most, though not enough."""
 
     def __str__(self) -> str:
         if self.name == BY_MASS:
@@ -489,15 +489,15 @@ def explain(before: State, patterns: Sequence[PatternModel]) -> PlateChange:
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """What may have changed: name, numbers of the parameters, and their prior.
-
-    starts: of the first estimates; None: the state before.
-    """
+    """A change that may have happened."""
 
     name: str
     changed: tuple[int, ...]
+    """Numbers of the changed parameters."""
     prior: State
+    """State before the patterns if it has."""
     starts: Sequence[FloatArray | None] = (None,)
+    """Starts of the first estimates, None for the state before."""
 
 
 def _likelihood(tried: tuple[_Hypothesis, StateUpdate]) -> float:

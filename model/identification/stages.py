@@ -1,37 +1,30 @@
-"""The stages of an identification, since all parameters at once end in wrong minima.
+"""Stages of an identification, and what is known of the parameters after it.
 
-Springs, damping, thickness and gains first, with a noise that hides the rest, from several
-thicknesses; then one additional mass, sought where it would explain most; then everything with the
-noise as measured. A second mass only where the first leaves something that it explains.
-
-Covariance of identified parameters, and what it leaves unknown of what answers depend on.
-
-The scale of mass, springs and dampers together changes no response to a moving base, that of all
-drives no contrast. What counts is each natural frequency, each spring and damper relative to the
-plate's mass, each gain relative to the others, and for levels all gains together: a response tells
-only their product with those of the sensors.
-
-How well a fit predicts paths that it was not shown: every fifth one, five times over.
-
-A path is from an ERA to a sensor, and what it shows is shown by the reverse one as well. Paths tell
-how far the fields are off that are not measured; tones left out would tell whether a resonance was
-seen, which the covariance knows. What counts against a model is the part of the error that neither
-noise nor the uncertainty of the parameters explains. In that part fits to different paths disagree
-in parameters, too, by more than their covariance says (a jackknife over groups: B. Efron, The
-Jackknife, the Bootstrap and Other Resampling Plans, SIAM 1982, ch. 3).
-
-What a measurement has not shown, and the tone and the sensor that would show it.
-
-What a measurement tells of a board's grain: its modulus across, and that of shear.
-
-A board of a kind has moduli that differ by 10 % and more from another, each by itself, and its
-lowest modes shift accordingly. Shifts m (k,) that a fit finds, in standard deviations s of what
-modes may shift beside, with their covariance C, are explained by logarithms d of the factors on
-moduli, of a prior variance D: to first order
+Fitting all parameters at once ends in wrong minima. So springs, damping, thickness and gains come
+first, from several thicknesses and with a noise that hides the rest; then one additional mass, from
+where it would explain most; then everything with the noise as measured. A second mass is added only
+where the first leaves something that it explains. A board with a grain is then fitted again with
+the moduli across and of shear that the shifts of its modes suggest: boards of one kind differ in
+each by 10 % and more. To first order shifts m (k,), in standard deviations s, with covariance C,
+follow from logarithms d of factors on the moduli, of prior variance D:
 
     d = (J^T (1 - C) J + D^-1)^-1 J^T m,   J = (v^T dK v / lambda) / s,
 
-where the first column, all ones, stands for a modulus that is fitted anew.
+where the first column of J, all ones, stands for a modulus that is fitted anew.
+
+A response to a moving base does not change if mass, springs and dampers are scaled together, nor
+does a contrast if all drives are. Answers depend on each natural frequency, on each spring and
+damper relative to the plate's mass, on each gain relative to the others, and levels on the mean of
+the gains: responses give only its product with that of the sensors (`relevant`).
+
+The fit is checked on paths from an ERA to a sensor that it was not shown, every fifth one, five
+times over; the reverse of a hidden path is hidden as well. Hidden paths show how far fields are off
+that are not measured; hidden tones would show whether a resonance was seen, which the covariance
+knows. Only the part of the error that neither noise nor uncertain parameters explain counts against
+the model. By that part parameters disagree between fits to different paths, beyond their covariance
+(a jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM
+1982, ch. 3). Where the measurement leaves a quantity unknown, `unknowns` names the tone and the
+sensor that would show it.
 """
 
 import math
@@ -60,17 +53,17 @@ from model.spectral.direct_solution import grain_slopes
 from model.structure.modal_elasticity import lowest_elastic
 from model.structure.plate import Plate
 
-_EXTRA_NOISE = 0.05  # of the rms at each frequency
-_THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations
-_MARGIN = 1.02  # of frequency, since layers do not stiffen all modes alike
-_GOOD = 0.5  # chi² under the raised noise that needs no further start
-_INWARDS = 0.6  # standard deviations
-_SCANNED = Grid(8, 6)
-_KEPT = 4
+_EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
+_THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations from which the first stage starts
+_FREQUENCY_MARGIN = 1.02  # since layers do not stiffen all modes alike
+_GOOD = 0.5  # chi² with the extra noise that needs no further start
+_INWARDS = 0.6  # standard deviations by which places start from an edge
+_MASS_GRID = Grid(8, 6)  # where an additional mass is sought
+_MASS_STARTS = 4
 _MORE_MASS_BEYOND = 1.5  # chi²
 _MASS_GAINS = 25.0  # of the cost: five standard deviations
 
-SIMPLE = (
+_SIMPLE = (
     "thickness",
     "stiffness",
     "damping",
@@ -84,7 +77,41 @@ SIMPLE = (
     "sensor_gain",
     "sensor_phase",
 )
-LOCATED = (*SIMPLE, "place", "masses")
+_LOCATED = (*_SIMPLE, "place", "masses")
+
+_THEORY = {
+    "frequency": KINDS["mode_shifts"].theory / 2,
+    "stiffness": KINDS["stiffness"].theory,
+    "damping": KINDS["damping_each"].theory,
+    "place": KINDS["place"].theory,
+}
+
+HELD_OUT_FOLDS = 5
+"""One path or sensor in so many is held out."""
+
+_FOLD_EVALUATIONS = 8
+_MAX_PREDICTION_ERROR = 0.1  # of the rms at a tone; less certain predictions are no test
+_MIN_PREDICTED = 16  # values
+_IN_COMMON = 2.0  # factor on standard deviations: what no path shows is wrong in all fits alike
+
+_UNKNOWN = 0.5
+"""Share of its standard deviation beforehand, beyond which a quantity was not identified.
+
+The standard deviation is that of a plate that was not measured where the rig states less: answers
+need no more.
+"""
+
+_SUSPENSION_FELT = 120.0  # Hz; above it a suspension that is 20 % off changes fields by under 5 %
+
+_ADVISED_STEP = 20.0  # Hz between the tones that may be advised
+_ADVISED_NOISE = 0.01  # of the rms of the responses at a tone
+_ADVISED_PLACES = (0.13, 0.5, 0.87)  # of the sides, where further sensors may be advised
+
+_GRAIN_PRIOR = 0.15  # standard deviation of the logarithms of a board's moduli by its kind
+_MIN_GRAIN_CHANGE = 3e-3  # of a logarithm, that is worth another fit
+_GRAIN_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
+_GRAIN_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
+_GRAIN_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +161,71 @@ class FittedModel:
         return self.problem.model.space
 
 
+def fit_board(setting: Setting) -> tuple[Setting, FittedModel]:
+    """Fit in stages, and for a board with a grain again with the grain that the fit shows.
+
+    Returns the setting with the grain that was found, and the fit in it.
+    """
+    if setting.rig.plate.material.orthotropy is None:
+        return setting, fit_in_stages(setting)
+    found = []
+    for start in _GRAIN_STARTS:
+        found += _fits_from(_with_grain(setting, start, 1.0))
+        if any(_is_good(fitted) for _, fitted in found):
+            break
+    return best_by(found, lambda each: -each[1].best.cost)
+
+
+def _fits_from(setting: Setting) -> list[tuple[Setting, FittedModel]]:
+    """Fits one after the other, each in the grain that the one before shows."""
+    found = [(setting, fit_in_stages(setting))]
+    for _ in range(_GRAIN_ROUNDS):
+        setting, fitted = found[-1]
+        across, shear = _grain_shown(setting, fitted)
+        if max(abs(across), abs(shear)) < _MIN_GRAIN_CHANGE:
+            break
+        other = _with_grain(setting, math.exp(across), math.exp(shear))
+        found.append((other, fit_in_stages(other)))
+    return found
+
+
+def _is_good(fitted: FittedModel) -> bool:
+    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
+    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
+    return chi2(fitted) <= _GRAIN_GOOD and float((shifts**2).mean()) <= _GRAIN_GOOD
+
+
+def _grain_shown(setting: Setting, fitted: FittedModel) -> tuple[float, float]:
+    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
+    shifts = fitted.space.of("mode_shifts")
+    count = int(shifts.sum())
+    posterior = Posterior.of(fitted.space, fitted.best)
+    shown = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
+    J = _slopes(setting.free, count) / KINDS["mode_shifts"].std
+    information = J.T @ shown @ J + np.eye(3) / _GRAIN_PRIOR**2
+    _, across, shear = np.linalg.solve(information, J.T @ posterior.x[shifts]).tolist()
+    return across, shear
+
+
+def _with_grain(setting: Setting, across: float, shear: float) -> Setting:
+    """The setting of a board with other moduli across and of shear, by factors."""
+    rig, of = setting.rig, setting.rig.plate.material.shares
+    shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
+    plate = replace(rig.plate, material=replace(rig.plate.material, orthotropy=shares))
+    free = solve_free_plate(plate, setting.free.mesh, frequency_max=setting.free.frequency_max)
+    return replace(setting, rig=replace(rig, plate=plate), free=free)
+
+
+def _slopes(free: FreePlate, count: int) -> FloatArray:
+    """Derivatives of the logarithms of the lowest eigenvalues by those of three moduli (k, 3)."""
+    modes, mesh = free.modes, free.mesh
+    lowest = lowest_elastic(modes.eigenvalues, count)
+    shapes = [each[:, lowest] for each in modes.unknowns(np.empty((0, 3)))]
+    by_grain = grain_slopes(free.plate, (mesh.nx, mesh.ny), shapes)
+    relative = by_grain / modes.eigenvalues[lowest]
+    return np.column_stack([np.ones(len(lowest)), *relative])
+
+
 def fit_in_stages(setting: Setting) -> FittedModel:
     """Find the most likely parameters of a measurement."""
     measurement = setting.measurement
@@ -150,35 +242,10 @@ def fit_in_stages(setting: Setting) -> FittedModel:
     return _solved_anew(setting, found)
 
 
-def _solved_anew(setting: Setting, found: FittedModel) -> FittedModel:
-    """Fit from there with the plate solved for its thickness and modulus, as a table will be."""
-    values, plate = found.problem.model.at(found.best.x).values, setting.rig.plate
-    identified = plate_with(plate, values)
-    identified = replace(identified, mode_deviations=plate.mode_deviations)
-    free = solved_with_modes_of(setting.free, identified)
-    model = replace(found.problem.model, free=free, last_places={})
-    problem = IdentificationProblem(model, setting.measurement)
-    return FittedModel(problem, solve(problem, found.best.x, found.space.uncertain))
-
-
-def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
-    """Solve a plate on the mesh of another, with all modes of that one though it may be stiffer."""
-    stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
-    frequency_max = free.frequency_max * max(stiffer * _MARGIN, 1.0)
-    return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
-
-
-def chi2(fitted: FittedModel) -> float:
-    """Squared residuals in standard deviations, per value beyond the parameters they determine."""
-    r, J = fitted.best.residuals, fitted.best.jacobian
-    determined = np.trace(linalg.solve(fitted.best.information, J.T @ J, assume_a="pos"))
-    return float(r @ r / max(len(r) - determined, 1.0))
-
-
 def _simple(problem: IdentificationProblem) -> Linearization:
     """Fit without form errors from several thicknesses."""
     space = problem.model.space
-    free = space.of(*SIMPLE)
+    free = space.of(*_SIMPLE)
     best: Linearization | None = None
     for thickness in _THICKNESSES:
         start = np.zeros(space.size)
@@ -204,7 +271,7 @@ def _with_mass(
         moved = start.copy()
         moved[own : own + 3] = mass, *place
         starts.append(moved)
-    free = space.of(*LOCATED)
+    free = space.of(*_LOCATED)
     found = [solve(problem, each, free) for each in starts]
     return ranked_by(found, lambda each: -each.cost)
 
@@ -222,12 +289,12 @@ def _scan(
         if kind not in ("masses", "mode_shifts", "mode_losses", "fingers")
     ]
     others = np.flatnonzero(space.of(*kinds))
-    plate, points = model.rig.plate, _SCANNED.centres(model.rig.plate)
+    plate, points = model.rig.plate, _MASS_GRID.centres(model.rig.plate)
     by_mass = by_mass_at(model.at(x), points)[problem.measurement.known] / problem.std[:, None]
     columns = np.concatenate([by_mass.real, by_mass.imag]) * space.std[own]
     heaviest = Linearization(x[others], now.residuals, now.jacobian[:, others]).further(columns)
     off = (points - [plate.length / 2, plate.width / 2]) / space.std[own + 1 : own + 3]
-    return [(off[number], size) for number, size in heaviest[:_KEPT]]
+    return [(off[number], size) for number, size in heaviest[:_MASS_STARTS]]
 
 
 def _in_full(problem: IdentificationProblem, starts: list[Linearization]) -> FittedModel:
@@ -250,32 +317,51 @@ def _another_mass(setting: Setting, found: FittedModel) -> FittedModel:
     return _in_full(IdentificationProblem(model, setting.measurement), starts)
 
 
-_THEORY = {
-    "frequency": KINDS["mode_shifts"].theory / 2,
-    "stiffness": KINDS["stiffness"].theory,
-    "damping": KINDS["damping_each"].theory,
-    "place": KINDS["place"].theory,
-}
+def _solved_anew(setting: Setting, found: FittedModel) -> FittedModel:
+    """Fit from there with the plate solved for its thickness and modulus, as a table will be."""
+    values, plate = found.problem.model.at(found.best.x).values, setting.rig.plate
+    identified = plate_with(plate, values)
+    identified = replace(identified, mode_deviations=plate.mode_deviations)
+    free = solved_with_modes_of(setting.free, identified)
+    model = replace(found.problem.model, free=free, last_places={})
+    problem = IdentificationProblem(model, setting.measurement)
+    return FittedModel(problem, solve(problem, found.best.x, found.space.uncertain))
+
+
+def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
+    """Solve a plate on the mesh of another one, with all of its modes though it may be stiffer."""
+    stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
+    frequency_max = free.frequency_max * max(stiffer * _FREQUENCY_MARGIN, 1.0)
+    return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
+
+
+def chi2(fitted: FittedModel) -> float:
+    """Squared residuals in standard deviations, per degree of freedom."""
+    r, J = fitted.best.residuals, fitted.best.jacobian
+    determined = np.trace(linalg.solve(fitted.best.information, J.T @ J, assume_a="pos"))
+    return float(r @ r / max(len(r) - determined, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Normal distribution of x (p,) with a covariance (p, p)."""
+    """Normal distribution of the parameters about their most likely values."""
 
     space: Space
     x: FloatArray
+    """Most likely values (p,)."""
     covariance: FloatArray
+    """Covariance (p, p) of x."""
 
     @classmethod
     def of(cls, space: Space, best: Linearization) -> "Posterior":
-        """That about the most likely parameters: (J^T J + 1)^-1, known ones without variance."""
+        """Linearise about the most likely parameters: (J^T J + 1)^-1, 0 for known parameters."""
         free = np.flatnonzero(space.uncertain)
         covariance = np.zeros((space.size, space.size))
         covariance[np.ix_(free, free)] = linalg.inv(best.information[np.ix_(free, free)])
         return cls(space, best.x, covariance)
 
     def within(self, space: Space) -> "Posterior":
-        """The same in a space with further parameters, which are 0 and without variance."""
+        """Extend to a space with further parameters, which are 0 and without variance."""
         own = [space.index(name) for name in self.space.names]
         x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
         x[own] = self.x
@@ -293,7 +379,7 @@ class Posterior:
         return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, self.covariance, scaled)))
 
     def stds(self) -> dict[str, FloatArray]:
-        """Standard deviations of what answers depend on, with those of the theory, by kind."""
+        """Standard deviations of what answers depend on, with the errors of the theory, by kind."""
         own = {kind: self.std_of(rows) for kind, rows in relevant(self.space).items()}
         own["place"] = self.std[self.space.groups["place"]]
         return {
@@ -304,11 +390,11 @@ class Posterior:
     def uncertainty(
         self, before: Uncertainty, *, gain: float, phase_deg: float, field: float
     ) -> Uncertainty:
-        """What a rig states of itself after it was identified.
+        """The `uncertainty` of the rig after its identification.
 
-        before: its own, of which fingers and harmonics stay; its common_gain, which no fit narrows,
-        counts beside what is unknown of the gains' mean. gain, phase_deg: how far drives repeat;
-        field: what the model leaves unexplained of fields, relative.
+        before: that of the rig, whose fingers and harmonics stay; its common_gain, which no fit
+        narrows, is added to the error of the gains' mean. gain, phase_deg: repeatability of drives;
+        field: share of fields that the model leaves unexplained.
         """
         mean = _rows(self.space, "gain").mean(axis=0, keepdims=True)
         rms = {kind: _rms(std) for kind, std in self.stds().items()}
@@ -329,7 +415,7 @@ class Posterior:
 
 
 def relevant(space: Space) -> dict[str, FloatArray]:
-    """Combinations (m, p) of the parameters that answers depend on, by name."""
+    """Combinations (m, p) of parameters that answers depend on, by name."""
     mass = _rows(space, "thickness")
     by_rigidity = mass + _rows(space, "modulus") / 2
     gain, phase = _rows(space, "gain"), _rows(space, "phase")
@@ -358,45 +444,34 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt((values**2).mean())) if len(values) else 0.0
 
 
-SHARE = 5
-"""One in so many is held out."""
-
-_EVALUATIONS = 8
-_PREDICTED = 0.1  # of the rms at a tone: standard error of a prediction that can be held against it
-_LEAST_VALUES = 16
-# Of standard deviations: what no path tells is wrong in all fits alike.
-_IN_COMMON = 2.0
-
-
 @dataclass(frozen=True, eq=False)
 class HeldOutPaths:
-    """Errors of prediction, root mean square relative to the responses at a tone.
-
-    total: without what noise explains; unexplained: without what noise and the uncertain parameters
-    explain together; disagreement: covariance (p, p) of parameters x beside that of their fit.
-    """
+    """Errors of prediction at paths held out of a fit, rms relative to the responses at a tone."""
 
     total: float
+    """Without the part that noise explains."""
     unexplained: float
+    """Without the part that noise and the uncertain parameters explain together."""
     disagreement: FloatArray
+    """Covariance (p, p) of x to add to that of the fit."""
 
 
 def hold_out(fitted: FittedModel, *, progress: Progress = unseen) -> HeldOutPaths | None:
-    """Predict paths from a fit to the others; None where these do not tell enough of them."""
+    """Predict paths from fits to the others; None where these do not determine enough of them."""
     measurement, model = fitted.problem.measurement, fitted.problem.model
-    folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % SHARE
+    folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % HELD_OUT_FOLDS
     squares, variance = np.full((2, *measurement.values.shape), np.nan)
     free, fits = np.flatnonzero(fitted.space.uncertain), []
     noise = min(chi2(fitted), 1.0)  # readings may be better than they are stated
-    for fold in range(SHARE):
-        progress(1 + fold, 1 + SHARE)
+    for fold in range(HELD_OUT_FOLDS):
+        progress(1 + fold, 1 + HELD_OUT_FOLDS)
         unseen = measurement.known & (folds == fold)
         if not unseen.any():
             continue
         if (unseen == measurement.known).all():
             return None
         shown = IdentificationProblem(model, measurement.part(folds != fold))
-        found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_EVALUATIONS)
+        found = solve(shown, fitted.best.x, fitted.space.uncertain, evaluations=_FOLD_EVALUATIONS)
         fits.append(found.x)
         plate = model.at(found.x)
         error = (plate.responses - measurement.values)[unseen]
@@ -405,8 +480,8 @@ def hold_out(fitted: FittedModel, *, progress: Progress = unseen) -> HeldOutPath
         covariance = linalg.inv(found.information[np.ix_(free, free)])
         variance[unseen] = ((J @ covariance) * J.conj()).sum(axis=1).real
     mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
-    predicted = variance < _PREDICTED**2 * mean_square
-    if predicted.sum() < _LEAST_VALUES:
+    predicted = variance < _MAX_PREDICTION_ERROR**2 * mean_square
+    if predicted.sum() < _MIN_PREDICTED:
         return None
 
     total, unexplained = (
@@ -422,40 +497,29 @@ def hold_out(fitted: FittedModel, *, progress: Progress = unseen) -> HeldOutPath
 def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
     """Root mean square of errors, each relative to the rms of its responses, by their squares.
 
-    None where what is taken from squares, such as noise, exceeds them; infinite where all are NaN.
+    0 where what was subtracted from the squares, such as noise, exceeds them; infinite without any
+    finite value.
     """
     share = squares / mean_squares
     known = share[np.isfinite(share)]
     return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
 
 
-UNKNOWN = 0.5
-"""Share of its standard deviation before, beyond which a measurement has not shown something.
-
-Of that of a plate that was not measured, where the rig states less: answers need no more.
-"""
-
-SUSPENSION_FELT = 120.0
-"""Hz; above it fields change by less than 5 % with a suspension that is 20 % off."""
-
-_STEP = 20.0  # Hz between the tones that are considered
-_NOISE = 0.01
-_SHARES = (0.13, 0.5, 0.87)  # of the sides, where further sensors are considered
-
-
 @dataclass(frozen=True)
 class UnknownQuantity:
-    """Something that was not identified: its name and standard deviations before and after.
-
-    Advised: an ERA and a frequency [Hz] to play, and a sensor at an ERA or at x, y [m].
-    """
+    """A quantity that was not identified, and the measurement that would show it."""
 
     name: str
     before: float
+    """Standard deviation before the measurement."""
     after: float
+    """Standard deviation after it."""
     era: str
+    """ERA to play."""
     frequency: float
+    """Frequency to play [Hz]."""
     sensor: Sensor
+    """Where to measure."""
 
     def __str__(self) -> str:
         sensor = self.sensor
@@ -467,14 +531,14 @@ class UnknownQuantity:
 
 
 def unknowns(setting: Setting, fitted: FittedModel, posterior: Posterior) -> list[UnknownQuantity]:
-    """All that answers depend on and the measurement has not shown, with what would show it."""
+    """Find the quantities that answers depend on and the measurement leaves unknown."""
     space, found = posterior.space, []
     prior = replace(posterior, covariance=np.diag(space.uncertain.astype(float)))
     built = replace(prior, space=space.as_built)
     for kind, rows in relevant(space).items():
         before, after = prior.std_of(rows), posterior.std_of(rows)
-        unknown = np.flatnonzero((before > 0) & (after > UNKNOWN * built.std_of(rows)))
-        if kind == "stiffness" and setting.measurement.frequencies[0] > SUSPENSION_FELT:
+        unknown = np.flatnonzero((before > 0) & (after > _UNKNOWN * built.std_of(rows)))
+        if kind == "stiffness" and setting.measurement.frequencies[0] > _SUSPENSION_FELT:
             excites = ["force_factor" in era.fields for era in setting.rig.eras]
             unknown = unknown[~np.array(excites)[unknown]]
         # Of losses and frequencies of single modes only those count that no tone has shown.
@@ -494,18 +558,18 @@ def _name(row: FloatArray, names: tuple[str, ...]) -> str:
 def _best(
     setting: Setting, fitted: FittedModel, posterior: Posterior, row: FloatArray
 ) -> tuple[str, float, Sensor]:
-    """ERA, frequency and sensor whose response would tell most of a combination (p,)."""
+    """ERA, frequency and sensor whose response would narrow a combination (p,) most."""
     rig, model = setting.rig, fitted.problem.model
     plate, limits = rig.plate, rig.limits
     measured = {sensor.era for sensor in model.sensors}
     more = [Sensor(f"ERA {era.name}", era.name) for era in rig.eras if era.name not in measured]
     more += [
         Sensor(f"{x:g} {y:g}", x=x * plate.length, y=y * plate.width)
-        for x in _SHARES
-        for y in _SHARES
+        for x in _ADVISED_PLACES
+        for y in _ADVISED_PLACES
     ]
     sensors = [*model.sensors, *more]
-    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _STEP)
+    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _ADVISED_STEP)
     wider = replace(setting.model(model.mass_count, more=more), frequencies=tones, free=model.free)
     space = wider.space
     own = [space.index(name) for name in posterior.space.names]
@@ -513,7 +577,7 @@ def _best(
     combination[own], unknown[own] = row, False
     covariance = known.covariance + np.diag(unknown.astype(float))
     at = wider.at(known.x)
-    scale = _NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
+    scale = _ADVISED_NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
     direction = covariance @ (combination * space.std)
     gains = _gains(jacobian(at) / scale[..., None], covariance, direction)
     f, s, e = np.unravel_index(best_of(gains.ravel()), gains.shape)
@@ -527,75 +591,3 @@ def _gains(J: ComplexArray, covariance: FloatArray, direction: FloatArray) -> Fl
         variance = ((part @ covariance) * part).sum(axis=-1)
         total += (part @ direction) ** 2 / (1 + variance)
     return total
-
-
-_PRIOR = 0.15  # of the logarithms: of a board by its kind
-_LEAST = 3e-3  # of a change that is worth another fit
-_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
-_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
-_GRAIN_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
-
-
-def fit_board(setting: Setting) -> tuple[Setting, FittedModel]:
-    """The most likely parameters of a measurement, and the board in whose grain they are.
-
-    Of a plate without a grain those of `fit_in_stages`.
-    """
-    if setting.rig.plate.material.orthotropy is None:
-        return setting, fit_in_stages(setting)
-    found = []
-    for start in _STARTS:
-        found += _fits_from(_with_grain(setting, start, 1.0))
-        if any(_is_good(fitted) for _, fitted in found):
-            break
-    return best_by(found, lambda each: -each[1].best.cost)
-
-
-def _fits_from(setting: Setting) -> list[tuple[Setting, FittedModel]]:
-    """Fits one after the other, each in the grain that the one before shows."""
-    found = [(setting, fit_in_stages(setting))]
-    for _ in range(_ROUNDS):
-        setting, fitted = found[-1]
-        across, shear = _grain_shown(setting, fitted)
-        if max(abs(across), abs(shear)) < _LEAST:
-            break
-        other = _with_grain(setting, math.exp(across), math.exp(shear))
-        found.append((other, fit_in_stages(other)))
-    return found
-
-
-def _is_good(fitted: FittedModel) -> bool:
-    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
-    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
-    return chi2(fitted) <= _GRAIN_GOOD and float((shifts**2).mean()) <= _GRAIN_GOOD
-
-
-def _grain_shown(setting: Setting, fitted: FittedModel) -> tuple[float, float]:
-    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
-    shifts = fitted.space.of("mode_shifts")
-    count = int(shifts.sum())
-    posterior = Posterior.of(fitted.space, fitted.best)
-    shown = np.eye(count) - posterior.covariance[np.ix_(shifts, shifts)]
-    J = _slopes(setting.free, count) / KINDS["mode_shifts"].std
-    information = J.T @ shown @ J + np.eye(3) / _PRIOR**2
-    _, across, shear = np.linalg.solve(information, J.T @ posterior.x[shifts]).tolist()
-    return across, shear
-
-
-def _with_grain(setting: Setting, across: float, shear: float) -> Setting:
-    """The setting of a board with other moduli across and of shear, by factors."""
-    rig, of = setting.rig, setting.rig.plate.material.shares
-    shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
-    plate = replace(rig.plate, material=replace(rig.plate.material, orthotropy=shares))
-    free = solve_free_plate(plate, setting.free.mesh, frequency_max=setting.free.frequency_max)
-    return replace(setting, rig=replace(rig, plate=plate), free=free)
-
-
-def _slopes(free: FreePlate, count: int) -> FloatArray:
-    """Derivatives of the logarithms of the lowest eigenvalues by those of three moduli (k, 3)."""
-    modes, mesh = free.modes, free.mesh
-    lowest = lowest_elastic(modes.eigenvalues, count)
-    shapes = [each[:, lowest] for each in modes.unknowns(np.empty((0, 3)))]
-    by_grain = grain_slopes(free.plate, (mesh.nx, mesh.ny), shapes)
-    relative = by_grain / modes.eigenvalues[lowest]
-    return np.column_stack([np.ones(len(lowest)), *relative])

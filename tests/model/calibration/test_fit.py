@@ -58,8 +58,8 @@ def fit_a_rig(*, are_free: bool) -> None:
     free_scales[1:] = are_free
     plate = sensed_plate(RIG, POINTS, FREQUENCIES, has_form=True)
     problem = replace(fit.CalibrationProblem.of(plate, measured(RIG)), free_scales=free_scales)
-    start = fit.start_at(problem, np.zeros(plate.model.space.size))
-    fit.solve(problem, replace(start, z=0 * start.z))
+    z, noise, used = fit.start_at(problem, np.zeros(plate.model.space.size))
+    fit.solve(problem, 0 * z, noise, used)
 
 
 def match_a_plate() -> None:

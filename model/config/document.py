@@ -86,7 +86,7 @@ class Document:
     lines: dict[KeyPath, int]
 
     def value(self, path: KeyPath) -> Value:
-        """The value at a path of keys; KeyError if there is none."""
+        """The value at a path of keys; raises KeyError for a missing one."""
         value: Value = self.data
         for key in path:
             if not (isinstance(value, dict) and isinstance(key, str)):
@@ -142,7 +142,9 @@ def read_document(path: Path, *, if_empty: str = IF_EMPTY) -> Document:
 
 
 def read_bytes(path: Path, max_size: int, *, is_for: str, give: str) -> bytes:
-    """Read a regular file that a user names; is_for, give: the remedy if it is none, or larger.
+    """Read a regular file that a user names.
+
+    is_for: remedy for a larger file; give: remedy for another one.
 
     Raises ConfigError if it cannot be read, or is larger than max_size [bytes].
     """
@@ -162,7 +164,7 @@ def read_bytes(path: Path, max_size: int, *, is_for: str, give: str) -> bytes:
 
 
 def decoded(source: str, content: bytes) -> str:
-    """Decode the UTF-8 text of a file; raises ConfigError with the line of what is none."""
+    """Decode the text of a file; raises ConfigError with the line that is not UTF-8."""
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:

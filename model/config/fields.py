@@ -17,7 +17,6 @@ from typing import (
     Annotated,
     Any,
     Generic,
-    Protocol,
     TypeAlias,
     TypeVar,
     Union,
@@ -52,17 +51,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Dimension:
-    """A kind of value: its name with article, its SI unit, and an example to write.
+    """A kind of value, such as a length.
 
-    factors: of common units, as pint has them: loading pint doubles a command's start. Any other
-    unit of the dimension is found by pint. A bare number of a unit with a zero of its own, such as
-    degC, counts from there, as other units with one do; elsewhere these are refused.
+    Units with a zero of their own, such as degC, are refused unless its SI unit has one, too.
     """
 
     name: str
+    """Its name with article."""
+
     unit: str
+    """Its SI unit; a bare number of degC counts from 0 degC."""
+
     example: str
+    """An example to write."""
+
     factors: Mapping[str, str] = field(default_factory=dict, compare=False)
+    """Factors of common units, as pint has them: loading pint doubles a command's start.
+
+    Any other unit of the dimension is found by pint.
+    """
 
     def key(self, name: str) -> str:
         """The name of such a value with its unit, as in JSON: `stiffness_n_m`."""
@@ -219,10 +226,9 @@ PartT = TypeVar("PartT", bound=Section)
 
 @dataclass(frozen=True)
 class Quantity:
-    """Annotation of a float field written with a unit or in SI; bounds in SI.
+    """Annotation of a float field written with a unit or in SI.
 
-    above and below exclude the bound, at_least and at_most include it. word: what may stand in
-    place of a number, and is kept as it is.
+    Bounds are in SI: above and below exclude theirs, at_least and at_most include it.
     """
 
     dimension: Dimension
@@ -231,6 +237,7 @@ class Quantity:
     at_most: float = float("inf")
     below: float = float("inf")
     word: str = ""
+    """A word that may stand in place of a number, and is kept as it is."""
 
     def read(self, value: object) -> float:
         """Convert to SI units; raises ValueError for another dimension or a value out of bounds."""
@@ -402,7 +409,10 @@ def _problem(
     bound = context.get("min_length", context.get("max_length", 0))
     match details["type"]:
         case "extra_forbidden":
-            message = _unknown_key(str(path[-1]), _section_at(root, path[:-1], document))
+            known = [*_section_at(root, path[:-1], document).model_fields]
+            message = (
+                f"unknown key; {did_you_mean(str(path[-1]), known)}known are {', '.join(known)}"
+            )
         case "literal_error" | "enum":
             message = _no_choice(details, context["expected"])
         case kind if kind in _MESSAGES:
@@ -455,11 +465,6 @@ def _no_choice(details: ErrorDetails, expected: str) -> str:
 def _shown(details: ErrorDetails) -> str:
     text = shown(details["input"])
     return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-def _unknown_key(key: str, section: type[Section]) -> str:
-    known = list(section.model_fields)
-    return f"unknown key; {did_you_mean(key, known)}known are {', '.join(known)}"
 
 
 def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[Section]:
@@ -553,23 +558,6 @@ Point: TypeAlias = tuple[float, float]
 
 _CIRCLE_CORNERS = 60  # a multiple of 4
 _TOLERANCE = 1e-9  # m; a point this close to a side lies on it
-
-
-class Shape(Protocol):
-    """A part of the plate; lengths in metres, from the plate's south-west corner."""
-
-    def contains(self, x: float, y: float) -> bool:
-        """Whether a point is within or on the edge."""
-
-    @property
-    def centre(self) -> Point:
-        """Its centre of area."""
-
-    def corners(self) -> Sequence[Point]:
-        """Return its corners in order; those of a circle are many, four of them at its box."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return `shape` and its dimensions; every key has its unit."""
 
 
 @dataclass(frozen=True)
@@ -689,6 +677,10 @@ class Polygon:
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""
         return {"shape": "polygon", "points_m": [list(point) for point in self.points]}
+
+
+Shape: TypeAlias = Rectangle | Circle | Polygon
+"""A part of the plate; lengths in metres, from the plate's south-west corner."""
 
 
 def _is_on_side(x: float, y: float, start: Point, end: Point) -> bool:

@@ -18,27 +18,32 @@ DEFAULT_KIND = "rig"
 
 @dataclass(frozen=True)
 class CheckedFile:
-    """A valid configuration file: one line about it, and warnings; more: to its report as data."""
+    """A valid configuration file."""
 
     line: str
+    """One line about it."""
+
     warnings: Sequence[str] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
+    """Further entries of its report as data."""
 
 
 @dataclass(frozen=True)
 class ConfigKind:
-    """One kind of configuration file.
-
-    recognises: whether a document is of this kind; check: of a file and the files that it names,
-    raises ConfigError; example_file: a commented one to start from; keys: their JSON schema, which
-    gets the title.
-    """
+    """One kind of configuration file."""
 
     title: str
     recognises: Callable[[Document], bool]
+    """Whether a document is of this kind."""
+
     check: Callable[[Document], CheckedFile]
+    """Check a file and the files that it names; raises ConfigError."""
+
     example_file: Path
+    """A commented file to start from."""
+
     keys: Callable[[], dict[str, Any]]
+    """JSON schema of its keys, without the title."""
 
     def example(self) -> str:
         """A commented file to start from."""

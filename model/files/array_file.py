@@ -26,8 +26,12 @@ from registry.files import open_regular
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 UNREADABLE = (
-    *(OSError, ValueError, EOFError, RecursionError),
-    *(zipfile.BadZipFile, NotImplementedError),
+    OSError,
+    ValueError,
+    EOFError,
+    RecursionError,
+    zipfile.BadZipFile,
+    NotImplementedError,
 )
 """Errors of `read_arrays` for a file that is missing, damaged or unexpected."""
 
@@ -59,7 +63,7 @@ def whole_or_nothing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def remove_partial(path: Path) -> None:
-    """Remove what writers of a file left that were killed; nobody may be writing it."""
+    """Remove temporary files of killed writers; the file must not be written meanwhile."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * _RANDOM}"):
         with suppress(OSError):
             left.unlink()

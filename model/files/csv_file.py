@@ -83,16 +83,19 @@ def as_frame(columns: Columns) -> Any:
 
 @dataclass(frozen=True)
 class CsvLine:
-    """A line of a file: its file and number, for errors, and the text of each column.
-
-    has_decimal_comma: whether a number may have a comma in place of a point; factors: on numbers of
-    columns in other units.
-    """
+    """A line of a CSV file."""
 
     place: str
+    """File and number of the line, for errors."""
+
     cells: Mapping[str, str]
+    """Text by column."""
+
     has_decimal_comma: bool = False
+    """Whether numbers may have a comma in place of a point."""
+
     factors: Mapping[str, float] = field(default_factory=dict)
+    """Factors of the numbers of columns in other units, by column."""
 
     def number(
         self,

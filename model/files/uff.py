@@ -49,33 +49,46 @@ _NO_LETTER = re.compile(rb"(?<=[\d.])(?=[-+])")
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """One dataset 58.
-
-    place: file and line, for errors; response, reference: nodes, each with a name ("" without one)
-    and a direction, +-3 for +-z; x: abscissa, data (n,) real or complex; data_types: codes of
-    abscissa, ordinate and denominator; units: labels of ordinate and denominator; abscissa_unit:
-    that of a file; note: its second line of free text, up to 80 characters.
-    """
+    """One dataset 58: a function between a response node and a reference node."""
 
     place: str
+    """File and line, for errors."""
+
     function_type: int
     response: int
     reference: int
     names: tuple[str, str]
+    """Names of both nodes, "" without one."""
+
     directions: tuple[int, int]
+    """Directions at both nodes, +-3 for +-z."""
+
     x: FloatArray
+    """Abscissa (n,)."""
+
     data: NDArray[Any]
+    """Ordinate (n,), real or complex."""
+
     data_types: tuple[int, int, int]
+    """Codes of abscissa, ordinate and denominator."""
+
     units: tuple[str, str]
+    """Labels of the units of ordinate and denominator."""
+
     abscissa_unit: str = ""
+    """Label of the unit of the abscissa, as a file has it."""
+
     note: str = ""
+    """The second line of free text, up to 80 characters."""
 
 
 @dataclass(frozen=True, eq=False)
 class Universal:
-    """Content of a file. nodes: x, y, z [m] by number."""
+    """Content of a universal file."""
 
     nodes: Mapping[int, tuple[float, float, float]]
+    """x, y, z [m] by number."""
+
     functions: Sequence[Function]
 
 

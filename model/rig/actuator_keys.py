@@ -367,8 +367,12 @@ class ExciterSection(ActuatorSection):
     """Whether a frame holds the magnet."""
 
     keys: ClassVar = {
-        **{"stiffness": "stiffness", "damping": "damping", "magnet_mass": "weight"},
-        **{each: each for each in ("coil_mass", "force_factor", "gains")},
+        "stiffness": "stiffness",
+        "damping": "damping",
+        "magnet_mass": "weight",
+        "coil_mass": "coil_mass",
+        "force_factor": "force_factor",
+        "gains": "gains",
     }
     instead: ClassVar = {"stiffness": ("resonance", "resonance_is"), "damping": ("q",)}
     is_electrical = True

@@ -102,15 +102,12 @@ class _MaterialByName:
         return {"anyOf": [{"enum": list(material_names())}, handler(schema)]}
 
 
-def _modulus(at_least: float = 1e3) -> Quantity:
-    return Quantity(MODULUS, at_least=at_least, at_most=1e13)
-
-
 def _or_none(value: object, section: ValidatorFunctionWrapHandler) -> object:
     """A section, or `none` in its place: of a union pydantic would name both in errors."""
     return value if value == "none" else section(value)
 
 
+Modulus = Annotated[float, Quantity(MODULUS, at_least=1e3, at_most=1e13)]
 ModulusRows = Annotated[list[GainRow], Field(min_length=2, max_length=200), MODULI]
 
 ISOTROPIC = frozenset({"E", "nu"})
@@ -133,7 +130,7 @@ class MaterialSection(Section):
     Limits: a name
     """
 
-    E: Annotated[float, _modulus()] | None = None
+    E: Modulus | None = None
     """Young's modulus.
 
     Default: required, or those with a grain
@@ -148,13 +145,13 @@ class MaterialSection(Section):
     Default: required, or those with a grain
     """
 
-    E1: Annotated[float, _modulus()] | None = None
+    E1: Modulus | None = None
     """Young's modulus along the grain, in place of `E`, see [boards](#boards)."""
 
-    E2: Annotated[float, _modulus()] | None = None
+    E2: Modulus | None = None
     """Across the grain."""
 
-    G12: Annotated[float, _modulus()] | None = None
+    G12: Modulus | None = None
     """Shear modulus in the plane of the board."""
 
     nu12: Annotated[float, Quantity(RATIO, above=-5, below=5)] | None = None
@@ -163,10 +160,10 @@ class MaterialSection(Section):
     Limits: above -5, below 5; less than the root of E1 / E2
     """
 
-    G13: Annotated[float, _modulus()] | None = None
+    G13: Modulus | None = None
     """Transverse shear modulus along the grain."""
 
-    G23: Annotated[float, _modulus()] | None = None
+    G23: Modulus | None = None
     """Transverse shear modulus across it, of wood the rolling shear."""
 
     by_frequency: ModulusRows | None = None

@@ -146,7 +146,10 @@ def stiffness_slopes(
     moduli = [layer.modulus(frequency).real for layer in layers]
 
     def section(further_nu: float) -> CrossSection:
-        changed = [_with_nu(each, further_nu) for each in layers]
+        changed = [
+            replace(each, material=replace(each.material, nu=each.material.nu + further_nu))
+            for each in layers
+        ]
         return section_of(changed, moduli, corrections)
 
     nominal = section(0.0)
@@ -201,7 +204,3 @@ def _shapes(
         of = ClassFunctions(x, y, parity, len(layers) + 1)
         along = follow(of, class_stiffness(of, nominal), interface_mass(layers), shift) @ w
         yield of, np.vstack([w, along])
-
-
-def _with_nu(layer: LaminateLayer, further: float) -> LaminateLayer:
-    return replace(layer, material=replace(layer.material, nu=layer.material.nu + further))

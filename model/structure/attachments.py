@@ -26,7 +26,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, Protocol, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -44,55 +44,34 @@ Factor: TypeAlias = float | FloatArray
 """Of a parameter that deviates, one or several."""
 
 
-class Support(Protocol):
-    """What reacts to the plate's motion at x, y [m], without energy of its own.
-
-    It acts on a disc of radius foot [m], 0 for a point.
-    """
-
-    @property
-    def x(self) -> float:
-        """Place along the length [m]."""
-
-    @property
-    def y(self) -> float:
-        """Place along the width [m]."""
-
-    @property
-    def foot(self) -> float:
-        """Radius of the disc [m]."""
-
-    def dynamic_stiffness(self, omega: FloatArray) -> ComplexArray:
-        """Force on it per displacement [N/m] at omega [rad/s], of its shape."""
-
-
 @dataclass(frozen=True)
 class InTime:
-    """A source in time: a spring and a damper from the plate to its far end, and what drives it.
-
-    mass [kg]: moves with the plate; stiffness [N/m], damping [N s/m]; inertance [kg]: force by the
-    relative acceleration of both ends; far_mass [kg]: of the far end, None where that moves by
-    itself or is held; by_drive, by_rate: force that pushes the plate and the far end apart per unit
-    of the drive and of its rate.
-    """
+    """Coefficients of a source in time: a spring and a damper from the plate to its far end."""
 
     mass: float
-    stiffness: float
-    damping: float
+    """Mass that moves with the plate [kg]."""
+
+    stiffness: float  # N/m
+    damping: float  # N s/m
     far_mass: float | None = None
+    """Mass of the far end [kg]; None where that is held, or its motion is given."""
+
     by_drive: float = 0.0
+    """Force that pushes the plate and the far end apart, per unit of the drive."""
+
     by_rate: float = 0.0
+    """The same per unit of the rate of the drive."""
+
     inertance: float = 0.0
+    """Force by the relative acceleration of both ends [kg]."""
 
 
 @dataclass(frozen=True)
 class Source(ABC):
-    """What drives the plate, and supports it: an actuator. It is a `Support`, too.
+    """An actuator: what drives the plate, and supports it.
 
-    name: in the rig; x, y [m], foot [m]: as of a support; stiffness [N/m], damping [N s/m]: of its
-    spring and damper. gains: measured complex gain of its drive, at ascending frequencies, empty
-    for a gain of 1. Errors of its spring and damper act on the plate with the change of D times the
-    base less the plate's motion.
+    Errors of its spring and damper act on the plate with the change of D times the base less the
+    plate's motion.
     """
 
     LEARNED: ClassVar[tuple[str, ...]]
@@ -102,12 +81,17 @@ class Source(ABC):
     """Of its drive: m of an ERA's base, V of an exciter."""
 
     name: str
-    x: float
+    """Its name in the rig."""
+
+    x: float  # m, as y
     y: float
-    stiffness: float
-    damping: float
+    stiffness: float  # N/m, of its spring
+    damping: float  # N s/m, of its damper
     gains: tuple[Gain, ...] = field(default=(), kw_only=True)
+    """Measured complex gain of its drive, at ascending frequencies; empty for a gain of 1."""
+
     foot: float = field(default=0.0, kw_only=True)
+    """Radius of the disc on which it acts [m], 0 for a point."""
 
     def __post_init__(self) -> None:
         """Keep gains as tuples: a file gives lists, which cannot be compared and hashed."""
@@ -193,15 +177,18 @@ class Source(ABC):
 class Era(Source):
     """One ERA under the plate; its base moves y(t) = amplitude sin(omega t + phase).
 
-    stiffness k_b [N/m]; damping c [N s/m]; bolt_mass m_b [kg]; stroke: the largest base amplitude
-    [m]. An ERA that is not driven still supports and damps.
+    Its spring has the stiffness k_b, its damper c. An ERA that is not driven still supports and
+    damps.
     """
 
     LEARNED: ClassVar[tuple[str, ...]] = ("x", "y", "stiffness", "damping", "bolt_mass", "gains")
     UNIT: ClassVar[str] = "m"
 
     bolt_mass: float
+    """Mass m_b that moves with the plate [kg]."""
+
     stroke: float
+    """The largest base amplitude [m]."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -366,21 +353,24 @@ def fingertip_loads(
 
 @dataclass(frozen=True)
 class PointLoad:
-    """A spring [N/m] and a damper [N s/m] to the ground, and a mass [kg], at x, y [m].
+    """A spring and a damper to the ground, and a mass, on a point or a disc of the plate.
 
-    foot [m]: radius of the disc on which it acts, 0 for a point. It follows the mean deflection;
-    its rotary inertia is not modelled. loss_factor: eta of the spring, k (1 + i eta), as of foam.
-    is_foot: whether it is a foot, whose stiffness `supports` of a rig's uncertainty is of.
+    It follows the mean deflection of a disc; its rotary inertia is not modelled.
     """
 
-    x: float
+    x: float  # m, as y
     y: float
-    stiffness: float = 0.0
-    damping: float = 0.0
-    mass: float = 0.0
+    stiffness: float = 0.0  # N/m
+    damping: float = 0.0  # N s/m
+    mass: float = 0.0  # kg
     foot: float = 0.0
+    """Radius of the disc on which it acts [m], 0 for a point."""
+
     loss_factor: float = 0.0
+    """Loss factor eta of the spring, k (1 + i eta), as of foam."""
+
     is_foot: bool = False
+    """Whether it is a foot, to whose stiffness `Uncertainty.supports` applies."""
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, and loads that add energy."""
@@ -405,9 +395,13 @@ class PointLoad:
         return np.asarray(self.stiffness * (1 + 1j * self.loss_factor * np.sign(omega)))
 
 
+Support: TypeAlias = Source | PointLoad | FingertipLoad
+"""What reacts to the plate's motion at x, y [m] on a disc of radius foot [m], 0 for a point."""
+
+
 def feet_of(loads: Iterable[Support]) -> tuple[int, ...]:
     """Numbers of the loads that are feet, in their order."""
-    # A diagnosis tries a fingertip among them, which is none.
+    # A diagnosis tries a fingertip among them, which is not a foot.
     return tuple(n for n, each in enumerate(loads) if getattr(each, "is_foot", False))
 
 

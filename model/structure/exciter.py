@@ -35,27 +35,36 @@ _MAX_LAG = 0.1
 class Exciter(Source):
     """One exciter whose coil is glued to the plate.
 
-    stiffness k [N/m] and damping c [N s/m]: of the suspension; magnet_mass M, coil_mass m_c [kg];
-    force_factor Bl [N/A]; resistance R_e, source_resistance R_g [ohm]; inductance L [H]; voltage:
-    amplitude [V] at full level; excursion: largest amplitude of the coil in the magnet [m],
-    infinite where no sheet says; held: whether a frame holds the magnet; gains: of its amplifier
-    and converter.
+    Its stiffness k and damping c are those of the suspension, its gains those of its amplifier and
+    converter.
     """
 
     LEARNED: ClassVar[tuple[str, ...]] = (
-        *("x", "y", "stiffness", "damping", "magnet_mass", "coil_mass", "force_factor", "gains"),
+        "x",
+        "y",
+        "stiffness",
+        "damping",
+        "magnet_mass",
+        "coil_mass",
+        "force_factor",
+        "gains",
     )
     UNIT: ClassVar[str] = "V"
 
-    magnet_mass: float
-    coil_mass: float
-    force_factor: float
-    resistance: float
+    magnet_mass: float  # M [kg]
+    coil_mass: float  # m_c [kg]
+    force_factor: float  # Bl [N/A]
+    resistance: float  # R_e [ohm]
     voltage: float
-    source_resistance: float = 0.0
-    inductance: float = 0.0
+    """Amplitude at full level [V]."""
+
+    source_resistance: float = 0.0  # R_g [ohm]
+    inductance: float = 0.0  # L [H]
     excursion: float = math.inf
+    """Largest amplitude of the coil in the magnet [m]; infinite if no data sheet states one."""
+
     held: bool = False
+    """Whether a frame holds the magnet."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

@@ -21,23 +21,28 @@ from registry.plugins import PluginRegistry
 
 @dataclass(frozen=True)
 class KnownMaterial:
-    """A material with its sources.
-
-    source: of E, rho and nu; variation: between grades and measurements;
-    loss_factor: order of the bare material's own (Cremer and Heckl, Structure-Borne Sound, 2nd ed.;
-    of polycarbonate only an order). What is built in loses more at its joints: a rig's default is
-    1 %, or own_loss where the material itself loses more. by_frequency: rows of frequency [Hz],
-    factor of E and loss factor of what depends on it, as of a layer. by_thickness: the material of
-    a board so thick [m], where `material` is that of one of them.
-    """
+    """A material with its sources."""
 
     material: Material
     source: str
+    """Source of E, rho and nu."""
+
     variation: str
+    """How much they vary between grades and measurements."""
+
     loss_factor: str
+    """Order of the bare material's own (Cremer and Heckl, Structure-Borne Sound, 2nd ed.; of
+    polycarbonate only an order).
+    """
+
     own_loss: float = 0.0
+    """Loss factor of a plate by default where it exceeds 1 %, that of a mounted panel's joints."""
+
     by_frequency: tuple[tuple[float, float, float], ...] = ()
+    """Frequency [Hz], factor of E and loss factor, as of a layer; empty for constant ones."""
+
     by_thickness: Callable[[float], Material] | None = None
+    """The material of a board of a thickness [m]; `material` is then that of one thickness."""
 
     def of_thickness(self, thickness: float) -> Material:
         """The material of a board of a thickness [m]."""

@@ -44,15 +44,12 @@ from model.errors import InputError, expect_between, expect_values
 
 @dataclass(frozen=True)
 class Orthotropy:
-    """Moduli of a material with a grain, each as a share of E, the one along the plate's length.
+    """Moduli of a material with a grain, as shares of E, the modulus along the plate's length."""
 
-    e2: across it; g12: shear in the plane; g13, g23: transverse shear along the length and across.
-    """
-
-    e2: float
-    g12: float
-    g13: float
-    g23: float
+    e2: float  # across the length
+    g12: float  # shear in the plane
+    g13: float  # transverse shear along the length
+    g23: float  # transverse shear across it
 
     def __post_init__(self) -> None:
         """Refuse moduli that are not above zero."""
@@ -61,16 +58,18 @@ class Orthotropy:
 
 @dataclass(frozen=True)
 class Material:
-    """A linear material, isotropic unless it has a grain.
-
-    E: Young's modulus [Pa]; rho: density [kg/m³]; nu: Poisson's ratio. With a grain E is that along
-    the plate's length, nu the contraction across it by a stress along it (nu_12).
-    """
+    """A linear material, isotropic unless it has a grain."""
 
     name: str
     E: float
+    """Young's modulus [Pa], with a grain along the plate's length."""
+
     rho: float
+    """Density [kg/m³]."""
+
     nu: float
+    """Poisson's ratio, with a grain the contraction across the length by a stress along it."""
+
     orthotropy: Orthotropy | None = None
 
     def __post_init__(self) -> None:
@@ -180,17 +179,18 @@ class Sheet:
 
 @dataclass(frozen=True)
 class LaminateLayer(Sheet):
-    """One layer of a laminate; thickness [m].
-
-    loss_factor: eta of its modulus E (1 + i eta). by_frequency: rows of frequency [Hz], ascending,
-    factor of E and loss factor, which then replaces loss_factor; linear in the logarithms of
-    frequency and factor, constant outside.
-    """
+    """One layer of a laminate; thickness [m]."""
 
     material: Material
     thickness: float
     loss_factor: float = 0.0
+    """Loss factor eta of its modulus E (1 + i eta)."""
+
     by_frequency: tuple[tuple[float, float, float], ...] = ()
+    """Rows of frequency [Hz], ascending, factor of E, and loss factor, which replaces loss_factor.
+
+    Linear in the logarithms of frequency and factor, constant outside.
+    """
 
     def __post_init__(self) -> None:
         """Refuse a thickness that is not above zero."""
@@ -271,13 +271,11 @@ _OPEN, _SEALED = (5.0, 1.4), (1.0, 0.28)
 
 @dataclass(frozen=True)
 class AirGap:
-    """An air gap between the whole plate and a rigid wall, its depth in m.
+    """An air gap between the whole plate and a rigid wall."""
 
-    closed: sealed along all edges; otherwise open to the room along all of them.
-    """
-
-    depth: float
+    depth: float  # m
     closed: bool = False
+    """Whether it is sealed along all edges; otherwise it is open to the room along all of them."""
 
     def __post_init__(self) -> None:
         """Refuse a depth that is not above zero."""
@@ -486,14 +484,12 @@ _MAX_STEPS = 200  # of the iteration for a wavenumber, which takes some twenty
 
 @dataclass(frozen=True)
 class Bending:
-    """Bending properties of a thin plate: flexural rigidity D [N m] and Poisson's ratio.
+    """Bending properties of a thin plate."""
 
-    bonded: how far layers do not slide on each other, 0 to 1.
-    """
-
-    rigidity: float
+    rigidity: float  # D [N m]
     nu: float
     bonded: float = 1.0
+    """How little its layers slide on each other, 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -682,10 +678,10 @@ def bending(laminate: Laminate, frequency: float) -> Bending:
 def equivalent_plate(
     laminate: Laminate, *, length: float, width: float, frequency: float, loss_factor: float = 0.01
 ) -> Plate:
-    """The plate of a laminate, with what is alike of a homogeneous one at a frequency [Hz].
+    """Make the plate of a laminate, with its homogeneous equivalent at a frequency [Hz].
 
-    length, width [m]. Its layers are those that are solved, none where they slide or are a single
-    elastic one.
+    length, width [m]. It keeps the laminate where its layers are solved as they are: not where they
+    slide, or where there is a single elastic one.
     """
     first, *others = laminate.layers
     if not others and first.is_elastic:

@@ -1,9 +1,4 @@
-"""Worker processes that die, and those whose program does.
-
-Versions of code and numbers that results carry.
-
-Clusters, choices and quantities.
-"""
+"""Parallel tasks on processes and clusters, versions of code and numbers, and small helpers."""
 
 import json
 import math

@@ -1,7 +1,4 @@
-"""Work in threads, finished or cancelled.
-
-Suggestions for mistyped names.
-"""
+"""Work in threads, finished or cancelled, and suggestions for mistyped names."""
 
 import asyncio
 import gc

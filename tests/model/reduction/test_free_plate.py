@@ -1,10 +1,8 @@
-"""The free plate with anything attached to it, against the direct solve of the same mesh.
+"""The free plate and the plate in a few coordinates, against direct solutions.
 
-The plate in a few coordinates: against the full one, its slopes, modes and what was left out.
-
-A plate with a part that stays as its thickness changes: a mass along its edges, as a double.
-
-Modes that differ from a plate's theory, and a loss factor that varies, in every solution.
+The free plate with attachments, against the direct solve of the same mesh; the reduced plate, its
+slopes and its modes, against the full one; a part whose mass does not follow the thickness; modes
+that differ from the theory, and a loss factor that varies, in every solution.
 """
 
 import math

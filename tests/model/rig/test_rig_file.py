@@ -1,6 +1,6 @@
-"""What full level is, gains of ERAs, and layouts of a rig.
+"""Rig files, read and written again with other values.
 
-Rig files written again with other values.
+Full levels, gains of ERAs and layouts; text with the values of a fitted rig.
 """
 
 import math
@@ -705,8 +705,12 @@ def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
 
 
 TEXTS = {
-    **{"flow": FLOW, "block": BLOCK, "bonded": BONDED},
-    **{"board": REWRITTEN_BOARD, "by numbers": BY_NUMBERS, "acrylic": ACRYLIC},
+    "flow": FLOW,
+    "block": BLOCK,
+    "bonded": BONDED,
+    "board": REWRITTEN_BOARD,
+    "by numbers": BY_NUMBERS,
+    "acrylic": ACRYLIC,
 }
 
 

@@ -1,8 +1,7 @@
-"""The reference of the rig file against what rig files may say.
+"""Keys of rig files: their reference page, plain keys and fields of a plate, and exciters.
 
-Every plain key of a plate, also a new one: in both solvers, in a rigid plate, in a summary.
-
-Exciters in rig files: by type and by values, what is refused and warned of, written again.
+Every key and field of a plate, also a new one, is covered: a plain key is in both solvers, in a
+rigid plate and in a summary; a field is written, read back, and followed by tables as it states.
 """
 
 import inspect

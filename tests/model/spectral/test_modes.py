@@ -1,12 +1,8 @@
-"""Plates in polynomials: stiff mounts, and the functions themselves.
+"""Plates in Legendre polynomials, against independent solvers, finite elements and elasticity.
 
-Closed derivatives of a plate's stiffness by its sides and Poisson's ratio.
-
-Air behind a plate against finite differences of its pressure and published squeeze films.
-
-Plates of layers against elasticity, the homogeneous plate, and direct solutions.
-
-The plate in Legendre polynomials, against independent solvers and finite elements.
+Also stiff mounts, the functions themselves, plates of layers, derivatives of the stiffness by sides
+and Poisson's ratio, and air behind a plate against finite differences of its pressure and published
+squeeze films.
 """
 
 import math

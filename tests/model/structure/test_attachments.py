@@ -1,6 +1,6 @@
-"""Supports, loads at points and under fingertips, and the areas that they have.
+"""Attachments of a plate: supports, loads at points, fingertips, frames and feet.
 
-Boards with a grain, frames along their edges, and feet that are not driven.
+Also boards with a grain, and the areas on which loads act.
 """
 
 import math

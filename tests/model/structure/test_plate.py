@@ -1,8 +1,7 @@
-"""Exciters by numbers worked out by hand, and on a plate by an independent solver.
+"""Materials, laminates and exciters by numbers worked out by hand and by independent solvers.
 
-Named materials, point masses and rigs made without a file.
-
-Laminates: bounds by hand, waves against elasticity and published sandwich plates.
+Also point masses and rigs made without a file; laminates against their bounds, elasticity and
+published sandwich plates.
 """
 
 import math

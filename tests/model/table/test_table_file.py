@@ -1,8 +1,6 @@
-"""Table files: read back to the bit, or refused.
+"""Table files: read back to the bit or refused, kept between runs, and of one rig only.
 
-Tables kept between runs, and never a wrong one.
-
-Which rigs a table is for: every key of a rig changed is refused, but for a short list.
+Every key of a rig that changes is refused, but for a short list.
 """
 
 import copy
@@ -401,8 +399,13 @@ RIGS["board"] = {
         "thickness": 0.005,
         "grain": "length",
         "material": {
-            **{"E1": 12e9, "E2": 5e9, "G12": 0.7e9, "G13": 0.3e9, "G23": 0.2e9},
-            **{"nu12": 0.05, "rho": 680.0},
+            "E1": 12e9,
+            "E2": 5e9,
+            "G12": 0.7e9,
+            "G13": 0.3e9,
+            "G23": 0.2e9,
+            "nu12": 0.05,
+            "rho": 680.0,
         },
     },
     "mesh": "12x9 Legendre",
@@ -423,14 +426,26 @@ RIGS["exciters"] = copy.deepcopy(RIGS["plain"]) | {
     }
     | {
         "X1": {
-            **{"at": [0.1, 0.05], "foot": 0.004, "coil_mass": 1e-3, "weight": 0.02},
-            **{"resonance": 200, "resonance_is": "free", "q": 3, "force_factor": 1.5},
-            **{"resistance": 3.6, "inductance": 1e-4, "source_resistance": 0.1, "power": 1},
+            "at": [0.1, 0.05],
+            "foot": 0.004,
+            "coil_mass": 1e-3,
+            "weight": 0.02,
+            "resonance": 200,
+            "resonance_is": "free",
+            "q": 3,
+            "force_factor": 1.5,
+            "resistance": 3.6,
+            "inductance": 1e-4,
+            "source_resistance": 0.1,
+            "power": 1,
             "excursion": 5e-4,
             "gains": [[40, 1, 0], [500, 1.1, 10]],
         },
         "X2": {
-            **{"at": [0.2, 0.05], "type": "DAEX25CT-4", "stiffness": 4000, "damping": 0.8},
+            "at": [0.2, 0.05],
+            "type": "DAEX25CT-4",
+            "stiffness": 4000,
+            "damping": 0.8,
             "clip": 1,
         },
         "X3": {"at": [0.15, 0.12], "type": "DAEX25CT-4"},
@@ -482,8 +497,16 @@ ELSEWHERE: dict[tuple[type[Section], str], tuple[str, tuple[Any, ...]]] = {
 }
 
 MAY_DIFFER = {
-    *("mesh", "amplifiers", "url", "full_level", "clock_error", "amplifier", "channel", "name"),
-    *("limits", *sections.LimitsSection.model_fields),
+    "mesh",
+    "amplifiers",
+    "url",
+    "full_level",
+    "clock_error",
+    "amplifier",
+    "channel",
+    "name",
+    "limits",
+    *sections.LimitsSection.model_fields,
 }
 """Keys that may have other values than the rig of a table, by the reference of the table's file."""
 

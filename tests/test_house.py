@@ -10,6 +10,7 @@ import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -153,6 +154,16 @@ def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> 
         assert re.findall(r"^test_(.)\.py::", done.stdout, re.MULTILINE) == ["b", "a"]
         assert outcome in done.stdout.splitlines()[-1]
         assert ("test_b.py test_a.py" in done.stdout.splitlines()) == (until == "0")
+
+
+def test_changed_page_is_typed_although_that_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its case loses the marks by which it is left out; that of another page keeps them."""
+    monkeypatch.setenv("ERA_TESTS_PAGES", "play-content your-own-application")
+    for page, left in (("play-content", ["needs"]), ("add-an-effect", ["long", "alone", "needs"])):
+        marks = [getattr(pytest.mark, name).mark for name in ("long", "alone", "needs")]
+        item = SimpleNamespace(name=f"test_page[{page}]", own_markers=marks)
+        changed_tests.pytest_itemcollected(item)  # type: ignore[arg-type]
+        assert [mark.name for mark in item.own_markers] == left
 
 
 def test_command_fails_where_no_test_had_time(

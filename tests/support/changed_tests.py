@@ -3,7 +3,8 @@
     python tests/support/changed_tests.py [--since COMMIT] [--seconds N] [--list]
 
 A test is near what has changed by its folder, then by the number of imports between both. A file
-that is no module has the tests that name it and those of its folder. What only `pyproject.toml` or
+that is no module has the tests that name it and those of its folder; a tutorial or a how-to page
+that has changed is typed, although that is long. What only `pyproject.toml` or
 an example leads to comes last. What is not reached and what the minute has no time for is printed;
 exit status 3 where no test had time. pytest loads this file as a plug-in, too.
 """
@@ -69,10 +70,12 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
 _MAX_FILES = 60  # collecting more leaves no time to run them
 _SECONDS = 45.0  # for tests, of a minute
 _UNTIL = "ERA_TESTS_UNTIL"
+_PAGES = "ERA_TESTS_PAGES"
 _NO_TIME = "without time"
 _NOTHING_RAN = 3
 _MODULES = (".py", ".pyi")
 _WRITER = re.compile(r"<!-- begin: written by \S*?(\w+)\.py")
+_TYPED = ("docs/how-to/", "docs/tutorials/")
 _LAST = ("pyproject.toml", "examples/")
 """What many tests name or import that its change does not concern."""
 
@@ -231,6 +234,14 @@ def _imports(file: Path) -> set[str]:
     return names
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Take what types a page that has changed, although it has the marks of what is long."""
+    if any(item.name.endswith(f"[{page}]") for page in os.environ.get(_PAGES, "").split()):
+        item.own_markers[:] = [
+            mark for mark in item.own_markers if mark.name not in ("long", "alone")
+        ]
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Run files in the order in which they are named."""
@@ -266,11 +277,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = _NOTHING_RAN
 
 
-def _run(files: Sequence[str], *, until: float) -> int:
+def _run(files: Sequence[str], pages: Iterable[str], *, until: float) -> int:
     """Run tests until a time; return pytest's status, or that of no test that had time."""
     options = ["-p", "changed_tests", "-q", "-r", "fE", "-m", "not long and not alone"]
     spread = ["--numprocesses", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     environment = os.environ | {"PYTHONPATH": "tests/support", _UNTIL: str(until)}
+    environment[_PAGES] = " ".join(pages)
     command = [sys.executable, "-m", "pytest", *options, *spread, *files]
     return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
@@ -293,7 +305,8 @@ def main() -> int:
     sys.stdout.write(f"{len(changed)} files differ from {since}; tests in {len(chosen)} files\n")
     sys.stdout.flush()
     if chosen:
-        status = _run(chosen, until=until)
+        pages = [Path(each).stem for each in changed if each.startswith(_TYPED)]
+        status = _run(chosen, pages, until=until)
     sys.stdout.write(
         f"Left out: tests in {len(reached) - len(chosen)} files that more imports lead to and in "
         f"{len(_tests()) - len(reached)} that none do, and all that is long or loads the machine.\n"

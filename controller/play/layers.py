@@ -1,11 +1,9 @@
-"""The layers of the amplifiers: contents in, the sets out; what each layer plays, and until when.
+"""The layers of the amplifiers: contents in, sets out; what each layer plays, and until when.
 
 The ledgers are asked before a set is made: what they do not admit is played along plain ramps, then
-without the newest content, and nothing where none is left. A vibration ends by itself if the host
-or a touch source falls silent, so it is renewed only while sources confirm the contacts that it is
-for.
-
-Layers that play courses: the set of the next piece, and when the one after it is due.
+without the newest content, and nothing is played where none is left. A vibration ends by itself if
+the host or a touch source falls silent, so it is renewed only while sources confirm its contacts.
+A layer with a course gets a set for each piece, half a piece ahead.
 """
 
 import logging
@@ -42,72 +40,6 @@ from model.rig.rig import Rig
 
 MIN_LEFT = 0.001
 """Time [s] of a pulse that is about to end."""
-
-
-class CourseLayers:
-    """Makes the pieces of courses; knots: of an envelope, 0 for ramps."""
-
-    def __init__(self, builder: SetBuilder, knots: int) -> None:
-        self._builder, self._knots = builder, knots
-
-    def piece(
-        self,
-        number: int,
-        content: Content,
-        course: Course,
-        pulse: Pulse,
-        now: float,
-        *,
-        among: int,
-        playing: Drive,
-        before: LayerContent | None = None,
-    ) -> tuple[PlateLayer, answer.Layer]:
-        """Return the set of the piece of a content's course that is played next, and its layer.
-
-        From where the pulse is at a time [s] on, or once the piece before ends, if that has not
-        ended yet. number: of the layer; among: pieces that are sent together; playing: what plays
-        there; before: with the piece before, None for the first.
-        """
-        is_after, knots, starts = False, self._knots, now
-        if before is None:
-            knots = min(knots, self._builder.support.onset_knots)
-        elif now < before.course_until:
-            is_after, starts = True, before.course_until
-        piece = piece_of(
-            course,
-            pulse,
-            0.0 if pulse.started_at is None else starts - pulse.started_at,
-            knots=max(knots // among, 1) if knots else 0,
-            is_first=before is None,
-        )
-        has_ended = before is not None and now >= before.ends_at
-        return self._builder.build_piece(
-            number,
-            content.layer,
-            piece,
-            playing={} if has_ended else playing,
-            valid_for=piece.duration + HELD,
-            is_after=is_after and piece.has_knots,
-        )
-
-    def confirmed(
-        self, one: LayerContent, played: answer.Layer, since: float, now: float, *, is_first: bool
-    ) -> LayerContent:
-        """Return what plays of a course once a piece is confirmed that starts at a time [s].
-
-        The next one follows the first at once, and is sent when half of any other has been played.
-        """
-        until = since + replace(one, layer=played).settled_after
-        due = now + MIN_LEFT if is_first else (since + until) / 2
-        due = due if played.onset else until
-        pulse = one.content.targets[0][1].pulse
-        is_over = pulse is not None and until > pulse.end - MIN_LEFT
-        return replace(
-            one,
-            drive=full_drive(one.content.layer.excitation, self._builder.rig),
-            course_until=until,
-            ending_due=math.inf if is_over else due,
-        )
 
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
@@ -202,7 +134,7 @@ class Layers:
         self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
         # A limit of slew lengthens ramps.
         knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
-        self._courses = CourseLayers(self.builder, knots)
+        self._course_knots = knots  # of a piece, 0 for ramps
         if not knots:
             why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
             _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
@@ -283,9 +215,8 @@ class Layers:
         for number, one in self.contents.items():
             if one.ending_due <= now and (led := one.content.course) is not None:
                 if now < self._confirmed_until(one.content):
-                    drive, among = self._drive_of(number), len(due)
-                    layers[number], endings[number] = self._courses.piece(
-                        number, one.content, *led, now, among=among, playing=drive, before=one
+                    layers[number], endings[number] = self._piece(
+                        number, one.content, *led, now, among=len(due), before=one
                     )
             elif one.ending_due <= now and one.is_falling:
                 layers[number] = self.builder.build_fall(
@@ -358,8 +289,7 @@ class Layers:
             if one.content.course is not None:
                 starts = max(played.starts_at, one.course_until)
                 piece, is_first = sets.endings.get(number, one.layer), number in sets.started
-                one = self._courses.confirmed(one, piece, starts, now, is_first=is_first)
-                self._replace({**self.contents, number: one})
+                self._confirm_piece(number, piece, starts, now, is_first=is_first)
             elif number in sets.started:
                 drive = tones_by_era(played.layers, self._rig, number)
                 settled_at = now + one.settled_after
@@ -487,9 +417,8 @@ class Layers:
         for number in starting:
             content = numbers[number]
             if (led := content.course) is not None:
-                among = len(starting)
-                layers[number], played = self._courses.piece(
-                    number, content, *led, now, among=among, playing=self._drive_of(number)
+                layers[number], played = self._piece(
+                    number, content, *led, now, among=len(starting)
                 )
                 playing[number] = LayerContent(content, played)
                 settled.append(playing[number].settled_after)
@@ -518,6 +447,65 @@ class Layers:
             layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
             settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+
+    def _piece(
+        self,
+        number: int,
+        content: Content,
+        course: Course,
+        pulse: Pulse,
+        now: float,
+        *,
+        among: int,
+        before: LayerContent | None = None,
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set of the next piece of a content's course in a layer, and what is played.
+
+        The piece starts where the pulse is at a time [s], or when the piece before ends if that has
+        not ended yet. among: pieces that are sent together; before: the layer with the piece
+        before, None for the first.
+        """
+        is_after, knots, starts = False, self._course_knots, now
+        if before is None:
+            knots = min(knots, self.builder.support.onset_knots)
+        elif now < before.course_until:
+            is_after, starts = True, before.course_until
+        piece = piece_of(
+            course,
+            pulse,
+            0.0 if pulse.started_at is None else starts - pulse.started_at,
+            knots=max(knots // among, 1) if knots else 0,
+            is_first=before is None,
+        )
+        has_ended = before is not None and now >= before.ends_at
+        return self.builder.build_piece(
+            number,
+            content.layer,
+            piece,
+            playing={} if has_ended else self._drive_of(number),
+            valid_for=piece.duration + HELD,
+            is_after=is_after and piece.has_knots,
+        )
+
+    def _confirm_piece(
+        self, number: int, played: answer.Layer, since: float, now: float, *, is_first: bool
+    ) -> None:
+        """Note that a piece of a layer's course is confirmed, which starts at a time [s].
+
+        The second piece is sent at once, each later one when half of that before has been played.
+        """
+        one = self.contents[number]
+        until = since + replace(one, layer=played).settled_after
+        due = now + MIN_LEFT if is_first else (since + until) / 2
+        due = due if played.onset else until
+        pulse = one.content.targets[0][1].pulse
+        is_over = pulse is not None and until > pulse.end - MIN_LEFT
+        self._change(
+            number,
+            drive=full_drive(one.content.layer.excitation, self._rig),
+            course_until=until,
+            ending_due=math.inf if is_over else due,
+        )
 
     def _fade_of(self, number: int, content: Content) -> float:
         """How long [s] a content is led to from what its finger feels; 0 where it begins."""

@@ -1,27 +1,19 @@
-"""What one layer of all amplifiers of a rig is to play: routed, and shaped where possible.
+"""Playback on the amplifiers of a rig: what they can play together, and the sets for each layer.
+
+Capabilities of the open amplifiers are stated in the terms of the table. A set takes its onset with
+it, so a touch waits for that; its ending follows in a set of its own, which takes no longer. The
+knots that the wires carry in time are counted once, when the amplifiers are open. Errors of their
+clocks are counted anew where one is worse than counted, or where all have become far better.
+
+A course is played in pieces. An amplifier plays a piece along straight lines between its knots, and
+holds one more that waits for the end of the first: so pieces follow each other without a gap though
+the host is late, by half a piece at most. The first is short, since a touch waits for it.
 
 Excitations [m, rad] become tones of channels by the wiring of the rig, and envelopes integers of
 the wire; `sim/bench` translates back by the same wiring. An onset of fewer knots follows the same
 curve in longer steps, which keeps quiet fingers quieter than a ramp does down to a single knot; an
 ending is sent whole or not at all. The last value of an envelope, the pattern itself or silence, is
 that of the command and not among the knots on the wire.
-
-Capabilities of the open amplifiers of a rig together, in the terms of the table.
-
-A set takes its onset with it, so a touch waits for that; its ending follows in a set of its own,
-which takes no longer. The knots that the wires carry in time are arithmetic, done once when the
-amplifiers are open.
-
-Errors of the amplifiers' clocks as answers count them, so that a promise holds while they vary.
-
-They are counted anew where one is worse than counted, and where all have become far better: not at
-each reading, of which every one differs.
-
-Pieces of a course: what of it goes out at once, as an onset of knots, or as a plain ramp.
-
-An amplifier plays a piece along straight lines between its knots, and holds one more that waits for
-the end of the first: so pieces follow each other without a gap though the host is late, by half a
-piece at most. The first is short, since a touch waits for it.
 """
 
 import logging
@@ -41,218 +33,99 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MAX_WORDS, QUANTITIES
 from drivers.protocol.sets import Envelope, LayerSet
 from model import vibration as physics
-from model.answer import answer
-from model.answer.answer import Layer, Limits, amplitudes_of
+from model.answer import answer, stimulus
+from model.answer.answer import Limits, amplitudes_of
 from model.answer.answer_report import Timing
-from model.answer.stimulus import FADE_RAMP, KNOT_STEP, Course, Placement
+from model.answer.stimulus import FADE_RAMP, Course, Placement
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.ensemble.draws import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.errors import InputError
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
-from model.transients.base_motion import KNOT_STEP as BASE_MOTION_KNOT_STEP
+from model.transients import base_motion
 from model.transients.base_motion import BaseEnvelope, Envelopes
 from model.transients.knots import ENDING_KNOTS, ONSET_KNOTS
 from registry import threads
 
-MARGIN = 1.25
-"""By how much more is counted than is known."""
+MAX_SET_TIME = 0.010
+"""Longest time [s] of a set on its wire, so that its onset does not delay a touch."""
 
-SETTLED = 10.0
-"""Time [s] for which a clock is held until that is said, with how often it was not."""
+MAX_PIECE_TIME = 0.020
+"""The same [s] of a set that continues a course, for which a touch may have to wait."""
 
-_FAR_BETTER = 2.0  # times what is counted
-
-_logger = logging.getLogger(__name__)
-
-
-class CountedClocks:
-    """Errors by amplifier of a rig; now: gives what is known, rms [s], infinite if unknown."""
-
-    def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
-        self._rig, self._now = rig, now
-        self._names = sorted(rig.channel_counts)
-        self._counted = EXACT_CLOCKS
-        self._losses = dict.fromkeys(self._names, 0)  # since it was last said to be held
-        self._held_since: dict[str, float] = {}  # not said yet
-        self.errors: dict[str, float] = {}
-        """By name, rms [s], as counted; empty where all ERAs are on one amplifier."""
-
-    @property
-    def known(self) -> Mapping[str, float]:
-        """What is known by name now, rms [s]; empty where nothing is counted."""
-        return self._now() if self.errors else {}
-
-    def counted_by(
-        self, table: LocalizationTable, known: Mapping[str, float] | None = None
-    ) -> LocalizationTable:
-        """The table with the clocks as they are counted now; takes no time.
-
-        known: of now, if that was looked up.
-        """
-        if len(self._names) < 2:
-            return table
-        known = known or self._now()
-        if self._is_other(known):
-            before, errors = self.errors, {name: MARGIN * known[name] for name in self._names}
-            eras = [era.name for era in table.eras]
-            self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
-            self.errors = errors
-            self._note(before)
-        for name in [*self._held_since]:  # mostly none
-            if threads.now() - self._held_since[name] >= SETTLED:
-                self._say_held(name)
-        return table.with_clocks(self._counted)
-
-    def is_one_lost(self, known: Mapping[str, float]) -> bool:
-        """Whether one is held no longer to those with which its amplifier shares contents.
-
-        known: of now.
-        """
-        for name, counted in self.errors.items():  # with each plan: no further calls
-            if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
-                return True
-        return False
-
-    def _is_other(self, known: Mapping[str, float]) -> bool:
-        """Whether a clock is worse than counted, or one far better."""
-        for name, counted in self.errors.items():  # as often
-            if known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted:
-                return True
-        return not self.errors
-
-    def _note(self, before: Mapping[str, float]) -> None:
-        """Count losses; log which amplifiers play contents of their own from now on, once.
-
-        No clock is known when its line has just been opened, so that it is no warning then.
-        """
-        level = logging.WARNING if before else logging.INFO
-        for name, error in self.errors.items():
-            was_alone = before.get(name, 0.0) > MAX_HELD
-            if error <= MAX_HELD:
-                if was_alone:
-                    self._held_since[name] = threads.now()
-            elif not was_alone:
-                self._held_since.pop(name, None)
-                if not self._losses[name]:
-                    _logger.log(
-                        level,
-                        "amplifier %s: its clock is not held to the others', so its ERAs play "
-                        "contents of their own; if that lasts, see its clock_error in era amp "
-                        "status",
-                        name,
-                    )
-                self._losses[name] += 1
-
-    def _say_held(self, name: str) -> None:
-        """Log that an amplifier's clock has been held for long, and how often it was not."""
-        _logger.info(
-            "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the others'; "
-            "losses before: %d",
-            name,
-            1e6 * self.errors[name],
-            SETTLED,
-            self._losses[name],
-        )
-        self._losses[name] = 0
-        del self._held_since[name]
-
+BESIDE_CLICK = 0.100
+"""Fade-out [s] beside a short pulse; a shorter one would be felt with it."""
 
 PLAIN_STEP = 0.050
-"""Time [s] of ramps, where amplifiers have no knots, of which each is a set of its own."""
+"""Time [s] of the ramps in which a course is played on amplifiers without knots, a set for each."""
 
 HELD = 0.1
-"""How long [s] a layer lasts beyond its last piece: if no other comes by then it ends by itself."""
+"""Time [s] for which a layer lasts beyond its last piece: without another it ends by itself."""
 
-_AMID = 0.020  # s; between knots of a first piece that leads there from something else
 _FIRST, _NEXT, _SHORTEST = 0.16, 0.32, 0.12  # s; of pieces, the last one where knots are few
+_AMID = 0.020  # s; between knots of a first piece that leads there from something else
 
 MAX_STEP = _SHORTEST / 2
 """Time [s] between knots where an envelope has one."""
 
-_ROUNDING = 1e-9  # s
+MARGIN = 1.25
+"""Factor by which more error of a clock is counted than is known."""
 
+SETTLED = 10.0
+"""Time [s] for which a clock is held before that is logged, with how often it was not."""
 
-@dataclass(frozen=True)
-class Piece:
-    """Shares of a course a step [s] apart, the first one a step after its start."""
+_FAR_BETTER = 2.0  # times what is counted
 
-    step: float
-    shares: tuple[float, ...]
-
-    @property
-    def duration(self) -> float:
-        """Time of its last share [s]."""
-        return self.step * len(self.shares)
-
-    @property
-    def has_knots(self) -> bool:
-        """Whether it is more than a ramp."""
-        return len(self.shares) > 1
-
-
-def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first: bool) -> Piece:
-    """Return the piece of a course that is played from a time [s] after the start of its pulse on.
-
-    It begins anew until the pulse ends, at 0. knots: of an envelope, 0 for ramps; is_first: of its
-    layer.
-    """
-    if not knots:
-        step, count = PLAIN_STEP, 1
-    else:
-        least = _AMID if is_first and since > 0 else KNOT_STEP
-        count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
-        step = max(least, _SHORTEST / count)
-        left = min((pulse.duration - since) / step, count)
-        count = max(math.ceil(left - _ROUNDING), 2)
-    times = since + step * np.arange(1, count + 1)
-    shares = np.asarray(course.at(np.mod(times, course.duration)))
-    shares[times > pulse.duration - _ROUNDING] = 0.0
-    return Piece(step, tuple(shares.tolist()))
-
-
-MAX_SET_TIME, MAX_PIECE_TIME = 0.010, 0.020
-"""How long [s] a set may take on its wire, so that its onset does not delay a touch, and one that
-continues a course, for which a touch may have to wait."""
-
-_FREQUENCY, _LEVEL, _RAMP = (QUANTITIES[name] for name in ("frequency", "level", "ramp"))
+_FREQUENCY, _LEVEL, _PHASE = (QUANTITIES[name] for name in ("frequency", "level", "phase"))
+_RAMP, _STEP = QUANTITIES["ramp"], QUANTITIES["envelope_step"]
 _PHASE_STEP = QUANTITIES["phase_step"]
-_STEP = QUANTITIES["envelope_step"]
 _LAYER_WORDS, _COMMAND_WORDS, _ENVELOPE_WORDS, _KNOT_WORDS = 3, 4, 2, 2
 _PART_WORDS = 3  # of a message: session, token, part
+_DIGITS = 6  # of a step of the wire
+_ROUNDING = 1e-9  # s
+
+Drive = Mapping[str, AmplifierTone]
+"""Tones that play, by ERA; without silent ones."""
+
+PlateLayer = Mapping[str, AmplifierLayer]
+"""The contents of one layer on every amplifier, by name."""
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSupport:
-    """Knots of an onset and of an ending that every channel may have; 0: ramps."""
+    """Envelopes that every channel may have."""
 
     onset_knots: int
+    """Knots of an onset; 0: ramps."""
     ending_knots: int = 0
+    """Knots of an ending; 0: ramps."""
 
 
 RAMPS_ONLY = EnvelopeSupport(0)
-"""Support of ramps only."""
 
 
 @dataclass(frozen=True)
 class PlaybackCapabilities:
-    """Capabilities that all amplifiers of a rig share.
-
-    drive_mode: of the questions to the table; playable: the drive modes that every amplifier can
-    play; limits: of a drive; envelope_support: knots that every amplifier plays; ramp_max [s];
-    layers: contents at once; course_knots: of a piece of a course, 0: ramps.
-    """
+    """Capabilities that all amplifiers of a rig share."""
 
     drive_mode: str
+    """Of the questions to the table."""
     playable: tuple[str, ...]
+    """Drive modes that every amplifier can play."""
     limits: Limits
+    """Of a drive."""
     envelope_support: EnvelopeSupport
     ramp_max: float = math.inf
+    """Longest ramp [s]."""
     layers: int = 1
+    """How many contents can play at once."""
     course_knots: int = 0
+    """Knots of a piece of a course; 0: ramps."""
 
-    def left_by(self, layers: Sequence[Layer], table: LocalizationTable) -> Self:
-        """Return what layers leave of the limits, their peaks together."""
+    def left_by(self, layers: Sequence[answer.Layer], table: LocalizationTable) -> Self:
+        """Return the capabilities with what layers leave of the limits if their peaks coincide."""
         drives = [each for layer in layers for each in layer.drives]
         taken, strokes = amplitudes_of([each for each, _ in drives]), table.full_levels
         levels = [amplitude / strokes[name] for name, amplitude in taken.items()]
@@ -272,7 +145,7 @@ class PlaybackCapabilities:
 def playback_capabilities(
     rig: Rig, amplifiers: Mapping[str, Amplifier], *, drive_mode: str | None = None
 ) -> PlaybackCapabilities:
-    """Return what the open amplifiers of a rig, by name, can play.
+    """Return the capabilities of the open amplifiers of a rig, by name.
 
     drive_mode: None for the best that all can. Raises InputError for a drive mode that one cannot
     play, or a wired channel that its amplifier does not have.
@@ -311,7 +184,7 @@ def playback_capabilities(
 
 
 def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
-    """Return what the amplifiers of a rig, by name, allow as they were identified last."""
+    """Return the limits of the amplifiers of a rig, by name, as they were identified last."""
     limits = {name: one.ledger.limits for name, one in amplifiers.items()}
     levels = {name: _LEVEL.from_wire(one.level) for name, one in limits.items()}
     return Limits(
@@ -326,7 +199,7 @@ def limits_of(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> Limits:
 
 
 def envelope_support(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> EnvelopeSupport:
-    """Return what all open amplifiers, by name, play, and their wires carry within 10 ms."""
+    """Return the envelopes that all open amplifiers play and their wires carry within 10 ms."""
     knots, onset, ending = _knots(rig, amplifiers), ONSET_KNOTS - 1, ENDING_KNOTS - 1
     return EnvelopeSupport(min(knots, onset), ending if knots >= ending else 0)
 
@@ -336,11 +209,11 @@ def _knots(
     amplifiers: Mapping[str, Amplifier],
     *,
     within: float = MAX_SET_TIME,
-    step: float = BASE_MOTION_KNOT_STEP,
+    step: float = base_motion.KNOT_STEP,
 ) -> int:
-    """Return how many knots all open amplifiers play, and their wires carry within a time [s].
+    """Return how many knots all open amplifiers play and their wires carry within a time [s].
 
-    step [s]: the longest between two of them.
+    step: longest time [s] between two of them.
     """
     wired: dict[str, int] = defaultdict(int)
     for channel in rig.wiring.values():
@@ -360,17 +233,20 @@ def _knots(
 
 
 def _knots_of(amplifier: Amplifier, max_step: float) -> int:
-    """Return how many knots an envelope of an amplifier may have.
+    """Return how many knots an envelope of an amplifier may have; 0 without the steps needed.
 
-    In steps from that of the model to a longest one, max_step [s].
+    The steps needed range from that of the model to max_step [s].
     """
-    can = amplifier.ledger.capabilities
-    low, high = (_STEP.from_wire(can[f"envelope_step_{end}"]) for end in ("min", "max"))
-    return int(can["knots"]) if low <= BASE_MOTION_KNOT_STEP <= max_step <= high else 0
+    capabilities = amplifier.ledger.capabilities
+    low, high = (_STEP.from_wire(capabilities[f"envelope_step_{end}"]) for end in ("min", "max"))
+    return int(capabilities["knots"]) if low <= base_motion.KNOT_STEP <= max_step <= high else 0
 
 
 def _knots_on(line: Line, channels: list[int], within: float) -> int:
-    """Return the knots of each channel that a line carries in time, for its amplifiers' sets."""
+    """Return how many knots of each channel a line carries within a time [s].
+
+    channels: numbers of channels of its amplifiers, each of which gets a set.
+    """
     takes = line.wire.transit(MAX_WORDS)
     if takes <= 0:
         return int(QUANTITIES["knots"].maximum)
@@ -385,25 +261,145 @@ def _knots_in(words: int, channels: list[int]) -> int:
     return int((words - heads - sum(channels) * each) // (_KNOT_WORDS * sum(channels)))
 
 
-Drive = Mapping[str, AmplifierTone]
-"""What ERAs play, by name, without silent ones."""
+class CountedClocks:
+    """Clock errors of a rig's amplifiers as answers count them, so that promises hold.
 
-PlateLayer = Mapping[str, AmplifierLayer]
-"""What one layer plays on every amplifier, by name."""
+    now: returns the error of each amplifier by name, rms [s], infinite if it is unknown.
+    """
 
-BESIDE_CLICK = 0.100
-"""Fade-out [s] beside a short pulse, below which a shorter one would be felt with it."""
+    def __init__(self, rig: Rig, now: Callable[[], Mapping[str, float]]) -> None:
+        self._rig, self._now = rig, now
+        self._names = sorted(rig.channel_counts)
+        self._counted = EXACT_CLOCKS
+        self._losses = dict.fromkeys(self._names, 0)  # since it was last said to be held
+        self._held_since: dict[str, float] = {}  # not said yet
+        self.errors: dict[str, float] = {}
+        """Counted errors by name, rms [s]; empty where all ERAs are on one amplifier."""
 
-_ROUTING_STEP, _ROUTING_LEVEL, _PHASE = (
-    QUANTITIES[name] for name in ("envelope_step", "level", "phase")
-)
-_ROUTING_FREQUENCY = QUANTITIES["frequency"]
-_DIGITS = 6  # of a step of the wire
+    @property
+    def known(self) -> Mapping[str, float]:
+        """The present errors by name, rms [s]; empty where none are counted."""
+        return self._now() if self.errors else {}
+
+    def counted_by(
+        self, table: LocalizationTable, known: Mapping[str, float] | None = None
+    ) -> LocalizationTable:
+        """Return the table with the clocks as they are counted now; takes no time.
+
+        known: the present errors, if they were looked up.
+        """
+        if len(self._names) < 2:
+            return table
+        known = known or self._now()
+        if self._is_other(known):
+            before, errors = self.errors, {name: MARGIN * known[name] for name in self._names}
+            eras = [era.name for era in table.eras]
+            self._counted = ClockErrors.of(eras, self._rig.wiring, errors)
+            self.errors = errors
+            self._note(before)
+        for name in [*self._held_since]:  # mostly none
+            if threads.now() - self._held_since[name] >= SETTLED:
+                self._say_held(name)
+        return table.with_clocks(self._counted)
+
+    def is_one_lost(self, known: Mapping[str, float]) -> bool:
+        """Whether a clock is no longer held to those with which its amplifier shares contents.
+
+        known: the present errors.
+        """
+        for name, counted in self.errors.items():  # with each plan: no further calls
+            if known[name] > counted and MARGIN * known[name] > MAX_HELD >= counted:
+                return True
+        return False
+
+    def _is_other(self, known: Mapping[str, float]) -> bool:
+        """Whether a clock is worse than counted, or far better."""
+        for name, counted in self.errors.items():  # as often
+            if known[name] > counted or known[name] * MARGIN * _FAR_BETTER < counted:
+                return True
+        return not self.errors
+
+    def _note(self, before: Mapping[str, float]) -> None:
+        """Count losses; log once which amplifiers play contents of their own from now on.
+
+        That is no warning when a line has just been opened, since no clock is known then.
+        """
+        level = logging.WARNING if before else logging.INFO
+        for name, error in self.errors.items():
+            was_alone = before.get(name, 0.0) > MAX_HELD
+            if error <= MAX_HELD:
+                if was_alone:
+                    self._held_since[name] = threads.now()
+            elif not was_alone:
+                self._held_since.pop(name, None)
+                if not self._losses[name]:
+                    _logger.log(
+                        level,
+                        "amplifier %s: its clock is not held to the others', so its ERAs play "
+                        "contents of their own; if that lasts, see its clock_error in era amp "
+                        "status",
+                        name,
+                    )
+                self._losses[name] += 1
+
+    def _say_held(self, name: str) -> None:
+        """Log that an amplifier's clock has been held for long, and how often it was not."""
+        _logger.info(
+            "amplifier %s: clock held to %.0f us for %.0f s, its ERAs play with the others'; "
+            "losses before: %d",
+            name,
+            1e6 * self.errors[name],
+            SETTLED,
+            self._losses[name],
+        )
+        self._losses[name] = 0
+        del self._held_since[name]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a course: shares at equal steps [s], the first one a step after its start."""
+
+    step: float
+    shares: tuple[float, ...]
+
+    @property
+    def duration(self) -> float:
+        """Time of its last share [s]."""
+        return self.step * len(self.shares)
+
+    @property
+    def has_knots(self) -> bool:
+        """Whether it is more than a ramp."""
+        return len(self.shares) > 1
+
+
+def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first: bool) -> Piece:
+    """Return the piece of a course that is played from a time [s] after the start of its pulse on.
+
+    The course begins anew until the pulse ends, at 0. knots: most of an envelope, 0 for ramps;
+    is_first: whether the piece is the first of its layer.
+    """
+    if not knots:
+        step, count = PLAIN_STEP, 1
+    else:
+        least = _AMID if is_first and since > 0 else stimulus.KNOT_STEP
+        count = min(knots + 1, round((_FIRST if is_first else _NEXT) / least))
+        step = max(least, _SHORTEST / count)
+        left = min((pulse.duration - since) / step, count)
+        count = max(math.ceil(left - _ROUNDING), 2)
+    times = since + step * np.arange(1, count + 1)
+    shares = np.asarray(course.at(np.mod(times, course.duration)))
+    shares[times > pulse.duration - _ROUNDING] = 0.0
+    return Piece(step, tuple(shares.tolist()))
 
 
 @dataclass(frozen=True)
 class SetBuilder:
-    """Builds the sets of one rig; timing: shapes patterns; ramp_max [s]: of all amplifiers."""
+    """Builds the sets of one rig.
+
+    timing: shapes patterns; ramp_max: longest ramp [s] of all amplifiers.
+    """
 
     rig: Rig
     support: EnvelopeSupport
@@ -516,8 +512,8 @@ class SetBuilder:
     ) -> tuple[PlateLayer, answer.Layer]:
         """Build the set of a piece of a course in a layer; returns it and what is played.
 
-        It leads there from wherever its tones are, is_after: when the piece before has ended.
-        playing: as of a pattern; valid_for [s]: from its start on.
+        The piece starts from wherever its tones are. is_after: whether it waits for the end of the
+        piece before; playing: as of a pattern; valid_for [s]: from its start on.
         """
         tones, ramp = layer.excitation, min(FADE_RAMP, self.ramp_max)
         onset: dict[str, BaseEnvelope] | None = None
@@ -553,10 +549,10 @@ class SetBuilder:
     ) -> PlateLayer:
         """Build the set by which a layer falls along a ramp [s] to below any threshold, and ends.
 
-        Not to silence, on the way to which no later set could end it sooner, as under a finger that
-        lifts. playing: what each ERA plays now in this layer.
+        It does not fall to silence, since no later set could end that sooner, as where a finger
+        lifts. playing: tones in this layer now, by ERA.
         """
-        least = _ROUTING_LEVEL.from_wire(1)
+        least = _LEVEL.from_wire(1)
         faint = {
             name: replace(tone, amplitude=least * self.rig.full_levels[name])
             for name, tone in excitation.items()
@@ -595,8 +591,8 @@ def route(
 
     Every wired channel has a tone: level = amplitude / stroke, phase in degrees within half a turn,
     level 0 for an ERA that is not driven. ramp [s]: lengthened to the rig's slew limit, on all
-    amplifiers alike. playing: what each ERA plays now in this layer (`tones_by_era`); a frequency
-    keeps its phase unless it is among those restarted: by default what not all its ERAs play yet.
+    amplifiers alike. playing: tones in this layer now, by ERA (`tones_by_era`). restarted:
+    frequencies that do not keep their phase; by default those that not all their ERAs play yet.
     valid_for [s]: of the layers. onset, ending: by ERA; an onset may lead an ERA that is not driven
     to silence. All other limits belong to the ledgers of the amplifiers. Raises InputError for an
     ERA that the rig does not have.
@@ -644,45 +640,10 @@ def route(
     }
 
 
-def tones_by_era(
-    played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
-) -> dict[str, AmplifierTone]:
-    """Return what each ERA plays in the layer of a number, by name; without silent ones."""
-    playing = {
-        (amplifier, command.channel): command
-        for amplifier, layers in played.items()
-        for one in layers
-        for command in one.commands
-        if one.layer == number and command.level > 0
-    }
-    return {
-        name: AmplifierTone(
-            channel.number,
-            command.frequency / _ROUTING_FREQUENCY.per_unit,
-            command.level / _ROUTING_LEVEL.per_unit,
-            command.phase / _PHASE.per_unit,
-        )
-        for name, channel in rig.wiring.items()
-        if (command := playing.get((channel.amplifier, channel.number))) is not None
-    }
-
-
-def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, AmplifierTone]:
-    """Return what each ERA plays of an excitation at the share 1 of its course, by name."""
-    layers = route(excitation, rig, ramp=0.0)
-    return {
-        name: tone
-        for name, channel in rig.wiring.items()
-        for tone in layers[channel.amplifier].tones
-        if tone.channel == channel.number and name in excitation
-    }
-
-
 def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
-    """Return the frequencies [Hz] that restart at the commit, because an ERA joins them.
+    """Return the frequencies [Hz] that restart at the commit because an ERA joins them.
 
-    All ERAs of one frequency must count its phase from one moment, or their field differs. Without
-    any, all tones continue what ERAs play now.
+    All ERAs of one frequency must count its phase from one moment, or their field differs.
     """
     restarted = set()
     for name, tone in excitation.items():
@@ -692,17 +653,15 @@ def restarted_by(excitation: physics.Excitation, playing: Drive) -> set[float]:
 
 
 def thinned(envelopes: Envelopes, *, knots: int) -> Envelopes:
-    """Return envelopes by ERA with at most so many knots beside the last value.
+    """Return envelopes, by ERA, with a limited number of knots beside the last value.
 
-    Over the same time, in whole steps of the wire; all have as many knots and the same step.
+    They take the same time, in whole steps of the wire; all have the same step and number of knots.
     """
     first = next(iter(envelopes.values()))
     count, steps = len(first.knots), knots + 1
     if count <= steps:
         return envelopes
-    step = (
-        math.ceil(round(first.duration * _ROUTING_STEP.per_unit) / steps) / _ROUTING_STEP.per_unit
-    )
+    step = math.ceil(round(first.duration * _STEP.per_unit) / steps) / _STEP.per_unit
     at = np.minimum(step * np.arange(1, steps + 1), first.duration) / first.step
     since = np.minimum(at.astype(int), count - 1)
     values = np.array([(each.start, *each.knots) for each in envelopes.values()])
@@ -722,7 +681,7 @@ def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[di
             motions += one.knots[:-1]
             units += [strokes[name]] * (len(one.knots) - 1)
     each = np.array(motions, dtype=complex) / units
-    levels = np.rint(np.abs(each) * _ROUTING_LEVEL.per_unit).astype(int)
+    levels = np.rint(np.abs(each) * _LEVEL.per_unit).astype(int)
     phases = np.rint(np.degrees(np.angle(each)) * _PHASE.per_unit).astype(int)
     phases[phases > _PHASE.maximum] = _PHASE.minimum  # half a turn
     knots = zip(levels.tolist(), phases.tolist(), strict=True)
@@ -730,6 +689,40 @@ def on_wire(strokes: Mapping[str, float], *several: Envelopes | None) -> list[di
     for envelopes in several:
         found.append({})
         for name, one in envelopes.items() if envelopes else ():
-            step = math.ceil(round(one.step * _ROUTING_STEP.per_unit, _DIGITS))
+            step = math.ceil(round(one.step * _STEP.per_unit, _DIGITS))
             found[-1][name] = Envelope(step, tuple(islice(knots, len(one.knots) - 1)))
     return found
+
+
+def tones_by_era(
+    played: Mapping[str, Sequence[LayerSet]], rig: Rig, number: int = 0
+) -> dict[str, AmplifierTone]:
+    """Return the tones of a layer, by ERA; without silent ones."""
+    playing = {
+        (amplifier, command.channel): command
+        for amplifier, layers in played.items()
+        for one in layers
+        for command in one.commands
+        if one.layer == number and command.level > 0
+    }
+    return {
+        name: AmplifierTone(
+            channel.number,
+            command.frequency / _FREQUENCY.per_unit,
+            command.level / _LEVEL.per_unit,
+            command.phase / _PHASE.per_unit,
+        )
+        for name, channel in rig.wiring.items()
+        if (command := playing.get((channel.amplifier, channel.number))) is not None
+    }
+
+
+def full_drive(excitation: physics.Excitation, rig: Rig) -> dict[str, AmplifierTone]:
+    """Return the tones of an excitation at the share 1 of its course, by ERA."""
+    layers = route(excitation, rig, ramp=0.0)
+    return {
+        name: tone
+        for name, channel in rig.wiring.items()
+        for tone in layers[channel.amplifier].tones
+        if tone.channel == channel.number and name in excitation
+    }

@@ -10,6 +10,7 @@ on. It is over before an answer for all would help, and never changed. What last
 beside a pulse that plays has what that leaves, until it has ended.
 """
 
+import asyncio
 import logging
 import math
 from collections import Counter, defaultdict
@@ -21,10 +22,7 @@ from operator import itemgetter
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
 from controller.play.joint_answers import (
     LIMITS_LEAVE_NOTHING,
-    MAX_LATE,
     STRETCH,
-    TIME_LIMIT,
-    AnswerThread,
     Crossfades,
     Shape,
     answered,
@@ -50,6 +48,7 @@ from model.drive_modes import UNRESTRICTED
 from model.errors import InputError
 from model.table.table import SAME_FREQUENCY, LocalizationTable
 from registry.plugins import failure_text
+from registry.threads import DaemonThreads
 
 _NOTHING = Selection((), ())
 _USED_UP = "the contents of other fingers use the whole stroke; lift a finger"
@@ -315,6 +314,12 @@ def silent(intended: Intention, targets: Targets, reason: str) -> Selection:
     return Selection(targets, quiet, (), reason, skipped, protected=intended.protected)
 
 
+TIME_LIMIT = 1.0
+"""Time [s] after which a choice is given up; it takes some tens of milliseconds."""
+
+MAX_LATE = 2
+"""Choices that may still be computed after they were given up; until one ends none is begun."""
+
 # Bending wavelengths are 17 cm and more below 500 Hz; a fingertip that has moved by about its own
 # radius is still within the disc that the pattern was chosen for. One that moves is answered for
 # this way ahead.
@@ -398,6 +403,59 @@ def _of_any_course(targets: Targets) -> set[Target]:
     }
 
 
+class AnswerThread:
+    """Makes one choice at a time in a thread, since some take longer than the control loop may.
+
+    A choice that hangs cannot be ended, only given up: its thread holds up neither the next choice
+    nor the end of the process, and what it returns at last is dropped. arrived: called in the loop
+    when there is something to `take`; freed: called before that when a choice that was given up has
+    ended.
+    """
+
+    def __init__(self, arrived: Callable[[], None], freed: Callable[[], None]) -> None:
+        self._arrived, self._freed = arrived, freed
+        self._threads = DaemonThreads()
+        self.is_busy = False
+        """Whether an answer is computed, or not taken yet: one at a time is asked of the table."""
+        self._answer: asyncio.Future[Choice] | None = None
+        self._late = set[asyncio.Future[Choice]]()  # given up, and still computed
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether too many answers that were given up are still computed."""
+        return len(self._late) >= MAX_LATE
+
+    def compute(self, question: Callable[[], Choice], *, instead: Choice) -> None:
+        """Compute in a thread, if neither busy nor blocked; instead: taken if that is late."""
+        loop = asyncio.get_running_loop()
+        self._answer, self.is_busy = loop.run_in_executor(self._threads, question), True
+        self._answer.add_done_callback(self._note)
+        loop.call_later(TIME_LIMIT, self._give_up, self._answer, instead)
+
+    def take(self) -> Choice | None:
+        """Return the answer that was not taken yet; None without any; raises its error."""
+        answer = self._answer
+        if answer is None or not answer.done():
+            return None
+        self._answer, self.is_busy = None, False
+        return None if answer.cancelled() else answer.result()
+
+    def _give_up(self, answer: "asyncio.Future[Choice]", instead: Choice) -> None:
+        if not answer.done():
+            _logger.warning("loop: answer given up, still computed after %g s", TIME_LIMIT)
+            self._late.add(answer)
+            self._answer = asyncio.get_running_loop().create_future()
+            self._answer.set_result(instead)
+            self._arrived()
+
+    def _note(self, answer: "asyncio.Future[Choice]") -> None:
+        if answer in self._late:
+            self._late.remove(answer)
+            answer.exception()  # of no interest any more
+            self._freed()
+        self._arrived()
+
+
 class Selector:
     """Chooses the contents of a table that realise an intent for the contacts on its plate.
 
@@ -422,7 +480,7 @@ class Selector:
         may_lead: Callable[[Sequence[Content], float], bool] = lambda contents, now: True,
     ) -> None:
         self.chooser, self._may_lead = chooser, may_lead
-        self._thread: AnswerThread[Choice] = AnswerThread(arrived, self._request_again)
+        self._thread = AnswerThread(arrived, self._request_again)
         self._lasting = _NOTHING  # as it was chosen, for fingers that have left it, too
         self._short: dict[ContactKey, Selection] = {}
         self._fingers: dict[ContactKey, float] = {}  # of what lasts, down since [s]

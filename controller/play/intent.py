@@ -1,6 +1,6 @@
 """Haptic intent: which contacts shall feel something, how strongly, and until when.
 
-The interface between the meaning of touches and their playback. All other contacts are kept quiet.
+Intents are the interface between effects and playback. All other contacts are kept quiet.
 """
 
 import math
@@ -21,7 +21,7 @@ _MIN_WAIT = 0.001  # s
 _MAX_DELAY = 0.1
 
 FADED_AFTER = 0.05
-"""After the end of a pulse, or of a layer, by so long [s] none of it is left on any amplifier."""
+"""Time [s] after the end of a pulse or layer when none of it is left on any amplifier."""
 
 MAX_DB_SL = 26.0
 """Upper bound of `as strongly as the neighbours allow`: twice a strong vibration."""
@@ -32,29 +32,33 @@ Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]; equal ones stand for the nearest that a table has."""
 
 Gains = Mapping[tuple[ContactKey, bool], float]
-"""Strengths [dB], 0 at most, of what is felt by a contact, and whether that is a short pulse."""
+"""Strengths [dB], 0 at most, by contact, and by whether a short pulse or what lasts is meant."""
 
 CLICK = -1
-"""Voice of a short pulse, which plays beside what lasts at its finger: that begins with 0."""
+"""Voice of a short pulse; those of what lasts at the same finger begin with 0."""
 
 _TOLERANCE = 0.05  # of a frequency; less than anyone tells apart
 
 
 @dataclass(slots=True, unsafe_hash=True)
 class Pulse:
-    """A vibration of limited duration [s], requested at a time [s]; a later one is another.
+    """A vibration of limited duration; pulses requested at different times differ.
 
-    Its duration counts from started_at [s], when the amplifiers have been sent its commit. Without
-    that it ends 0.1 s after it is due, or after its duration where that is more; it is due at
-    requested_at, or at due_at [s] where it waits its turn. is_raised: whether the drive is raised
-    so that the level is felt over the duration, onset included; else the level is the steady one.
+    A pulse that is not started ends 0.1 s after it is due, or after its duration where that is
+    more.
     """
 
     duration: float
+    """[s], from its start."""
     requested_at: float
+    """[s]"""
     is_raised: bool = True
+    """Whether the drive is raised so that the level is felt over the duration, onset included; else
+    the level is the steady one."""
     due_at: float = field(default=-math.inf, init=False, compare=False)
+    """When [s] it is due, where it waits its turn; else it is due when it is requested."""
     started_at: float | None = field(default=None, init=False, compare=False)
+    """When [s] the amplifiers were sent its commit; None before."""
 
     @property
     def start(self) -> float:
@@ -78,38 +82,38 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A contact that shall feel something of its own.
-
-    level_db_sl: how strongly, where the plate can; None for as strongly as the neighbours allow.
-    pulse: None without an end of its own. priority: lower ones give way first. content: a name;
-    fingers of one name may share one vibration where the plate cannot give each its own. None: of
-    this one alone. is_own: whether it feels its own content or none; may_share: whether it may also
-    feel that of any finger that may share. modulation_hz: how often a second the strength of what
-    lasts comes and goes. above_db: by how much at least a short pulse is above what lasts at its
-    finger; None as strong as its level says. course: along which it is felt from the start of its
-    pulse on, None for steadily; it begins anew until the pulse ends.
-    """
+    """A contact that shall feel something of its own."""
 
     key: ContactKey
     level_db_sl: float | None = STRONG_DB_SL
+    """Level where the plate allows it; None for as strong as the neighbours allow."""
     pulse: Pulse | None = None
+    """None without an end of its own."""
     band: Band | None = None
     priority: int = 0
+    """Targets of lower priority give way first."""
     content: str | None = None
+    """Name of the content. Fingers of one name may share a vibration where the plate cannot give
+    each its own; without a name the content is this finger's alone."""
     is_own: bool = False
+    """Whether it feels its own content or none."""
     may_share: bool = False
+    """Whether it may also feel the content of any other finger that may share."""
     modulation_hz: float | None = None
+    """Frequency [Hz] at which the strength of what lasts comes and goes."""
     above_db: float | None = None
+    """Least level [dB] of a short pulse above what lasts at its finger; None for its own level."""
     course: Course | None = field(default=None, hash=False, repr=False)  # of thousands of points
+    """Course from the start of the pulse on, again and again until that ends; None if steady."""
 
     @property
     def voice(self) -> int:
-        """The first of its voices, by which layers tell the contents of one finger apart."""
+        """Its first voice; voices tell the contents of one finger apart."""
         return CLICK if self.is_short else 0
 
     @property
     def shared_as(self) -> str | bool | None:
-        """Equal for contacts that may feel one vibration that lasts; None for its own alone."""
+        """A value that targets have in common if they may share a vibration; None if it may not."""
         if self.is_short or self.is_own or self.course:
             return None
         return self.may_share or self.content
@@ -122,20 +126,19 @@ class Target:
 
 @dataclass(frozen=True)
 class HapticIntent:
-    """Targets and their levels at one moment.
-
-    targets: of each contact one that lasts, a short pulse, or both at once; those that are not on
-    the plate are ignored. reason: why there are
-    none. until: when [s] the intent may change though no contact has. protected: contacts that must
-    not notice the contents of others. gains_db: by which what is chosen for targets is played
-    weaker.
-    """
+    """Targets and their levels at one moment."""
 
     targets: tuple[Target, ...]
+    """For each contact one that lasts, a short pulse, or both; contacts that are not on the plate
+    are ignored."""
     reason: str = "no target"
+    """Why there are no targets."""
     until: float = math.inf
+    """When [s] the intent may change though no contact does."""
     protected: frozenset[ContactKey] = frozenset()
+    """Contacts that must not notice the contents of others."""
     gains_db: Gains = field(default_factory=dict)
+    """Strengths with which the contents of targets are played."""
 
     def due(self, now: float) -> float:
         """Return when [s] to query again, at least a millisecond from now; infinite for never."""
@@ -143,12 +146,12 @@ class HapticIntent:
 
 
 class IntentSource(Protocol):
-    """Where intents come from; queried when contacts change and when an intent expires."""
+    """A source of intents, queried when contacts change and when an intent expires."""
 
     def intent(self, contacts: Sequence[Contact], now: float) -> HapticIntent:
-        """Return the intent for contacts in their order of arrival, at a time [s], at once.
+        """Return the intent for contacts in their order of arrival, at a time [s]; must not wait.
 
-        While it raises, all channels are silent.
+        All channels are silent while it raises.
         """
 
 
@@ -163,7 +166,7 @@ def band_of_table(band: Band, frequencies: FloatArray) -> Band:
 
 
 def band_problem(band: Band, frequencies: FloatArray) -> str | None:
-    """Return what a table with these frequencies [Hz] plays instead of a band that it lacks."""
+    """Return a warning if a table of frequencies [Hz] has none in or near a band."""
     low, high = band
     nearest = band_of_table(band, frequencies)[0]
     if low * (1 - _TOLERANCE) <= nearest <= high * (1 + _TOLERANCE):

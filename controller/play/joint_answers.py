@@ -1,27 +1,19 @@
-"""Where moving fingers are going to be, so that answers are made, and promised, for their next way.
-
-An answer to a place is best as it is asked, and the finger is elsewhere when it plays. One that
-moves is answered for the next 8 mm of its way, at three places at once, its own content and as
-quiet for all others: from where it is once the weights have half changed, to where they do again.
-Weights that change have side bands, which a steady promise does not count: a margin does.
-
-Threads for answers that take longer than the control loop may.
-
-An answer that hangs cannot be ended, only left behind: its thread holds up neither the next answer
-nor the end of the process, and what it returns at last is dropped.
-
-Contents of fingers from one answer of the table, a layer for each.
+"""Joint answers: from targets to contents by one answer of the table, and ways to better answers.
 
 A frequency that a finger feels is content: it is kept, and its phase at that finger, unless another
-one serves more fingers. What promises more is led over to once all rest (`crossfades`).
+one serves more fingers.
 
-The way from what plays to a better answer, once all fingers rest: one content at a time.
+Moving fingers are answered for the next 8 mm of their way, at three places at once, with their own
+content and as quiet for all others: from where a finger is once the weights have half changed, to
+where they do again. Weights that change have side bands, which a steady promise does not count: a
+margin does.
 
-What fingers feel depends on who came first, since a frequency that is felt is kept. The answer with
-none kept is led to along cross-fades, a content after the other, so that others feel little of it;
-where only weights change, as after a finger has left, along the same ramp within the layer. Each
-step keeps 30 Hz between all that sounds at once, the old tone included; where no order of the
-contents does, what plays is left. Between the steps the promise is that of what plays then.
+What fingers feel depends on the order of their arrival, since frequencies are kept. Once all rest,
+the answer with none kept is led to along cross-fades (`Crossfades`), one content after the other,
+so that others feel little of it; where only weights change, as after a finger has left, along the
+same ramp within the layer. Each step keeps 30 Hz between all that sounds at once, the old tone
+included; where no order of the contents does, what plays is left. Between the steps the promise is
+that of what plays then.
 """
 
 import cmath
@@ -64,104 +56,23 @@ from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes
 
 STRETCH = 0.008
-"""Way [m] that a moving finger is answered for: until it has gone that far it is not asked anew."""
+"""Way [m] that a moving finger is answered for; once it has gone that far it is asked anew."""
 
 MARGIN_DB = 2.0
-"""By how much less is promised while a finger moves, to it and beside it, than if it rested."""
+"""Reduction [dB] of promises to a moving finger, and beside one, from those at rest."""
 
-_ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
+WORTH = 2.0
+"""How much more [dB] the worst finger must be promised for other frequencies."""
 
+WORTH_OF_WEIGHTS = 0.5
+"""How much more [dB] it must be promised for other weights alone."""
 
-def with_ways(
-    fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
-) -> list[Finger]:
-    """Return fingers of contacts with those that move where they are going to be.
+LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
 
-    At a time [s]. Behind all of them come the two ends of the way of each, as fingers of the same
-    stimulus that share its load. Fingers that may share with others, whose strength comes and goes,
-    or that come too near another are only moved.
-    """
-    found, ends = [*fingers], list[Finger]()
-    for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
-        vx, vy = contact.motion.velocity(now)
-        if not (speed := math.hypot(vx, vy)):
-            continue
-        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
-        way = [
-            _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
-            for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)
-        ]
-        others = [each for each in (*found, *ends) if each is not finger]
-        if any(math.dist(at, each.at) < FINGERTIP_RADIUS for at in way for each in others):
-            continue
-        found[number] = replace(finger, at=way[1])
-        is_one = len({*way}) == len(way) and len(found) + len(ends) + 2 <= MAX_CONTACTS
-        if is_one and _is_steady_and_alone(finger, others):
-            name = finger.name or f"finger {number}"
-            stimulus = finger.stimulus and replace(finger.stimulus, name=name)
-            one = replace(finger, stimulus=stimulus, load=MIN_LOAD, sharing=MUST)
-            ends += [replace(one, at=at) for at in (way[0], way[2])]
-            found[number] = replace(one, at=way[1], load=finger.load - 2 * MIN_LOAD)
-    return [*found, *ends]
-
-
-def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
-    """Return what the first fingers of an answer get on their ways, the rest being these.
-
-    Of weights that change for a way those who rest feel side bands, too.
-    """
-    if len(found.fingers) == count:
-        return [*found.fingers]
-    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
-
-
-def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
-    """Return what they feel of others there at most, by set of thresholds [dB SL]."""
-    levels = found.tones.foreign_db_sl
-    heard = np.where(np.isnan(levels), -math.inf, levels)
-    if len(heard) == count:
-        return heard.tolist()  # type: ignore[no-any-return]
-    return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]
-
-
-def _ways(found: Answer, count: int) -> list[list[int]]:
-    """The numbers of the fingers that stand for each of the first, itself before its ends."""
-    ways, places = [[number] for number in range(count)], [each.at for each in found.asked]
-    for end in range(count, len(places)):
-        near = [math.dist(at, places[end]) for at in places[:count]]
-        ways[near.index(min(near))].append(end)
-    return ways
-
-
-def _on_plate(at: Point, plate: Plate) -> Point:
-    x, y = at
-    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
-
-
-def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
-    """Whether a finger feels nothing, or what is steady and no other finger may feel."""
-    if finger.stimulus is None:
-        return True
-    may_share = any(finger.may_feel_one_with(each) for each in others)
-    return finger.stimulus.modulation_hz is None and not may_share
-
-
-def _on_way(places: Sequence[Sensation]) -> Sensation:
-    """What a finger gets at least on its way, of several places, while it moves."""
-    first = places[0]
-    if first.verdict == HELD_BACK:
-        return first
-    least = dict[str, Any]()
-    for name, (sign, margin) in _WORST.items():
-        values = [each for one in places if (each := getattr(one, name)) is not None]
-        if values:
-            least[name] = sign * min(sign * each for each in values) - sign * margin
-    found: Sensation = replace(first, **least)
-    if found.verdict not in (OWN, MIXED):
-        return found
-    judged = found.promised_contrast_db, found.foreign_level_db_sl
-    return replace(found, verdict=verdict_of(*judged, pauses=found.pauses))
-
+NEIGHBOURS_LEAVE_NOTHING = (
+    "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
+    "not; lift or move that finger away"
+)
 
 _WORST = {
     "level_db_sl": (1, 0.0),
@@ -171,20 +82,18 @@ _WORST = {
     "promised_contrast_db": (1, MARGIN_DB),
     "foreign_level_db_sl": (-1, MARGIN_DB),
 }
-"""Figures of a sensation: whether less of it is worse or more (-1), and the margin on it [dB]."""
+"""Figures of a sensation: 1 where less is worse and -1 where more is, and the margin [dB]."""
 
-
+_ANSWER_TIME = 0.020  # s; until what is asked now has begun to play
 _SHORT_OF = 1.0  # dB; by which what keeps its frequency may be weaker than asked
 _SIDE_BANDS = 2
-
-LIMITS_LEAVE_NOTHING = "the limits of the amplifiers allow nothing that is felt; raise them"
-NEIGHBOURS_LEAVE_NOTHING = (
-    "a quiet finger must stay at -10 dB SL, but at every level that reaches the target it does "
-    "not; lift or move that finger away"
-)
+_SAME = 0.01  # of the largest amplitude of two drives: a difference that is not felt
 
 Shape = Callable[[Placement, Layer, bool], Layer]
-"""Adds the envelopes of a layer; whether it continues what plays in it, without an onset."""
+"""Adds the envelopes of a layer; without an onset where the last argument is true."""
+
+_Voices = Mapping[ContactKey, tuple[Content, ...]]
+"""A content and its side bands, by the finger whose content it is."""
 
 
 def answered(
@@ -199,11 +108,12 @@ def answered(
     now: float = math.inf,
     avoided_hz: Sequence[float] = (),
 ) -> Answer:
-    """Answer the fingers of targets and of quiet contacts, those that move on their ways.
+    """Answer the fingers of targets and of quiet contacts, moving ones on their ways.
 
-    before: what fingers feel now, whose frequencies are kept, if any are, unless others serve more
-    fingers, or more strongly; now [s]: infinite where all rest; avoided_hz: frequencies that
-    play beside it. Raises InputError for fingers that are too close.
+    before: contents that play, by finger and voice; keeps: whether their frequencies are kept,
+    unless others serve more fingers, or more strongly. now [s]: infinite where all rest;
+    avoided_hz: frequencies that play beside the answer. Raises InputError for fingers that are too
+    close.
     """
     is_shaped = capabilities.envelope_support.onset_knots > 0
     fingers = fingers_of(table, targets, quiet, capabilities, protected)
@@ -233,6 +143,111 @@ def answered(
     return other if (len(other.layers), is_better) > (served, False) else found
 
 
+def fingers_of(
+    table: LocalizationTable,
+    targets: Sequence[tuple[Contact, Target]],
+    quiet: Sequence[Contact],
+    capabilities: PlaybackCapabilities,
+    protected: frozenset[ContactKey] = frozenset(),
+) -> list[Finger]:
+    """Return the fingers of targets, then the quiet ones.
+
+    protected: contacts that must not notice the vibrations of others. A duration is asked for only
+    with a single target, and with pulses that end before an onset would have settled.
+    """
+    found = []
+    for contact, target in targets:
+        is_over = target.course is None and (len(targets) == 1 or target.is_short)
+        duration = None
+        if is_over and target.pulse is not None and target.pulse.is_raised:
+            duration = target.pulse.duration
+        stimulus = Stimulus(
+            MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
+            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
+            duration,
+            None if duration is not None else target.modulation_hz,
+            is_limit=target.level_db_sl is None,
+            name=target.content,
+            course=target.course,
+        )
+        never = target.is_own or target.course is not None  # each has begun at its own time
+        sharing = NEVER if never else ANY if target.may_share else BY_NAME
+        found.append(
+            Finger(
+                (contact.x, contact.y),
+                stimulus,
+                contact.load,
+                target.priority,
+                sharing,
+                min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
+                max_foreign_db_sl=IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf,
+            )
+        )
+    for contact in quiet:
+        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
+        found.append(Finger((contact.x, contact.y), load=contact.load, max_foreign_db_sl=bound))
+    return found
+
+
+def playable_band(
+    band: tuple[float, float] | None, frequencies: FloatArray, playable: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the lowest and highest frequency [Hz] of a band that can be played.
+
+    A band that shares no frequency of a table with what is playable is ignored.
+    """
+    low, high = playable
+    if band is not None:
+        of_table = band_of_table(band, frequencies)
+        together = max(low, of_table[0]), min(high, of_table[1])
+        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
+            low, high = together
+    return low, high
+
+
+def _as_layers_allow(
+    fingers: Sequence[Finger], targets: int, capabilities: PlaybackCapabilities
+) -> list[Finger]:
+    """Return fingers, those of low priority steady where no layers are left for side bands.
+
+    One layer is left free for a click.
+    """
+    found, spare = [*fingers], capabilities.layers - targets - 1
+    for number in sorted(range(targets), key=lambda each: -found[each].priority):
+        stimulus = found[number].stimulus
+        if stimulus is not None and stimulus.modulation_hz is not None:
+            if spare >= _SIDE_BANDS:
+                spare -= _SIDE_BANDS
+            else:
+                steady = replace(stimulus, modulation_hz=None)
+                found[number] = replace(found[number], stimulus=steady)
+    return found
+
+
+def _kept(
+    fingers: Sequence[Finger],
+    targets: Sequence[tuple[Contact, Target]],
+    before: Mapping[tuple[ContactKey, int], Content],
+) -> list[Finger]:
+    """Return fingers tuned to the frequencies that they feel now, where their bands allow it."""
+    kept = [*fingers]
+    for number, (contact, target) in enumerate(targets):
+        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
+        frequency = None if then is None else then.frequency
+        if stimulus is None or frequency is None:
+            continue
+        low, high = stimulus.band_hz
+        if low <= frequency <= high:
+            tuned = replace(stimulus, band_hz=(frequency, frequency))
+            kept[number] = replace(fingers[number], stimulus=tuned)
+    return kept
+
+
+def _lowered_db(found: Answer) -> float:
+    """Return by how many dB the weakest finger is weaker than asked."""
+    return max([each.lowered_db for each in found.fingers], default=0.0)
+
+
 def selection_of(
     table: LocalizationTable,
     found: Answer,
@@ -246,7 +261,8 @@ def selection_of(
 ) -> Selection:
     """Return the contents of an answer to the fingers of targets and quiet contacts.
 
-    before: what fingers feel now, whose phases are kept if is_in_phase.
+    before: contents that play, by finger and voice; their phases are kept if is_in_phase. shape:
+    adds envelopes; protected: contacts that must not notice the contents of others.
     """
     count = len(targets) + len(quiet)
     sensed = felt_on_ways(found, count)
@@ -307,120 +323,8 @@ def selection_of(
     )
 
 
-def fingers_of(
-    table: LocalizationTable,
-    targets: Sequence[tuple[Contact, Target]],
-    quiet: Sequence[Contact],
-    capabilities: PlaybackCapabilities,
-    protected: frozenset[ContactKey] = frozenset(),
-) -> list[Finger]:
-    """Return the fingers of targets, then the quiet ones.
-
-    protected: contacts that must not notice the vibrations of others. The duration counts of a
-    single target, and of what ends before an onset would have settled.
-    """
-    found = []
-    for contact, target in targets:
-        is_over = target.course is None and (len(targets) == 1 or target.is_short)
-        duration = None
-        if is_over and target.pulse is not None and target.pulse.is_raised:
-            duration = target.pulse.duration
-        stimulus = Stimulus(
-            MAX_DB_SL if target.level_db_sl is None else target.level_db_sl,
-            playable_band(target.band, table.frequencies, capabilities.limits.frequencies),
-            duration,
-            None if duration is not None else target.modulation_hz,
-            is_limit=target.level_db_sl is None,
-            name=target.content,
-            course=target.course,
-        )
-        never = target.is_own or target.course is not None  # each has begun at its own time
-        sharing = NEVER if never else ANY if target.may_share else BY_NAME
-        found.append(
-            Finger(
-                (contact.x, contact.y),
-                stimulus,
-                contact.load,
-                target.priority,
-                sharing,
-                min_contrast_db=OWN_CONTRAST_DB if target.is_own else -math.inf,
-                max_foreign_db_sl=IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf,
-            )
-        )
-    for contact in quiet:
-        bound = IMPERCEPTIBLE_DB_SL if contact.key in protected else math.inf
-        found.append(Finger((contact.x, contact.y), load=contact.load, max_foreign_db_sl=bound))
-    return found
-
-
-def playable_band(
-    band: tuple[float, float] | None, frequencies: FloatArray, playable: tuple[float, float]
-) -> tuple[float, float]:
-    """Return the lowest and highest frequency [Hz] of a band that can be played.
-
-    A band that shares no frequency of a table with what is playable is ignored.
-    """
-    low, high = playable
-    if band is not None:
-        of_table = band_of_table(band, frequencies)
-        together = max(low, of_table[0]), min(high, of_table[1])
-        if ((frequencies >= together[0]) & (frequencies <= together[1])).any():
-            low, high = together
-    return low, high
-
-
-def _as_layers_allow(
-    fingers: Sequence[Finger], targets: int, capabilities: PlaybackCapabilities
-) -> list[Finger]:
-    """The fingers, steady where there are no layers for side bands, of low priority first.
-
-    A layer is left to a click.
-    """
-    found, spare = [*fingers], capabilities.layers - targets - 1
-    for number in sorted(range(targets), key=lambda each: -found[each].priority):
-        stimulus = found[number].stimulus
-        if stimulus is not None and stimulus.modulation_hz is not None:
-            if spare >= _SIDE_BANDS:
-                spare -= _SIDE_BANDS
-            else:
-                steady = replace(stimulus, modulation_hz=None)
-                found[number] = replace(found[number], stimulus=steady)
-    return found
-
-
-def _kept(
-    fingers: Sequence[Finger],
-    targets: Sequence[tuple[Contact, Target]],
-    before: Mapping[tuple[ContactKey, int], Content],
-) -> list[Finger]:
-    """The fingers with the frequencies that they feel now, where their bands allow it."""
-    kept = [*fingers]
-    for number, (contact, target) in enumerate(targets):
-        then, stimulus = before.get((contact.key, target.voice)), fingers[number].stimulus
-        frequency = None if then is None else then.frequency
-        if stimulus is None or frequency is None:
-            continue
-        low, high = stimulus.band_hz
-        if low <= frequency <= high:
-            tuned = replace(stimulus, band_hz=(frequency, frequency))
-            kept[number] = replace(fingers[number], stimulus=tuned)
-    return kept
-
-
-def _lowered_db(found: Answer) -> float:
-    """By how much the weakest finger is weaker than asked."""
-    return max([each.lowered_db for each in found.fingers], default=0.0)
-
-
-def felt_db_sl(felt: Sensation) -> float:
-    """Return the level of a finger: promised of what lasts, over its duration as modelled."""
-    stimulus = felt.finger.stimulus
-    lasts = stimulus is None or stimulus.duration is None
-    return felt.promised_level_db_sl if lasts else felt.level_db_sl
-
-
 def _why_unfelt(felt: Sensation) -> str | None:
-    """Return why a finger would not feel what is played for it; None if it does."""
+    """Return why a finger would not feel its own layer; None if it does."""
     stimulus = felt.finger.stimulus
     if felt.layer is None or stimulus is None:
         return None
@@ -429,12 +333,19 @@ def _why_unfelt(felt: Sensation) -> str | None:
     return LIMITS_LEAVE_NOTHING if felt_db_sl(felt) < 0 <= stimulus.level_db_sl else None
 
 
+def felt_db_sl(felt: Sensation) -> float:
+    """Return the level [dB SL] of a finger: promised if it lasts, else nominal over its time."""
+    stimulus = felt.finger.stimulus
+    lasts = stimulus is None or stimulus.duration is None
+    return felt.promised_level_db_sl if lasts else felt.level_db_sl
+
+
 def _predictions(
     targets: Sequence[tuple[Contact, Target]],
     sensations: Sequence[Sensation],
     layer: Layer,
 ) -> tuple[Prediction, ...]:
-    """What is predicted of a layer's finger, and of those that share it."""
+    """Return the predictions for a layer's finger, and for those that share it."""
     first, own = targets[0]
     shares = (
         f"shares the vibration of finger {first.key.source} {first.key.id}; lift one, or move them "
@@ -461,7 +372,7 @@ def _predictions(
 
 
 def _held_back(contact: Contact, felt: Sensation) -> Prediction:
-    """What is said of a finger whose vibration is held back, and by how much."""
+    """Return the prediction for a finger whose vibration is held back, with the reason."""
     had = felt.promised_contrast_db
     least = max(MIN_CONTRAST_DB, felt.finger.min_contrast_db)
     if felt.is_disturbing:
@@ -513,7 +424,7 @@ def _in_phase(
 def _felt(
     excitation: Excitation, fields: Complex64Array, table: LocalizationTable
 ) -> dict[float, complex]:
-    """Complex acceleration at a finger, by frequency [Hz]."""
+    """Return the complex acceleration at a finger, by frequency [Hz]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = table.rows_of(frequencies)
     weights = bases / table.highest_drives[rows]
@@ -521,21 +432,103 @@ def _felt(
     return dict(zip(frequencies.tolist(), felt.tolist(), strict=True))
 
 
-WORTH, WORTH_OF_WEIGHTS = 2.0, 0.5
-"""How much more [dB] the worst finger must be promised for other frequencies, or weights alone."""
+def with_ways(
+    fingers: Sequence[Finger], contacts: Sequence[Contact], now: float, plate: Plate
+) -> list[Finger]:
+    """Return the fingers of contacts at a time [s], moving ones at the middle of their ways.
 
-_SAME = 0.01  # of the largest amplitude of two drives: a difference that is not felt
+    The two ends of each way follow all of them, as fingers of the same stimulus that share its
+    load. Fingers that may share with others, whose strength comes and goes, or that come too near
+    another are only moved.
+    """
+    found, ends = [*fingers], list[Finger]()
+    for number, (finger, contact) in enumerate(zip(fingers, contacts, strict=True)):
+        vx, vy = contact.motion.velocity(now)
+        if not (speed := math.hypot(vx, vy)):
+            continue
+        since = now - contact.motion.places[-1][0] + _ANSWER_TIME + ONSET_RAMP / 2
+        way = [
+            _on_plate((contact.x + vx * each, contact.y + vy * each), plate)
+            for each in (since, since + STRETCH / 2 / speed, since + STRETCH / speed)
+        ]
+        others = [each for each in (*found, *ends) if each is not finger]
+        if any(math.dist(at, each.at) < FINGERTIP_RADIUS for at in way for each in others):
+            continue
+        found[number] = replace(finger, at=way[1])
+        is_one = len({*way}) == len(way) and len(found) + len(ends) + 2 <= MAX_CONTACTS
+        if is_one and _is_steady_and_alone(finger, others):
+            name = finger.name or f"finger {number}"
+            stimulus = finger.stimulus and replace(finger.stimulus, name=name)
+            one = replace(finger, stimulus=stimulus, load=MIN_LOAD, sharing=MUST)
+            ends += [replace(one, at=at) for at in (way[0], way[2])]
+            found[number] = replace(one, at=way[1], load=finger.load - 2 * MIN_LOAD)
+    return [*found, *ends]
 
-_Voices = Mapping[ContactKey, tuple[Content, ...]]
-"""What fingers feel: a content, and its side bands, by the finger whose content it is."""
+
+def _on_plate(at: Point, plate: Plate) -> Point:
+    x, y = at
+    return min(max(x, 0.0), plate.length), min(max(y, 0.0), plate.width)
+
+
+def _is_steady_and_alone(finger: Finger, others: Sequence[Finger]) -> bool:
+    """Whether a finger feels nothing, or a steady content that no other finger may share."""
+    if finger.stimulus is None:
+        return True
+    may_share = any(finger.may_feel_one_with(each) for each in others)
+    return finger.stimulus.modulation_hz is None and not may_share
+
+
+def felt_on_ways(found: Answer, count: int) -> list[Sensation]:
+    """Return the sensations of the first fingers of an answer; the others are ends of their ways.
+
+    Where weights change for a way, resting fingers feel side bands, too.
+    """
+    if len(found.fingers) == count:
+        return [*found.fingers]
+    return [_on_way([found.fingers[each] for each in way]) for way in _ways(found, count)]
+
+
+def foreign_on_ways(found: Answer, count: int) -> list[list[float]]:
+    """Return the highest foreign levels [dB SL] of these fingers, by set of thresholds."""
+    levels = found.tones.foreign_db_sl
+    heard = np.where(np.isnan(levels), -math.inf, levels)
+    if len(heard) == count:
+        return heard.tolist()  # type: ignore[no-any-return]
+    return [(heard[way].max(axis=0) + MARGIN_DB).tolist() for way in _ways(found, count)]
+
+
+def _ways(found: Answer, count: int) -> list[list[int]]:
+    """Return, for each of the first fingers, its number and those of the ends of its way."""
+    ways, places = [[number] for number in range(count)], [each.at for each in found.asked]
+    for end in range(count, len(places)):
+        near = [math.dist(at, places[end]) for at in places[:count]]
+        ways[near.index(min(near))].append(end)
+    return ways
+
+
+def _on_way(places: Sequence[Sensation]) -> Sensation:
+    """Return the worst sensation of a finger among the places of its way."""
+    first = places[0]
+    if first.verdict == HELD_BACK:
+        return first
+    least = dict[str, Any]()
+    for name, (sign, margin) in _WORST.items():
+        values = [each for one in places if (each := getattr(one, name)) is not None]
+        if values:
+            least[name] = sign * min(sign * each for each in values) - sign * margin
+    found: Sensation = replace(first, **least)
+    if found.verdict not in (OWN, MIXED):
+        return found
+    judged = found.promised_contrast_db, found.foreign_level_db_sl
+    return replace(found, verdict=verdict_of(*judged, pauses=found.pauses))
 
 
 @dataclass(frozen=True)
 class Crossfades:
     """Finds the way from what plays to a better answer for the same fingers.
 
-    targets, quiet: contacts where they rest; playing: what they feel, by finger and voice; shape:
-    adds envelopes.
+    targets, quiet: contacts where they rest; playing: contents by finger and voice; shape: adds
+    envelopes.
     """
 
     table: LocalizationTable
@@ -547,12 +540,12 @@ class Crossfades:
     shape: Shape | None = None
 
     def steps(self) -> tuple[Selection, ...]:
-        """What plays after each step, the content that is led to marked.
+        """Return the selection after each step; contents that are led to are marked.
 
-        Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5;
-        either to the same fingers, and not more weakly. It ends where a step promises no more.
-        Where nothing is better, what plays, if it promises another contrast where fingers rest by
-        0.5 dB than it did on their ways.
+        Other frequencies must promise 2 dB more to the worst finger, other weights alone 0.5 dB;
+        either to the same fingers, and not more weakly. The way ends where a step promises no more.
+        Where nothing is better, the only step is what plays, if its promised contrast differs by
+        0.5 dB from what was promised while fingers moved.
         """
         if self.capabilities.drive_mode != UNRESTRICTED:
             return ()
@@ -582,7 +575,7 @@ class Crossfades:
         return same
 
     def _restated(self, now: Answer, playing: _Voices) -> tuple[Selection, ...]:
-        """What plays with what it promises now; nothing if that has been said."""
+        """Return what plays with its present promises; nothing if they are known."""
         found, said = self._felt(now, playing), dict[ContactKey, float]()
         for content in self.playing.values():
             for each in content.predictions:
@@ -594,9 +587,9 @@ class Crossfades:
         return ()
 
     def _in_order(self, goal: Answer, playing: _Voices, led: _Voices) -> tuple[Selection, ...]:
-        """What plays after each step to contents, the best first; none where none may follow.
+        """Return the selection after each step, the best content first; none if none may follow.
 
-        One that may follow hinders no other after: no other order goes on where this one ends.
+        A content that may follow hinders none later, so no other order goes on where this ends.
         """
         left, steps, before = {**led}, list[Selection](), -math.inf
         while left:
@@ -632,7 +625,7 @@ class Crossfades:
         return self.capabilities.limits.factor_within(total, self.table) >= 1 - NEARLY
 
     def _mixed(self, goal: Answer, voices: _Voices) -> Answer:
-        """The answer with the tones of contents that are felt together, and what these promise."""
+        """Return an answer with the tones of contents that are felt together, and its promises."""
         drives, owners = [], list[int]()
         rows, table = list[int](), self.table
         for number, stream in enumerate(goal.contents.streams):
@@ -646,7 +639,7 @@ class Crossfades:
         return with_tones(table, goal, *every)
 
     def _felt(self, mixed: Answer, voices: _Voices) -> Selection:
-        """What is felt of contents together, with what is predicted of them."""
+        """Return the selection of contents that are felt together, with their predictions."""
         found = self._selection(mixed)
         contents = [
             replace(one, predictions=predicted.predictions)
@@ -670,7 +663,7 @@ def _by_finger(contents: Iterable[Content]) -> _Voices:
 
 
 def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
-    """How many voices the content of each finger has, and who feels it."""
+    """Return the number of voices and the contacts of each finger's content."""
     return {
         key: (len(each), {contact.key for contact, _ in each[0].targets})
         for key, each in voices.items()
@@ -678,12 +671,12 @@ def _served(voices: _Voices) -> dict[ContactKey, tuple[int, set[ContactKey]]]:
 
 
 def _is_tuned(then: Sequence[Content], now: Sequence[Content]) -> bool:
-    """Whether another frequency plays."""
+    """Whether frequencies differ."""
     return [each.frequency for each in then] != [each.frequency for each in now]
 
 
 def _differ(now: Sequence[Content], then: Sequence[Content]) -> bool:
-    """Whether two contents of a finger are felt to differ by anyone."""
+    """Whether any finger feels a difference between two contents of one."""
     if _is_tuned(then, now):
         return True
     for one, other in zip(now, then, strict=True):

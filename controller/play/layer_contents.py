@@ -1,6 +1,7 @@
-"""What layers play: one content each, for its own finger and those that share it.
+"""Contents of layers: what each layer plays, for its own finger and those that share it.
 
-What a layer of all amplifiers plays: a content, until when, and what is due of it.
+Predictions say what fingers feel of contents; a selection has the contents of all fingers; a layer
+content is one as it is played, with its times.
 """
 
 import math
@@ -26,31 +27,35 @@ BEING_CHOSEN = "what it shall feel is being chosen; wait a moment"
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a finger that is to feel something is predicted to feel.
+    """The predicted sensation of a finger that is to feel something.
 
-    contact: as it was when the content was chosen; verdict: whether it feels its own content, that
-    mixed with others', that of another finger, or none; held_back: why not its own, None if it
-    does. level_db_sl: over the duration of the effect, onset included, or the steady one where it
-    has none; contrast_db: on the plate as modelled, to the loudest quiet finger or to the contents
-    of others here; promised_contrast_db: the same on nine of ten plates; foreign_level_db_sl: of
-    others' contents here, which nine of ten plates do not exceed. None where there is nothing to
-    compare with. frequency [Hz]: None where several or none play; content: name of what it feels;
-    nominal_db_sl: its level on the plate as modelled; pauses: whether it ends, or comes and goes;
-    is_apart: whether all that others feel is 30 Hz away.
+    Contrasts and foreign levels are None where there is nothing to compare with.
     """
 
     contact: Contact
+    """As it was when the content was chosen."""
     level_db_sl: float | None
+    """Over the duration of the effect, onset included, or the steady level where it has none."""
     contrast_db: float | None = None
+    """Nominal contrast to the loudest quiet finger, or to the contents of others here."""
     verdict: str = OWN
+    """Whether the finger feels its own content, that mixed, that of another finger, or none."""
     held_back: str | None = None
+    """Why it does not feel its own content; None if it does."""
     promised_contrast_db: float | None = None
+    """The contrast that nine of ten plates reach."""
     foreign_level_db_sl: float | None = None
+    """Level of others' contents here that nine of ten plates do not exceed."""
     frequency: float | None = None
+    """[Hz]; None where several or none play."""
     content: str | None = None
+    """Name of what the finger feels."""
     nominal_db_sl: float | None = None
+    """Level of that on the plate as modelled."""
     pauses: bool = False
+    """Whether the content ends, or comes and goes."""
     is_apart: bool = True
+    """Whether all that others feel is at least 30 Hz away."""
 
     @property
     def is_foreign_felt(self) -> bool:
@@ -58,7 +63,7 @@ class Prediction:
         return is_felt(self.foreign_level_db_sl)
 
     def judged(self) -> "Prediction":
-        """Return it with the verdict that its figures give where it feels a content of its own."""
+        """Return the prediction with its verdict by its figures, if it has a content of its own."""
         if self.verdict not in (OWN, MIXED):
             return self
         verdict = verdict_of(
@@ -69,10 +74,10 @@ class Prediction:
     def beside(
         self, others: Sequence[float], total: Sequence[float], above: Sequence[float] = (0.0,)
     ) -> "Prediction":
-        """Return it with other contents besides, whose powers add, by the set that is worst.
+        """Return the prediction with other contents besides, whose powers add.
 
-        others: of these alone [dB SL], by each set of thresholds; total: all that is foreign here;
-        above: its level by each set, above that by the rig's own [dB].
+        The worst set of thresholds counts. others: levels [dB SL] of these contents by set; total:
+        levels of all that is foreign here; above: own level by set [dB], relative to the rig's set.
         """
         level, contrast = self.level_db_sl, self.promised_contrast_db
         found = replace(self, foreign_level_db_sl=max(total))
@@ -86,9 +91,9 @@ class Prediction:
         return replace(found, promised_contrast_db=min(least, *contrasts)).judged()
 
     def weakened(self, gain_db: float, others_db: float) -> "Prediction":
-        """Return it with a gain [dB]; others_db: at most on others' contents.
+        """Return the prediction with a gain [dB]; others_db: the highest on others' contents.
 
-        Of its contrasts what is left at least.
+        Contrasts are lower bounds.
         """
         gains = {
             **dict.fromkeys(("level_db_sl", "nominal_db_sl"), gain_db),
@@ -114,31 +119,31 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Content:
-    """What one layer plays, with the contacts as they were when it was chosen.
-
-    key: of the finger whose content it is, and CLICK for a short pulse, 0 for what lasts, or the
-    number of a side band of that, which has no predictions; targets: that finger, then those that
-    share it; placement: where they are, and all others; predictions: one per target, which also
-    depend on others; gain_db: that the layer has, its fingers' strength. is_led: whether it
-    takes the place of what its finger feels along a cross-fade, which others hardly notice.
-    """
+    """The content of one layer, with the contacts as they were when it was chosen."""
 
     key: tuple[ContactKey, int]
+    """Its finger, and its voice: CLICK for a short pulse, 0 for a content that lasts, or the number
+    of a side band of that, which has no predictions."""
     targets: Targets
+    """Its finger, then those that share it."""
     placement: Placement
+    """Where these fingers are, and all others."""
     layer: Layer
     predictions: tuple[Prediction, ...] = field(default=(), compare=False)
+    """One for each target; they also depend on other contents."""
     gain_db: float = 0.0
+    """Strength of its fingers, included in the layer."""
     is_led: bool = field(default=False, compare=False)
+    """Whether it takes the place of another content of its finger along a cross-fade."""
 
     @property
     def frequency(self) -> float | None:
-        """Its frequency [Hz]; None of several."""
+        """Its frequency [Hz]; None where there are several."""
         return self.layer.frequency
 
     @property
     def course(self) -> tuple[Course, Pulse] | None:
-        """The course along which it is felt, and its pulse; None for steadily."""
+        """Its course and pulse; None for a steady content."""
         target = self.targets[0][1]
         if target.course is None or target.pulse is None:
             return None
@@ -147,23 +152,24 @@ class Content:
 
 @dataclass(frozen=True)
 class Selection:
-    """The contents of some contacts, or none and the reason for silence.
-
-    targets, quiet: contacts as they were when the contents were chosen, targets with their
-    intents; not_served: targets that feel nothing, with the reason; is_pending: whether the
-    contents of some targets are still being chosen. foreign_levels [dB SL]: what contacts feel
-    of others' contents by each set of thresholds, which nine of ten plates do not exceed;
-    protected: contacts that must not notice those of others.
-    """
+    """The contents of some contacts, or the reason for silence."""
 
     targets: Targets
+    """Contacts that are to feel something, as they were when the contents were chosen."""
     quiet: tuple[Contact, ...]
+    """The other contacts, as they were then."""
     contents: tuple[Content, ...] = ()
     reason: str | None = None
+    """Why there are no contents."""
     not_served: tuple[Prediction, ...] = ()
+    """Predictions for targets that feel nothing, with the reasons."""
     is_pending: bool = False
+    """Whether the contents of some targets are still being chosen."""
     foreign_levels: Mapping[ContactKey, Sequence[float]] = field(default_factory=dict)
+    """Levels [dB SL] of others' contents at contacts, by set of thresholds; nine of ten plates do
+    not exceed them."""
     protected: frozenset[ContactKey] = frozenset()
+    """Contacts that must not notice the contents of others."""
 
     @cached_property
     def contacts(self) -> dict[ContactKey, Contact]:
@@ -180,17 +186,17 @@ class Selection:
 
     @property
     def pulses(self) -> list[Pulse]:
-        """Those of the targets that have an end of their own."""
+        """The pulses of the targets."""
         return [target.pulse for _, target in self.targets if target.pulse is not None]
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether every target feels its own, so that who leaves changes nothing for others."""
+        """Whether every target feels its own, so that others gain nothing when one leaves."""
         is_each_alone = all(len(content.targets) == 1 for content in self.contents)
         return bool(self.contents) and is_each_alone and not self.not_served
 
     def weakened(self, gains_db: Gains) -> "Selection":
-        """Return it with the strengths of fingers; what several share has the lowest."""
+        """Return the selection with the strengths of fingers; a shared content has the lowest."""
         if not (self.contents and any(gains_db.values())):
             return self
         gains = {
@@ -221,7 +227,7 @@ class Selection:
         return replace(self, contents=tuple(contents), foreign_levels=levels)
 
     def without(self, contents: Sequence["Content"], reason: str) -> "Selection":
-        """Return it without some contents, whose targets feel nothing for a reason."""
+        """Return the selection without some contents, whose targets feel nothing for a reason."""
         held_back = dict.fromkeys(contact for each in contents for contact, _ in each.targets)
         left = tuple(each for each in self.contents if each not in contents)
         return replace(
@@ -235,9 +241,9 @@ class Selection:
         )
 
     def beside(self, others: Sequence["Selection"], table: LocalizationTable) -> "Selection":
-        """Return it with what the fingers of its targets feel of others that play beside it.
+        """Return the selection with the foreign levels of others that play beside it.
 
-        table: whose sets of thresholds count.
+        table: has the sets of thresholds.
         """
         levels, total = dict[ContactKey, list[float]](), {**self.foreign_levels}
         for key in self.target_keys:
@@ -265,9 +271,10 @@ class Selection:
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """What each finger feels, those that feel nothing at the end.
+        """A prediction for each target, those that feel nothing at the end.
 
-        Of a short pulse beside what lasts; where that is not served, why, of the other.
+        A finger with two contents has that of its short pulse; if one is not served, that of the
+        other with the reason.
         """
         found = {each.contact.key: each for one in self.contents for each in one.predictions}
         for each in self.not_served:
@@ -279,7 +286,7 @@ class Selection:
 
 
 def foreign_at(key: ContactKey, parts: Sequence[Selection]) -> list[float]:
-    """Return what a contact feels of others' contents of several selections, by set [dB SL]."""
+    """Return the foreign levels [dB SL] of several selections at a contact, by set."""
     return sums_db([known for part in parts if (known := part.foreign_levels.get(key))])
 
 

@@ -39,27 +39,26 @@ from model.answer.stimulus import FADE_RAMP, Course
 from model.rig.rig import Rig
 
 MIN_LEFT = 0.001
-"""Time [s] of a pulse that is about to end."""
+"""Shortest remaining time [s] of a pulse."""
 
 
 # With no finger left on the plate the end may be short: zero within 20 ms of the lift.
 RELEASE_RAMP = 0.010
 
 STRENGTH_FADE = 0.100
-"""Time [s] within which what plays is led to another strength, along a raised cosine."""
+"""Time [s] of the raised cosine along which a content is led to another strength."""
 
 CROSSFADE = 0.300
-"""Time [s] within which one content takes the place of another, and that falls, by raised cosines.
+"""Time [s] of the raised cosines along which one content takes the place of another.
 
-Shorter ones are heard by the fingers that are on nulls, in time.
+Shorter ones are felt by fingers that are on nulls.
 """
 
 FALL_AFTER = 0.27 * CROSSFADE
-"""Time [s] by which the other falls later, so that its finger feels no dip between."""
+"""Delay [s] of the fall of the other content, so that its finger feels no dip between."""
 
 RETRY = 1.0
-"""Time [s] after which a set is planned again that was refused without an end, fingers that rest
-included."""
+"""Time [s] after which a set is planned again that was refused for an unknown time."""
 
 # Shortest time [s] until a vibration ends by itself on the amplifier, so that a slow wire or a rate
 # limit of one set a second does not interrupt it. It is renewed at half its time.
@@ -70,31 +69,33 @@ _MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch w
 _VALID_FOR = QUANTITIES["valid_for"]
 
 Check = Callable[[Mapping[str, Sequence[AmplifierLayer]]], CommandRefused | None]
-"""Why the ledgers would not admit layers, by amplifier, now; None if they would."""
+"""Returns why the ledgers would refuse layers, by amplifier, now; None if they would admit them."""
 
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Sets:
-    """What is sent to all amplifiers for one moment; nothing where there is neither.
-
-    layers: those that change, by number; started: of these, those that play another content;
-    endings: of those that play on, which get an ending; silence: ramp [s] along which all layers
-    fall silent instead; settled_after [s]: when the last ramp or onset has ended. skipped: contents
-    that a ledger does not admit, for a reason; retry_at [s]: when it may. preempted_until [s]: when
-    endings, among which are pieces of courses, are no longer preempted by a touch.
-    """
+    """The sets of all amplifiers for one moment; without layers and silence nothing is sent."""
 
     layers: Mapping[int, PlateLayer] = field(default_factory=dict)
+    """Layers that change, by number."""
     started: frozenset[int] = frozenset()
+    """Of these, the layers that play another content."""
     endings: Mapping[int, answer.Layer] = field(default_factory=dict)
+    """Of the others, those that get an ending, or the next piece of a course."""
     silence: float | None = None
+    """Ramp [s] along which all layers fall silent instead."""
     settled_after: float = 0.0
+    """Time [s] until the last ramp or onset has ended."""
     skipped: Sequence[Content] = ()
+    """Contents that a ledger does not admit."""
     reason: str = ""
+    """Why it does not."""
     retry_at: float = math.inf
+    """When [s] it may."""
     preempted_until: float = math.inf
+    """When [s] a touch no longer preempts endings, pieces of courses among them."""
 
     @cached_property
     def by_amplifier(self) -> dict[str, list[AmplifierLayer]]:
@@ -111,10 +112,9 @@ class Sets:
 
 
 class Layers:
-    """The layers of all amplifiers of a rig; capabilities: of these together.
+    """The layers of all amplifiers of a rig; times are arguments.
 
-    check: by the ledgers; expiry_of: when [s] a contact is lifted unless a frame arrives. Times are
-    arguments.
+    check: asks the ledgers; expiry_of: returns when [s] a contact is lifted unless a frame arrives.
     """
 
     def __init__(
@@ -141,11 +141,11 @@ class Layers:
         self.contents: Mapping[int, LayerContent] = {}
         """What plays, by layer."""
         self.due = math.inf
-        """When [s] the next content is to be renewed, gets its ending, or has ended by itself."""
+        """When [s] the next content is renewed, gets its ending, or has ended by itself."""
         self.ending_due = math.inf
         """When [s] the next content gets its ending, or the next piece of its course."""
         self.may_play: frozenset[int] = frozenset()
-        """Layers that may play, since all were silent."""
+        """Layers that may play; empty once all are silent for certain."""
         self.is_silent = False
         """Whether all layers are silent, for certain."""
         self._fades_until = -math.inf  # s; what was ended or replaced
@@ -154,9 +154,9 @@ class Layers:
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
 
     def plan(self, contents: Sequence[Content], now: float) -> Sets:
-        """Return the sets by which layers play these contents from a time [s] on, and no others.
+        """Return the sets by which layers play these contents and no others from a time [s] on.
 
-        What plays already stays as it is.
+        Contents that play already stay as they are.
         """
         left, skipped = [*contents], list[Content]()
         reason, retry_at = "", math.inf
@@ -182,8 +182,8 @@ class Layers:
     def may_lead(self, contents: Sequence[Content], now: float) -> bool:
         """Whether contents may be led to from what plays at a time [s].
 
-        All of their fingers must feel theirs. Each other frequency needs a free layer, and the
-        ledgers must admit both together.
+        Each must take the place of one that plays. Each other frequency needs a free layer, and
+        the ledgers must admit both together.
         """
         if {each.key for each in contents} - {one.content.key for one in self.contents.values()}:
             return False
@@ -194,7 +194,7 @@ class Layers:
         return self.check(self._sets(contents, now, is_shaped=True)[0].by_amplifier) is None
 
     def silence(self, ramp: float, now: float) -> Sets:
-        """Return the silence of all layers along a ramp [s]; nothing if they are silent."""
+        """Return the sets that silence all layers along a ramp [s]; empty if they are silent."""
         if self.is_silent:
             return Sets()
         self._replace({})
@@ -204,9 +204,9 @@ class Layers:
     def endings(self, now: float) -> Sets:
         """Return the sets that give endings to what plays, where that is due at a time [s].
 
-        By a set of its own, so that no touch waits for them. What a ledger refuses fades. What
-        gives way to another content falls. With these go the next pieces of courses, while sources
-        confirm the contacts.
+        They are sets of their own, so that no touch waits for endings. A content whose ending a
+        ledger refuses fades later; one that gives way to another falls. The next pieces of courses
+        are among them, while sources confirm the contacts.
         """
         layers: dict[int, PlateLayer] = {}
         endings: dict[int, answer.Layer] = {}
@@ -241,7 +241,7 @@ class Layers:
     def renewal(self, now: float) -> Sets:
         """Return the sets that prolong what plays, where that is due at a time [s].
 
-        What a ledger refuses for good ends by itself.
+        A content that a ledger refuses for good ends by itself.
         """
         if endings := self.endings(now):
             return endings
@@ -263,7 +263,7 @@ class Layers:
         return renewal
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
-        """Note that layers are not prolonged; one refused for good lets them end."""
+        """Note that layers are not prolonged; after a refusal for good they end."""
         due = math.inf if refusal.until is None else refusal.until
         for number in renewal.endings:
             has_course = self.contents[number].content.course is not None
@@ -279,7 +279,7 @@ class Layers:
     def confirm(self, sets: Sets, played: Played, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
 
-        What a ledger has shortened is not renewed, since that would circumvent its limit.
+        A content that a ledger has shortened is not renewed: that would circumvent its limit.
         """
         going_on = sets.layers.keys() & self.contents.keys()
         self.may_play = self.may_play.difference(sets.layers).union(going_on)
@@ -314,9 +314,9 @@ class Layers:
         self.is_silent, self._over = False, ()
 
     def ended(self, now: float) -> tuple[Content, ...]:
-        """Return the contents that have ended by themselves by a time [s], once.
+        """Return the contents that have ended by themselves by a time [s], each once.
 
-        Not those of which a piece is due, for which the host was late: they go on.
+        Those of which a piece is due, for which the host was late, go on.
         """
         over = [
             number
@@ -339,7 +339,7 @@ class Layers:
         return is_due and now < self._confirmed_until(one.content)
 
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
-        """Return those of the contents that are still wanted that have ended by themselves."""
+        """Return which of the wanted contents have ended by themselves."""
         if self._over:
             over = [(each.key, each.targets, each.placement) for each in self._over]
             self._over = tuple(
@@ -348,10 +348,10 @@ class Layers:
         return self._over
 
     def numbered(self, contents: Sequence[Content]) -> dict[int, Content]:
-        """Contents by layer: what plays in its own, else a finger's, new ones in those that end.
+        """Return contents by layer: the own one, or that of the finger, or one that ends.
 
-        One that another gives way to has one that is free, and a short pulse rather, too: along its
-        short ramp would fade what ends there.
+        A content that another gives way to gets a free layer. So does a short pulse if it can,
+        since what ends in its layer would fade along its short ramp.
         """
         numbers: dict[int, Content] = {}
         for number, one in self.contents.items():
@@ -370,8 +370,9 @@ class Layers:
                 new.append(content)
             else:
                 numbers[known] = content
-        falling = [n for n in sorted(self.may_play - numbers.keys()) if self._is_falling(n)]
-        ending = sorted(self.may_play - numbers.keys() - {*falling})
+        falls = {number for number, one in self.contents.items() if one.is_falling}
+        falling = sorted(falls & self.may_play - numbers.keys())
+        ending = sorted(self.may_play - numbers.keys() - falls)
         free = [n for n in range(self._count) if n not in self.may_play and n not in numbers]
         for content in new:
             first, second = (free, ending) if content.key[1] == CLICK else (ending, free)
@@ -380,7 +381,7 @@ class Layers:
         return numbers
 
     def starting(self, numbers: Mapping[int, Content]) -> list[int]:
-        """Return the layers that start by the contents of all.
+        """Return the layers whose contents start.
 
         Side bands join a carrier that plays: all count their phases on one clock.
         """
@@ -404,7 +405,7 @@ class Layers:
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
     ) -> tuple[Sets, dict[int, LayerContent]]:
-        """Return the sets of all layers that change by these contents, and what all play then."""
+        """Return the sets for these contents, and what all layers play then."""
         numbers = self.numbered(contents)
         starting = self.starting(numbers)
         layers: dict[int, PlateLayer] = {}
@@ -508,7 +509,7 @@ class Layers:
         )
 
     def _fade_of(self, number: int, content: Content) -> float:
-        """How long [s] a content is led to from what its finger feels; 0 where it begins."""
+        """Return the time [s] in which a content takes the place of another; 0 where it begins."""
         before = self.contents[number].content if number in self.contents else None
         same = [
             (one.key, one.frequency, one.targets[0][1].pulse) for one in (before, content) if one
@@ -519,17 +520,14 @@ class Layers:
         return CROSSFADE if is_led else 0.0
 
     def _led_from(self, content: Content) -> LayerContent | None:
-        """What its finger feels, and a content that is led to takes the place of."""
+        """Return what a content that is led to takes the place of, if anything."""
         one = self.contents.get(self._layer_of.get(content.key, -1))
         if one is None or not content.is_led or one.content == content:
             return None
         return None if one.content.targets[0][1].is_short else one
 
-    def _is_falling(self, number: int) -> bool:
-        return number in self.contents and self.contents[number].is_falling
-
     def _falling(self, number: int, contents: Sequence[Content], now: float) -> LayerContent | None:
-        """What a layer plays, if it gives way to one of these contents; None if it ends at once."""
+        """Return a layer as it gives way to one of these contents; None if it ends at once."""
         if (one := self.contents.get(number)) is None:
             return None
         for content in contents:
@@ -577,9 +575,9 @@ class Layers:
         return until
 
     def _lasts(self, content: Content, left: Sequence[float], now: float) -> float:
-        """Return for how long [s] a content at a time [s] may last by itself.
+        """Return for how long [s] a content may last by itself from a time [s] on.
 
-        left [s]: of each target. The amplifiers end a pulse; the last one, where several play.
+        left: time [s] of each target; the amplifiers end the content with the last pulse.
         """
         until = self._confirmed_until(content)
         unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
@@ -591,10 +589,7 @@ class Layers:
         return one is not None and bool(one.layer.ending) and now >= one.settled_at
 
     def _drive_of(self, number: int) -> Drive:
-        """Return what plays in a layer, at the frequencies that were asked for.
-
-        Wire and amplifier round these.
-        """
+        """Return what plays in a layer, at frequencies not rounded by wire and amplifier."""
         drive: dict[str, AmplifierTone] = {}
         if (one := self.contents.get(number)) is None:
             return drive

@@ -1,6 +1,6 @@
-"""The controller of a plate: its amplifiers are opened, armed, stopped and released here.
+"""The control loop of a plate, and the controller that opens, arms and stops its amplifiers.
 
-The cycle of the control loop: plan, send what changes, then feed the amplifiers' watchdogs.
+A cycle of the loop plans, sends what changes, then feeds the watchdogs of the amplifiers.
 """
 
 import asyncio
@@ -47,7 +47,7 @@ _logger = logging.getLogger(__name__)
 
 
 class Cycle:
-    """The cycle of the control loop of one plate; fingers are followed amid it, too.
+    """The control loop of one plate; contacts are followed while it waits, too.
 
     group: all amplifiers, which are opened and armed elsewhere.
     """
@@ -65,13 +65,12 @@ class Cycle:
         self.is_closed = False
         """Whether `run` ends."""
         self.rejects = RejectCounter(_logger)
-        """What of touches was rejected, at the sources and as contacts: the only such counter."""
+        """Counter of all rejected touches, at the sources and as contacts."""
         self.clicks_too_late = 0
-        """Short vibrations that came too late to be felt while armed, since the start.
+        """Number of short vibrations that came too late to be felt while armed, since the start.
 
-        They were over, or had lost their touch, before the amplifiers were to play them; with
-        fingers that had left before they were looked at. Not what a ledger refuses, or neighbours
-        do not allow.
+        They were over, or had lost their touch, before the amplifiers could play them, as under
+        fingers that came and left within a cycle. Refusals by a ledger do not count.
         """
         self._plan: Plan | None = None  # that is on its way to the amplifiers
         self._wake = asyncio.Event()
@@ -92,8 +91,8 @@ class Cycle:
     async def run(self) -> None:
         """Run the loop until `close` or cancellation, also while amplifiers are lost or closed.
 
-        It sends only while they are armed. A loss is reported to observers; all others are stopped
-        by then; a loss while disarmed shows in the next request, as the supervisor checks.
+        It sends only while they are armed. A loss is reported to observers once all others are
+        stopped; a loss while disarmed shows in the next request of the supervisor.
         """
         while not self.is_closed:
             await self.step()
@@ -157,8 +156,8 @@ class Cycle:
     async def _play(self, planner: Planner, plan: Plan) -> float | CommandRefused | None:
         """Play the sets of a plan on all amplifiers, from one moment on.
 
-        Returns when [s] they start, None where nothing is to be sent, or why they were
-        refused. Whatever is raised instead leaves it unknown what plays.
+        Returns when [s] they start, None where nothing is sent, or the refusal. It is unknown what
+        plays if anything is raised.
         """
         if not (sets := plan.sets):
             return None
@@ -195,16 +194,16 @@ class Cycle:
             )
 
     def wake(self) -> None:
-        """Look at once at what is to be done."""
+        """Begin the next cycle at once."""
         self._wake.set()
 
     def feed_at_once(self) -> None:
-        """Feed the watchdogs at once."""
+        """Begin the next cycle at once, and feed the watchdogs in it."""
         self._heartbeat_due = threads.now()
         self._wake.set()
 
     def note_armed(self, limits: Limits, *, was_armed: bool) -> None:
-        """Note that the amplifiers have been armed: what is to play is sent, watchdogs are fed.
+        """Note that the amplifiers have been armed: the next cycle sends all and feeds watchdogs.
 
         limits: of the amplifiers as they are now; was_armed: also before, so that what plays goes
         on. Raises CommandError without a planner.
@@ -230,7 +229,7 @@ class Cycle:
             self.rejects.count(reason, f"touch of {frame.source}")
 
     def lift(self, prefix: str) -> None:
-        """Lift the fingers of all sources whose names begin so, whatever fails at one of them."""
+        """Lift the contacts of all sources whose names have a prefix; failures are only logged."""
         for source in self.tracker.sources_of(prefix):
             try:
                 self.deliver(TouchFrame(source, threads.now(), ()))
@@ -280,7 +279,7 @@ class Cycle:
         self._schedule_expiry()
 
     def _expire(self, now: float) -> None:
-        """Lift fingers that no source has confirmed in time: here alone, and before every plan."""
+        """Lift contacts that no source has confirmed in time; called before every plan."""
         if (change := self.tracker.expire(now)).up:
             self._follow(change)
 
@@ -316,7 +315,7 @@ class Cycle:
 
 
 def _report(callbacks: Iterable[Callable[_P, object]], *args: _P.args, **kwargs: _P.kwargs) -> None:
-    """Call all observers of an event; their exceptions are logged."""
+    """Call all observers of an event; log their exceptions."""
     for callback in callbacks:
         try:
             callback(*args, **kwargs)
@@ -330,14 +329,13 @@ CLOSING_RAMP = 0.050  # s; not urgent, so longer than a release
 class Controller:
     """Drives the amplifiers of a rig by touch frames: open, arm, run its `cycle`, close.
 
-    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening; urls and
-    expected serial numbers by amplifier name. Starts disarmed: contacts are followed but nothing is
-    sent. The loop sends the heartbeat itself after it has run, so that the watchdogs of the
-    amplifiers trip when it hangs.
+    It starts disarmed: contacts are followed but nothing is sent. The loop sends the heartbeat
+    itself after it has run, so that the watchdogs of the amplifiers trip when it hangs.
 
-    intent_source: what contacts shall feel. timing: shapes the patterns of the table. drive_mode:
-    None for the best that the amplifiers can play.
-    connected: called with all amplifiers when their lines are open. watchdog [s]: of armed ones.
+    table: for this rig; lines: makes the lines to its amplifiers, anew for each opening;
+    intent_source: says what contacts shall feel; timing: shapes the patterns of the table; urls,
+    serial_numbers: by amplifier name; drive_mode: None for the best that the amplifiers can play;
+    connected: called with all amplifiers when their lines are open; watchdog [s]: of armed ones.
     """
 
     def __init__(
@@ -398,8 +396,8 @@ class Controller:
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer touches by another table of this plate from now on, in one step.
 
-        What plays stays until its contacts change or rest. Prepared by the caller: nothing is
-        computed here.
+        What plays is kept until its contacts change or rest. The caller prepares the table: nothing
+        is computed here.
         """
         self.table, self._timing = table, timing
         if self.cycle.planner is not None:
@@ -464,7 +462,7 @@ class Controller:
     async def _amplifier(self, lines: Lines, name: str) -> Amplifier:
         """Open the line of an amplifier, and send the stop that it is owed.
 
-        One whose line is open since another attempt is the same, as is a stop of it that goes on.
+        An amplifier whose line is open since another attempt is kept, with a stop in progress.
         Raises LinkError, CommandError.
         """
         before = amplifier = self._opened.get(name)
@@ -533,12 +531,12 @@ class Controller:
         return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
 
     def what_may_play(self, name: str, cause: str = "") -> Stopped:
-        """What an amplifier may play as far as is known; cause: why no more is; see there."""
+        """Return what an amplifier may be playing; cause: why no more is known."""
         opened = self._opened.get(name)
         return UNREACHED if opened is None else opened.what_may_play(cause)
 
     async def clear(self) -> None:
-        """Acknowledge stops, and faults whose cause has gone; nothing arms by itself."""
+        """Acknowledge stops, and faults whose cause is gone; nothing arms by itself."""
         await self.group.clear()
 
     async def close(self) -> None:

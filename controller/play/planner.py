@@ -1,8 +1,8 @@
-"""What the control loop plans, without waiting: fingers in, the sets of all amplifiers out.
+"""The planner of the control loop: fingers in, the sets of all amplifiers out; it never waits.
 
 plan(now):  fingers -> intent -> contents -> the layers that change, on every amplifier
 
-Reports of the control loop to a demo, a log or a dashboard.
+Reports say what a plan plays or silences; observers of the control loop get them.
 """
 
 import logging
@@ -49,39 +49,39 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Plan:
-    """What is felt by contacts from a moment on, and the sets for it; none where nothing changes.
-
-    from_rest: whether nothing has played for 0.4 s, so that the plate is at rest. made_at [s];
-    answered: when [s] the fingers changed that this answers, None: the first that lifted.
-    is_reported: not, where what is felt stays as it is.
-    """
+    """What contacts feel from a moment on, and the sets for it."""
 
     contacts: tuple[Contact, ...]
     selection: Selection
     from_rest: bool
+    """Whether nothing has played for 0.4 s, so that the plate is at rest."""
     made_at: float
+    """[s]"""
     answered: Mapping[ContactKey | None, float]
+    """When [s] the fingers changed that the plan answers; None: the first that lifted."""
     sets: Sets = field(default_factory=Sets)
+    """Empty where nothing changes."""
     is_reported: bool = True
+    """Whether what is felt changes."""
 
     @property
     def since(self) -> float:
-        """When [s] the first finger changed that this answers; when it was made, if none did."""
+        """When [s] the first finger changed that it answers; when it was made, if none did."""
         return min([self.made_at, *self.answered.values()])
 
     @property
     def is_touch(self) -> bool:
-        """Whether one of these fingers came, moved or pressed, instead of lifts alone or none."""
+        """Whether it answers a finger that came, moved or pressed, not lifts alone."""
         return len(self.answered) > (None in self.answered)
 
 
 class Planner:
     """Plans what the contacts on one plate feel; synchronous, times are arguments.
 
-    A plan never raises: it falls back to silence on any exception. check: by the ledgers; arrived:
-    called when several contents have been chosen, which a plan does not wait for; too_late: called
-    with how many clicks came too late to be felt; clock_errors: gives those of the amplifiers by
-    name, rms [s].
+    A plan never raises: it falls back to silence on any exception. check: asks the ledgers;
+    arrived: called when contents have been chosen in the thread; too_late: called with the number
+    of clicks that came too late to be felt; clock_errors: returns the clock errors of the
+    amplifiers by name, rms [s].
     """
 
     def __init__(
@@ -99,14 +99,14 @@ class Planner:
         clock_errors: Callable[[], Mapping[str, float]],
     ) -> None:
         self.capabilities = capabilities
-        """Of the amplifiers together."""
+        """The capabilities of the amplifiers together."""
         self._tracker, self._intent_source = tracker, intent_source
         self.timing = timing
         """Shapes the patterns of the table."""
         self.layers = Layers(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
-        """What they play."""
+        """The layers of the amplifiers."""
         self.clocks = CountedClocks(rig, clock_errors)
-        """Their clocks, as answers count them."""
+        """The clock errors of the amplifiers, as answers count them."""
         self._selector = Selector(
             Chooser(table, self.layers.builder.shape),
             arrived=self._note_answer,
@@ -126,7 +126,7 @@ class Planner:
         self._waiting: dict[ContactKey | None, float] = {}  # fingers that the last is for
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
-        """Answer by another table of this plate from now on; what plays stays until all rest."""
+        """Answer by another table of this plate from now on; what plays is kept until all rest."""
         self.timing, layers = timing, self.layers
         layers.builder = replace(layers.builder, timing=timing)
         self._answer_by(Chooser(self.clocks.counted_by(table), layers.builder.shape))
@@ -138,9 +138,9 @@ class Planner:
             self._answer_by(self._selector.chooser)
 
     def _count_clocks(self) -> None:
-        """Answer by the clocks as they are now; what plays stays until all rest.
+        """Answer by the clocks as they are now; what plays is kept until all rest.
 
-        Not over one that is held no longer.
+        It is chosen anew at once if a clock is no longer held.
         """
         chooser, known = self._selector.chooser, self.clocks.known
         is_one_lost = self.clocks.is_one_lost(known)
@@ -149,7 +149,7 @@ class Planner:
             self._answer_by(replace(chooser, table=counted), at_once=is_one_lost)
 
     def _answer_by(self, chooser: Chooser, *, at_once: bool = False) -> None:
-        """Answer anew, by what has changed: once all rest; at once where nothing plays, too."""
+        """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""
         selector = self._selector
         selector.chooser = chooser
         if at_once or not (self.layers.may_play or selector.is_choosing):
@@ -159,8 +159,8 @@ class Planner:
     def prepare(self) -> None:
         """Precompute what the first touch would have to wait for; seconds, of a large rig.
 
-        Of the table as it is, by which statuses say what leaks; all of it is shared by that of the
-        clocks. Raises InputError for a table that has no pattern for these amplifiers.
+        The table without clock errors, by which statuses say what leaks, shares all of that with
+        the one with them. Raises InputError for a table without a pattern for these amplifiers.
         """
         mode, timing = self.capabilities.drive_mode, self.timing
         prepare_answers(self._selector.chooser.table, mode)
@@ -179,13 +179,13 @@ class Planner:
     def due(self) -> float:
         """When [s] to plan next even if nothing arrives.
 
-        An intent expires then, a ledger may admit what it refused, or a finger that moved rests.
+        Then an intent expires, a ledger may admit what it refused, or a finger that moved rests.
         """
         return min(self._intent_due, self._retry_at, self._selector.due)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether a change of fingers is to be answered yet, or contents are being chosen."""
+        """Whether a change of fingers is not answered yet, or contents are being chosen."""
         return bool(self._tracker.changed) or self._selector.is_choosing
 
     @property
@@ -209,13 +209,13 @@ class Planner:
         self.layers.forget()
 
     def not_played(self, plan: Plan) -> None:
-        """Forget what plays, since a plan has not been played: its fingers wait for the next."""
+        """Discard what plays, since a plan has not been played; its fingers wait for the next."""
         self.forget()
         if plan.is_reported:
             self._tracker.wait_again(plan.answered)
 
     def only_ends(self, plan: Plan) -> Plan:
-        """Return a plan without what it starts, which is planned again later, or prolongs."""
+        """Return a plan that starts and prolongs nothing; what it would start is planned again."""
         if not plan.is_reported:
             return replace(plan, sets=Sets())
         if not plan.sets.started:
@@ -239,7 +239,7 @@ class Planner:
         self.layers.confirm(sets, played, now)
 
     def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
-        """Return silence instead of a plan whose sets were not played, though a ledger admits them.
+        """Return silence in place of a plan that amplifiers refused though the ledgers admit it.
 
         It is planned again when the refusal ends, or after RETRY where that is unknown.
         """
@@ -312,10 +312,7 @@ class Planner:
         return self._go_on(plan, now) if is_said else plan
 
     def _go_on(self, plan: Plan, now: float) -> Plan | None:
-        """Plan what is due where nothing changes: what has ended by itself, or is to be prolonged.
-
-        With silence if nothing plays on. However often fingers change, as they do while one moves.
-        """
+        """Plan what is due where nothing changes: contents have ended or are to be prolonged."""
         if now < self.layers.due:
             return None
         if contents := self.layers.ended(now):
@@ -342,7 +339,7 @@ class Planner:
         return selection
 
     def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> Sets:
-        """Return the end of all that plays: along endings only under fingers that stay."""
+        """Return the sets that end all that plays; along endings only under fingers that stay."""
         if not contacts:
             return self.layers.silence(RELEASE_RAMP, now)
         if has_failed or not self.layers.have_settled(now):
@@ -350,10 +347,10 @@ class Planner:
         return self.layers.plan((), now)
 
     def _answered(self, started: Collection[int]) -> dict[ContactKey | None, float]:
-        """Return when [s] the fingers changed that are answered, None: the first that lifted.
+        """Return when [s] the fingers changed that are answered; None: the first that lifted.
 
-        While contents are being chosen these are those that have lifted or feel a pulse that
-        starts, and with something that lasts those that the choice before was for.
+        While contents are being chosen, only lifts and pulses that start are answered, and with a
+        content that lasts also the fingers of the choice before.
         """
         changed, requests = self._tracker.changed, self._selector.requests
         answered = {**changed, **self._waiting}
@@ -388,34 +385,35 @@ class Planner:
 
 
 def _predicted(plan: Plan | None) -> Sequence[Prediction]:
-    """Return what targets are predicted to feel, or why they feel nothing of their own."""
+    """Return the predictions of a plan."""
     return () if plan is None else plan.selection.predictions
 
 
 @dataclass(frozen=True)
 class PlayReport:
-    """The contents that amplifiers play since their last confirmed set.
-
-    contacts: all, in order of arrival; targets: a prediction for each; quiet: quiet contacts, and
-    what they feel at most (`Selection.foreign_levels`);
-    contents: as they are played, by layer, the newest one last; latency [s]: from the touch frame
-    to the last byte of the command on the wire, None if none was needed; time [s] of that byte, or
-    of the report; from_rest: whether the plate
-    was at rest; settled_after [s]: when the last fade or envelope has ended; lasts: whether all
-    play until their contacts change; is_touch: as of the plan.
-    """
+    """The contents that amplifiers play since their last confirmed set."""
 
     contacts: tuple[Contact, ...]
+    """All contacts, in order of arrival."""
     targets: tuple[Prediction, ...]
+    """A prediction for each target."""
     quiet: tuple[Contact, ...]
     quiet_levels: Mapping[ContactKey, Sequence[float]]
+    """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
     contents: Mapping[int, LayerContent]
+    """Contents as they are played, by layer, the newest one last."""
     latency: float | None
+    """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
     time: float
+    """When [s] that byte was sent, or the report made."""
     from_rest: bool
+    """Whether the plate was at rest."""
     settled_after: float
+    """Time [s] until the last fade or envelope has ended."""
     lasts: bool
+    """Whether all contents play until their contacts change."""
     is_touch: bool
+    """As of the plan."""
     timing: Timing = field(repr=False, compare=False)
 
     @property
@@ -425,12 +423,12 @@ class PlayReport:
 
     @property
     def layer(self) -> Layer:
-        """What plays of the newest content."""
+        """The layer of the newest content as it plays."""
         return self.newest.layer
 
     @property
     def drive(self) -> Drive:
-        """What the amplifiers play of the newest content, by ERA, without silent ones."""
+        """The tones of the newest content, by ERA, without silent ones."""
         return self.newest.drive
 
     @property
@@ -443,8 +441,8 @@ class PlayReport:
         """Predicted contrast over the first 100 ms [dB], with the onset as it is played.
 
         Computed when it is first read, in about two milliseconds, so that no touch waits for it.
-        None without quiet contacts, within 0.4 s of another pattern, whose ringing it does not
-        include, or beside other contents.
+        None without quiet contacts, beside other contents, or within 0.4 s of another pattern,
+        whose ringing it does not include.
         """
         is_alone = self.from_rest and len(self.contents) == 1
         if not (is_alone and self.quiet):
@@ -453,24 +451,23 @@ class PlayReport:
 
     @property
     def felt(self) -> Prediction | None:
-        """What the finger of the newest content is predicted to feel; None where none plays."""
+        """The prediction for the finger of the newest content; None where none plays."""
         every = [each for one in self.contents.values() for each in one.content.predictions[:1]]
         return every[-1] if every else None
 
 
 @dataclass(frozen=True)
 class SilenceReport:
-    """All channels are silent, for a reason; latency and time [s].
-
-    targets: of contacts that were to feel something, with the reason for each. latency: up to the
-    last byte of the command, None if none was needed.
-    """
+    """The silence of all channels, and its reason."""
 
     contacts: tuple[Contact, ...]
     targets: tuple[Prediction, ...]
+    """A prediction for each contact that was to feel something, with the reason."""
     reason: str
     latency: float | None
+    """Time [s] up to the last byte of the command; None if none was needed."""
     time: float
+    """[s]"""
     is_touch: bool = False
 
 

@@ -1,13 +1,12 @@
 """Selection: from a haptic intent to the contents of a table that realise it, and when to ask anew.
 
-One question is answered at a time, with the fingers as they are when the one before was answered.
+All contents that last are chosen together, by one answer of the table; each short pulse is chosen
+alone, beside what lasts: with the stroke and the power that this leaves, all other fingers quiet,
+30 Hz from all that plays where its band allows it. What lasts at its own finger goes on. A pulse is
+over before an answer for all would help, so it is never changed. Contents that last and do not fit
+beside a pulse that plays get what it leaves, until it has ended.
 
-What is chosen for fingers: one answer for all contents that last, and one for each short pulse.
-
-A pulse is chosen beside what lasts: with the stroke and the power that this leaves, all other
-fingers quiet, 30 Hz from all that plays where its band allows it. What lasts at its own finger goes
-on. It is over before an answer for all would help, and never changed. What lasts and does not fit
-beside a pulse that plays has what that leaves, until it has ended.
+One choice is made at a time, for the fingers as they are when the one before was made.
 """
 
 import asyncio
@@ -58,18 +57,18 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Intention:
-    """Who is to feel what, among contacts: what lasts, and short pulses.
-
-    protected: contacts that must not notice the contents of others.
-    """
+    """The targets among the contacts on the plate."""
 
     contacts: tuple[Contact, ...]
     lasting: Targets
+    """Targets of contents that last."""
     short: Targets
+    """Targets of short pulses."""
     protected: frozenset[ContactKey] = frozenset()
+    """Contacts that must not notice the contents of others."""
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
-        """Return the contacts that are to feel nothing of what these targets feel."""
+        """Return the contacts that are not among some targets."""
         quiet = [*self.contacts]
         for contact, _ in targets:
             quiet.remove(contact)
@@ -78,47 +77,47 @@ class Intention:
 
 @dataclass(frozen=True)
 class ChoiceRequest:
-    """What is to be chosen; of what is intended only that.
-
-    before: what is felt now, by finger and voice; kept: what plays on beside it; takes_long:
-    whether what lasts takes longer than the control loop may wait; is_rested: whether what plays
-    would do, too, but may be led to what promises more; now [s]; fading: what played before a
-    cross-fade that goes on.
-    """
+    """The targets that contents are to be chosen for, and what plays."""
 
     intended: Intention
+    """All contacts, and only those targets that are to be chosen for."""
     before: Mapping[tuple[ContactKey, int], Content]
+    """Contents that are felt now, by finger and voice."""
     kept: tuple[Selection, ...]
+    """Selections that play on beside the new ones."""
     takes_long: bool = False
+    """Whether what lasts takes longer than the control loop may wait."""
     is_rested: bool = False
+    """Whether what plays would do, too, but may be led to what promises more."""
     now: float = math.inf
+    """[s]"""
     fading: Selection = _NOTHING
+    """What played before a cross-fade that goes on."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What was asked, and what was chosen: for what lasts, and for each finger with a pulse.
-
-    is_limited: whether what lasts has only what pulses leave that play beside it; steps: to what
-    lasts otherwise, one after the other.
-    """
+    """The selections made for a request."""
 
     requested: ChoiceRequest
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
+    """Selections of short pulses, by finger."""
     is_limited: bool = False
+    """Whether what lasts has only the limits that pulses leave which play beside it."""
     steps: tuple[Selection, ...] = ()
+    """Selections on the way to a better answer for what lasts, one after the other."""
 
 
 @dataclass(frozen=True)
 class Chooser:
-    """Chooses by a table; shape: adds envelopes to what is joint."""
+    """Chooses contents by a table; shape: adds envelopes to those of a joint answer."""
 
     table: LocalizationTable
     shape: Shape | None = None
 
     def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
-        """Choose what is asked for, what lasts first."""
+        """Choose for the targets of a request, those that last first."""
         if requested.is_rested:
             return Choice(requested, None, {}, steps=self._steps(requested, capabilities))
         kept, lasting, is_limited = [*requested.kept], None, False
@@ -188,9 +187,9 @@ class Chooser:
         capabilities: PlaybackCapabilities,
         beside: Sequence[Selection] = (),
     ) -> Selection:
-        """Choose for targets within what is left; any failure is their reason for silence.
+        """Choose for targets within capabilities; any failure is their reason for silence.
 
-        beside: what a pulse is felt beside.
+        beside: selections that a pulse is felt beside.
         """
         table, intended, before = self.table, requested.intended, requested.before
         raised = tuple([(contact, _over(target, contact, beside)) for contact, target in targets])
@@ -235,7 +234,7 @@ class Chooser:
 
 
 def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
-    """Whether what lasts is one steady content that no other finger must not notice."""
+    """Whether targets are one, steady, beside no other finger that is protected."""
     if len(targets) != 1:
         return False
     ((contact, target),) = targets
@@ -243,7 +242,7 @@ def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
 
 
 def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
-    """Whether only the level of a target changes, which is not raised."""
+    """Whether all that changes is the level of a single target that is not raised."""
     ((contact, new),) = targets
     then = before.get((contact.key, new.voice))
     if then is None or new.level_db_sl is None or (new.pulse and new.pulse.is_raised):
@@ -253,9 +252,9 @@ def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content])
 
 
 def _alike(found: Answer, target: Target) -> Answer:
-    """Return an answer whose level in a band is alike wherever the finger is.
+    """Return an answer whose level in a band is the same wherever the finger is.
 
-    The margin for other plates, by which it is more than promised, differs from place to place.
+    The margin for other plates, by which the level exceeds the promise, differs between places.
     """
     is_level = target.level_db_sl is not None and not (target.pulse and target.pulse.is_raised)
     if not (is_level and target.band and found.layers):
@@ -265,7 +264,7 @@ def _alike(found: Answer, target: Target) -> Answer:
 
 
 def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Target:
-    """Return the target of a short pulse as strong as it is to be above what lasts there."""
+    """Return the target of a short pulse, raised as far as it must be above what lasts there."""
     level, above = target.level_db_sl, target.above_db
     if level is None or above is None:
         return target
@@ -277,9 +276,9 @@ def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Targ
 
 
 def _among(intended: Intention, found: Selection, frequencies: Sequence[float]) -> Selection:
-    """Return what was chosen for a pulse among vibrations, by their frequencies [Hz].
+    """Return the selection for a pulse among vibrations of some frequencies [Hz].
 
-    Nearer than 30 Hz to one of them it is mixed.
+    It is mixed where it is nearer than 30 Hz to one of them.
     """
     if not found.contents:
         is_used_up = found.reason == LIMITS_LEAVE_NOTHING
@@ -297,7 +296,7 @@ def _contents(parts: Iterable[Selection]) -> list[Content]:
 
 
 def unanswered(requested: ChoiceRequest, reason: str) -> Choice:
-    """Return what stands in for an answer: nothing is felt, unless what plays would do, too."""
+    """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
     intended = requested.intended
     none = silent(intended, intended.lasting, reason)
     return Choice(
@@ -329,10 +328,10 @@ MOVE_TOLERANCE = STRETCH
 _RESTS_AFTER = 0.1
 
 CROSSFADE_INTERVAL = 0.4
-"""Time [s] from one step of a way to a better answer to the next, each of another finger."""
+"""Time [s] between two steps on the way to a better answer, each of another finger."""
 
 MIN_INTERVAL = 1.0
-"""Time [s] from the last step of such a way to the next way."""
+"""Time [s] from the last step on such a way to the first on the next."""
 
 GIVEN_UP = f"no answer within {TIME_LIMIT:g} s for these fingers; lift or move one to ask again"
 BLOCKED = (
@@ -342,15 +341,17 @@ BLOCKED = (
 
 _UNANSWERED = (GIVEN_UP, BLOCKED)
 
-_SOON = 5.0  # s; of a course whose answer takes no longer than one of what lasts, nearly
+_SOON = 5.0  # s; longer courses take longer to answer than the control loop may wait
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
 
 
 def _is_met_by(intended: Intention, chosen: Selection) -> bool:
     """Whether what was chosen also serves what lasts of what is intended now."""
-    if not (chosen.targets and _is_part_of(intended, chosen, _targets_of)):
-        return False
     is_whole, then = chosen.is_whole, chosen.contacts
+    wanted, had = _targets_of(intended.lasting), _targets_of(chosen.targets)
+    # Others would gain from the end of one only where fingers share or are not served.
+    if not (had and (wanted == had or (wanted < had and is_whole))):
+        return False
     now = {each.key: each for each in intended.contacts}
     same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
     follows = not is_alone(intended.lasting, intended.protected)
@@ -375,31 +376,15 @@ def _is_among(intended: Intention, chosen: Selection) -> bool:
     return all((each.key, each.since) in then for each in intended.contacts)
 
 
-def _is_part_of(
-    intended: Intention, chosen: Selection, kinds: Callable[[Targets], set[Target]]
-) -> bool:
-    """Whether what lasts was chosen, and no more that would leave others more if it ended."""
-    now, had = kinds(intended.lasting), kinds(chosen.targets)
-    return now == had or (now < had and chosen.is_whole)
-
-
 def _targets_of(targets: Targets) -> set[Target]:
     return set(map(itemgetter(1), targets))
 
 
-def _of_any_level(targets: Targets) -> set[Target]:
-    return {replace(target, level_db_sl=None) for _, target in targets}
-
-
-def _is_long(targets: Targets) -> bool:
-    """Whether any course is answered in more time than the control loop has."""
-    return any(each.course is not None and each.course.duration > _SOON for _, each in targets)
-
-
 def _of_any_course(targets: Targets) -> set[Target]:
+    """Return targets without what may differ in a late choice: level, pulse, course."""
     return {
-        replace(target, pulse=None, modulation_hz=None, course=None)
-        for target in _of_any_level(targets)
+        replace(target, level_db_sl=None, pulse=None, modulation_hz=None, course=None)
+        for _, target in targets
     }
 
 
@@ -457,19 +442,22 @@ class AnswerThread:
 
 
 class Selector:
-    """Chooses the contents of a table that realise an intent for the contacts on its plate.
+    """Keeps a selection for the contacts on a plate, and chooses anew where it no longer serves.
 
-    Each target has its own: all that last are chosen together, in a thread where they are several;
-    a short pulse is chosen alone beside them, and never changed. What lasts stays as long as its
-    targets and their levels do, no contact has moved more than 8 mm, none of several has set out,
-    and none has another load, which changes by a factor of 1.5 or more. A contact that lifts, or
-    whose effect ends, leaves the others as they are. Once all rest, contents are led to a better
-    answer, if there is one, a step after the other, until anything changes: fingers, the table with
-    its clocks, or what the amplifiers allow. Where a finger was held back before that, all are
-    chosen anew. An answer that takes too long is given up: all that lasts is silent until its
-    fingers change, or until that answer has ended at last. chooser: answers the next question; what
-    the thread computes goes on by the former one. arrived: called when the thread is done;
-    may_lead: whether contents may be led to from what plays at a time [s].
+    Each target has contents of its own: all that last are chosen together, in a thread where they
+    are several; a short pulse is chosen alone beside them, and never changed. What lasts is kept as
+    long as its targets and their levels are the same, no contact has moved more than 8 mm, none of
+    several has set out, and none has another load, which changes by a factor of 1.5 or more. A
+    contact that lifts, or whose effect ends, leaves the others as they are.
+
+    Once all rest, contents are led to a better answer, if there is one, a step after the other,
+    until anything changes: fingers, the table with its clocks, or the limits of the amplifiers.
+    Where a finger was held back before that, all are chosen anew. A choice that takes too long is
+    given up: all that lasts is silent until its fingers change, or until that choice has ended.
+
+    chooser: makes the next choice; a choice in the thread goes on by the former one. arrived:
+    called when the thread is done; may_lead: whether contents may be led to from what plays at a
+    time [s].
     """
 
     def __init__(
@@ -491,9 +479,9 @@ class Selector:
         self._led_at = -math.inf  # s; by the last step
         self._fading = _NOTHING  # what plays until that has been taken
         self.requests = 0
-        """How often the thread was asked."""
+        """Number of choices begun in the thread."""
         self.due = math.inf
-        """When [s] to select anew though no contact changes: all rest, or pulses have ended."""
+        """Time [s] to select anew though no contact changes: all rest, or pulses have ended."""
 
     @property
     def is_choosing(self) -> bool:
@@ -508,9 +496,9 @@ class Selector:
         *,
         now: float = math.inf,
     ) -> Selection:
-        """Return the selection for contacts in their order of arrival; equal if it is kept.
+        """Return the selection for contacts in their order of arrival; an equal one if it is kept.
 
-        While the thread computes, what played and is still to be felt stays. now [s]: infinite
+        While the thread computes, contents that play and are still wanted stay. now [s]: infinite
         where fingers do not move.
         """
         by_key = defaultdict[ContactKey, list[Target]](list)
@@ -575,7 +563,7 @@ class Selector:
         return found
 
     def choose_anew(self) -> None:
-        """Choose anew what lasts, silent until then; what the thread computes is not taken."""
+        """Choose anew what lasts: silent until then, and not by a choice that is under way."""
         self._lasting, self._steps, self._requested = _NOTHING, (), None
 
     def _rest_again(self, now: float) -> None:
@@ -596,7 +584,7 @@ class Selector:
         self.due = now + CROSSFADE_INTERVAL if self._steps else math.inf
 
     def _request_again(self) -> None:
-        """Ask anew for fingers that were left without an answer, since one has ended."""
+        """Choose anew for fingers whose choice was given up, since a late one has ended."""
         if self._lasting.reason in _UNANSWERED:
             self._lasting = _NOTHING
 
@@ -608,9 +596,10 @@ class Selector:
         *,
         has_waited: bool,
     ) -> Iterator[ChoiceRequest]:
-        """Yield what is to be asked now, one after the other; pulses: of all fingers, until now.
+        """Yield the requests that are due, one after the other.
 
-        A pulse that has waited for the thread goes before what lasts, for which it would be late.
+        pulses: selections of pulses until now. A pulse that has waited for the thread goes before
+        what lasts, after which it would be late.
         """
         lasting = intended.lasting
         is_kept = not lasting or _is_met_by(intended, self._lasting)
@@ -624,7 +613,9 @@ class Selector:
             ):
                 is_kept = False
         if lasting:
-            takes_long = not is_alone(lasting, intended.protected) or _is_long(lasting)
+            takes_long = not is_alone(lasting, intended.protected) or any(
+                each.course is not None and each.course.duration > _SOON for _, each in lasting
+            )
         is_rested = is_due and is_kept and takes_long
         if is_rested and any(target.course for _, target in lasting):  # which no cross-fade follows
             is_rested = False
@@ -666,11 +657,11 @@ class Selector:
         return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
 
     def _is_intended(self, chosen: Choice, intended: Intention) -> bool:
-        """Whether what was chosen to last is for those that are on the plate by now.
+        """Whether a late choice of what lasts still serves the contacts on the plate.
 
-        Places may have changed since, and what effects change, or a program that plays them again:
-        else such a finger would get nothing. Those of another layout are not played. What plays may
-        do again, since a finger that came has lifted meanwhile.
+        Places, levels and courses may have changed since, or such a finger would get nothing; the
+        layout may not. It is dropped if what plays will do again, since a finger that came has
+        lifted meanwhile.
         """
         found = chosen.lasting
         if found is not None and found.reason in _UNANSWERED:
@@ -688,7 +679,7 @@ class Selector:
         )
 
     def _take(self, chosen: Choice, now: float, *, is_late: bool = False) -> None:
-        """Take what was chosen, at a time [s]; is_late: without what lasts."""
+        """Take a choice at a time [s]; is_late: without what lasts."""
         self._short = {**self._short, **chosen.short}
         if chosen.steps and self._requested == self._situation:
             self._steps, self.due = chosen.steps, now
@@ -702,7 +693,7 @@ class Selector:
 
 
 def _situation_of(intended: Intention) -> tuple[object, ...]:
-    """Equal as long as the same fingers are to feel the same of what lasts, in any places."""
+    """Return a value that changes with the fingers or their targets that last, not with places."""
     contacts = frozenset([(each.key, each.since, each.load) for each in intended.contacts])
     return contacts, _targets_of(intended.lasting), intended.protected
 
@@ -715,7 +706,7 @@ def _together(
     reason: str,
     table: LocalizationTable,
 ) -> Selection:
-    """Join what was chosen apart, contacts as they were then; reason: why there are no targets."""
+    """Join selections made apart, contacts as they were then; reason: why there are no targets."""
     chosen: list[Selection] = []
     for part in parts:
         if part.targets:
@@ -740,7 +731,7 @@ def _together(
 
 
 def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
-    """Return what was chosen, without the contents of all fingers but some, by key."""
+    """Return a selection with the contents of some fingers alone, by key."""
     targets, quiet, contents = list[tuple[Contact, Target]](), [*chosen.quiet], list[Content]()
     for contact, target in chosen.targets:
         if contact.key in keys:
@@ -766,10 +757,10 @@ def _felt(chosen: Selection, keys: Set[ContactKey]) -> Selection:
 def _within_layers(
     targets: Targets, capabilities: PlaybackCapabilities
 ) -> tuple[Targets, tuple[Prediction, ...]]:
-    """Leave out targets for which there is no layer: of the lowest priority, then the earliest.
+    """Split targets into those that have a layer, and predictions for the others.
 
-    Before these short pulses of fingers that feel what lasts. Many that may share have one layer
-    together.
+    Short pulses of fingers that feel what lasts are left out first, then the targets of lowest
+    priority, the earliest first. Many that may share have one layer together.
     """
     mode = capabilities.drive_mode
     count = capabilities.layers if mode == UNRESTRICTED else 1

@@ -38,7 +38,7 @@ from controller.api.schema import (
     TouchPoint,
 )
 from controller.content.pattern import MAX_GIVEN
-from controller.effects.player import GainDb, SourceName
+from controller.effects.strengths import GainDb, SourceName
 
 DEFAULT_LEASE = 10.0  # s
 MAX_TOUCHES = 64  # per frame; a panel reports ten, a forearm some more

@@ -19,7 +19,7 @@ from controller.effects.layout import (
     level_problem,
     load_layout,
 )
-from controller.effects.player import read_strengths
+from controller.effects.strengths import read_strengths
 from controller.process.daemon_process import check_socket_path
 from controller.sources.touch import TouchCalibration, TouchSource, fitted, open_source, turned
 from drivers.by_hand.reaching import check_links

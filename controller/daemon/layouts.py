@@ -20,7 +20,8 @@ from controller.api.schema import TouchInputStatus
 from controller.daemon.children import read_in_child
 from controller.daemon.config import DaemonConfig, TouchInput
 from controller.effects.layout import SurfaceLayout
-from controller.effects.player import EffectPlayer, Strengths, read_strengths
+from controller.effects.player import EffectPlayer
+from controller.effects.strengths import Strengths, read_strengths
 from controller.sources.touch import ALIGNED, RejectCounter, TouchFrame, TouchSource
 from model.arrays import FloatArray
 from model.errors import InputError

@@ -53,7 +53,7 @@ from controller.api.server import Hub
 from controller.daemon.config import DaemonConfig
 from controller.daemon.layouts import LayoutChoice
 from controller.effects.layout import SurfaceLayout
-from controller.effects.player import UNNAMED
+from controller.effects.strengths import UNNAMED
 from controller.learning.learning import Learning
 from controller.operation.operation_states import DaemonState, Loss, Operation
 from controller.operation.supervisor import LinkChange

@@ -1,7 +1,4 @@
-"""Effects: their parameters in a layout, and their course at one finger.
-
-A region of the plate and its effects.
-"""
+"""Effects: their parameters in a layout, their runs at one finger, and the regions they play in."""
 
 import math
 from abc import ABC, abstractmethod
@@ -24,27 +21,29 @@ ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")
 
 @dataclass(frozen=True)
 class Region:
-    """A region of the plate and the names of its effects, None for none.
-
-    on_press: when a finger comes down or slides in; on_move: while it moves within; on_release:
-    when it slides out. A finger that lifts feels nothing. level_db_sl: replaces the level of the
-    effects if has_level; band: their frequencies, if not None. priority: lower ones give way first.
-    is_own: a finger in it feels its own content or none; may_share: it may feel that of any finger
-    that may share, too; is_protected: no content that it would notice is played elsewhere.
-    """
+    """A region of the plate and the names of its effects; a finger that lifts feels none."""
 
     name: str
     shape: Shape
     on_press: str | None = None
+    """Effect when a finger comes down or slides in."""
     on_move: str | None = None
+    """Effect while it moves within."""
     on_release: str | None = None
+    """Effect when it slides out."""
     level_db_sl: float | None = None
+    """Replaces the level of the effects if has_level."""
     has_level: bool = False
     priority: int = 0
+    """Effects of lower priority give way first."""
     band: Band | None = None
+    """Replaces the band of the effects unless None."""
     is_own: bool = False
+    """Whether a finger in it feels its own content or none."""
     may_share: bool = False
+    """Whether it may also feel the content of any other finger that may share."""
     is_protected: bool = False
+    """Whether no content is played elsewhere that a finger in it would notice."""
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the API describes it."""
@@ -81,7 +80,7 @@ MAX_DURATION = 10.0
 Modulation: TypeAlias = (
     Annotated[float, Quantity(FREQUENCY, at_least=MIN_MODULATION, at_most=MAX_MODULATION)] | None
 )
-"""How often a second a vibration comes and goes [Hz]; None for a steady one."""
+"""Frequency [Hz] at which a vibration comes and goes; None for a steady one."""
 
 Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=NEIGHBOURS)]
 """dB above the detection threshold, or `neighbours`."""
@@ -89,27 +88,27 @@ Level: TypeAlias = Annotated[float | Literal["neighbours"], replace(DB_SL, word=
 
 @dataclass(frozen=True, slots=True)
 class EffectStimulus:
-    """Target of one finger from now on.
-
-    level_db_sl: None for as strong as the neighbours allow. until: when [s] that may change though
-    the finger does nothing; None for never. pulse: for a vibration of limited duration, which the
-    amplifiers end by themselves. modulation_hz: how often a second its strength comes and goes, 10
-    to 30; None for a steady one, as are pulses below 0.2 s. course: along which it is felt over its
-    pulse, at the level where that is 1, and anew until the pulse ends; None for steadily. band: its
-    own frequencies, where the layout says none. click: a short pulse that is felt beside it.
-    is_absolute: whether a short pulse is as strong as its level says, whatever lasts there.
-    among_others: what is felt instead while other fingers are on the plate; None: the same.
-    """
+    """What one finger shall feel of an effect from now on."""
 
     level_db_sl: float | None
+    """None for as strong as the neighbours allow."""
     until: float | None = None
+    """When [s] the stimulus may change though the finger does nothing; None for never."""
     pulse: Pulse | None = None
+    """Set for a vibration of limited duration, which the amplifiers end by themselves."""
     modulation_hz: float | None = None
+    """Frequency [Hz] at which its strength comes and goes, 10 to 30; None for a steady one. Pulses
+    below 0.2 s are steady."""
     course: Course | None = field(default=None, repr=False)
+    """Course of its strength, again and again over the pulse; the level is felt where it is 1."""
     band: Band | None = None
+    """Its own frequencies, where the layout gives none."""
     click: "EffectStimulus | None" = None
+    """Short pulse that is felt beside it."""
     is_absolute: bool = False
+    """Whether a short pulse has the level given here whatever lasts at the finger."""
     among_others: "EffectStimulus | None" = None
+    """Replaces it while other fingers are on the plate; None: nothing does."""
 
     def target(
         self,
@@ -123,8 +122,8 @@ class EffectStimulus:
     ) -> Target:
         """Return the target of a finger that feels it in a region, or outside of all.
 
-        effect: its name; band: by the layout, None for its own; above_db: that a short pulse has
-        over what lasts there.
+        effect: name of the effect; band: given by the layout, None for its own; above_db: least
+        level of a short pulse over what lasts there.
         """
         is_raised = self.is_short and self.pulse is not None and self.pulse.is_raised
         return Target(
@@ -143,13 +142,13 @@ class EffectStimulus:
 
     @property
     def is_short(self) -> bool:
-        """Whether it is a short pulse, beside which another is felt that lasts."""
+        """Whether it is a short pulse, which is felt beside a stimulus that lasts."""
         return self.pulse is not None and self.pulse.is_short and self.course is None
 
 
 @dataclass(frozen=True, slots=True)
 class NoStimulus:
-    """A finger shall feel nothing now; until as in `EffectStimulus`."""
+    """Silence at one finger; until as in `EffectStimulus`."""
 
     until: float | None = None
 
@@ -167,7 +166,7 @@ class EffectRun(ABC):
 
 @dataclass(frozen=True)
 class SteadyRun(EffectRun):
-    """A level for one pulse, None for as long as the finger stays."""
+    """A steady level for one pulse, or as long as the finger stays if that is None."""
 
     level_db_sl: float | None
     pulse: Pulse | None
@@ -187,7 +186,7 @@ _FREQUENCY = Annotated[float, Quantity(FREQUENCY, at_least=10, at_most=1000)]
 
 
 class TunedSection(Section):
-    """A section that may fix the frequency, or the band that it is in."""
+    """A section that may fix a frequency or a band."""
 
     frequency: _FREQUENCY | None = None
     band: Annotated[tuple[_FREQUENCY, _FREQUENCY], Strict(strict=False)] | None = None
@@ -212,36 +211,35 @@ class TunedSection(Section):
 
 
 class Effect(TunedSection, ABC):
-    """Parameters of an effect; each kind of effect is a subclass.
-
-    kind: its name in layouts; is_for_motion: whether it follows a moving finger and belongs under
-    `on_move`, or runs by itself; needs_region: whether it is felt in regions only; needs_entry:
-    whether a layout defines it before it is used. Those of the project that need none exist in
-    every layout.
-    """
+    """Parameters of an effect; each kind of effect is a subclass."""
 
     kind: ClassVar[str]
+    """Its name in layouts."""
     is_for_motion: ClassVar[bool]
+    """Whether it follows a moving finger and belongs under `on_move`; else it runs by itself."""
     needs_region: ClassVar[bool] = False
+    """Whether it is felt in regions only."""
     needs_entry: ClassVar[bool] = True
+    """Whether a layout must define it; kinds of the project that need no entry are in every
+    layout."""
 
     level: Level = STRONG_DB_SL
 
     @abstractmethod
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
-        """Start at a finger, at a time [s]; level None for as strong as the neighbours allow."""
+        """Start a run at a finger, at a time [s]; level None: as strong as the neighbours allow."""
 
     def start_in(
         self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
     ) -> EffectRun:
-        """Start in a region, or outside of all; for effects that depend on it."""
+        """Start a run in a region, or outside of all; overridden by kinds that depend on it."""
         return self.start(contact, now, level_db_sl=level_db_sl)
 
     def read(self, folder: Path) -> None:
-        """Read what it names, from the folder of its layout; raises InputError."""
+        """Read the files that it names, from the folder of its layout; raises InputError."""
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it as it is played at the frequencies of a table [Hz]."""
+        """Return the effect as it is played at the frequencies of a table [Hz]."""
         return self
 
     def is_prepared(self, level_db_sl: float | None) -> bool:
@@ -249,7 +247,7 @@ class Effect(TunedSection, ABC):
         return True
 
     def prepare(self, level_db_sl: float | None) -> object:
-        """Make what a start at a level would take time for; called outside of the control loop."""
+        """Prepare a start at a level that would take time; called outside of the control loop."""
 
     def gives_level_in(self, region: Region | None) -> bool:
         """Whether its layout gives it a level of its own, in a region or outside of all."""

@@ -1,18 +1,6 @@
-"""Kinds of effects by name: those of the project, and those of installed packages.
+"""Kinds of effects by name: those of the project (`BUILT_IN`), and those of installed packages.
 
-Buzz: a steady vibration, as long as the finger stays or for a duration.
-
-Click: one short vibration.
-
-Detents: a click at equal distances along the way of the finger.
-
-Dial: a click at equal angles about the centre of a region.
-
-Ramp: a level that rises or falls in steps.
-
-Texture: a vibration whose level follows the speed of the finger.
-
-File: content that people have, AHAP and its relatives, felt from its beginning to its end.
+Each kind is a section of a layout with its parameters, and a run that follows one finger.
 """
 
 import math
@@ -92,14 +80,13 @@ class Click(Effect):
         return SteadyRun(level_db_sl, Pulse(self.duration, now))
 
 
-# A finger has passed a detent once it is this far [m] beyond it.
-_HYSTERESIS = 0.0005
+_HYSTERESIS = 0.0005  # m; a finger has passed a detent once it is this far beyond it
 
 
 class Notches:
     """Clicks of a duration [s] at equal distances along a coordinate of one finger.
 
-    It starts halfway between two of them. hysteresis: how far beyond one the finger has passed it.
+    The finger starts halfway between two notches; it has passed one when it is hysteresis beyond.
     """
 
     def __init__(
@@ -119,7 +106,7 @@ class Notches:
         self._pulse: Pulse | None = None  # of the last notch
 
     def at(self, coordinate: float, now: float) -> EffectStimulus | NoStimulus:
-        """Return a click from each passing on; several passed at once are one click."""
+        """Return a click from each passing on; several notches passed at once are one click."""
         away = coordinate - self._middle
         passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
         if passed > 0:
@@ -180,11 +167,9 @@ class _DetentsRun(EffectRun):
         return self._notches.at(self._detents.position(contact), now)
 
 
-# A finger has passed a detent once it is this far [rad] beyond it, or [m] where that is more.
-_DIAL_HYSTERESIS, _HYSTERESIS_LENGTH = 0.02, 0.0005
-_DEGREES_15 = 0.26179938779914946  # rad; as the file's units convert it
-# Nearer to the centre [m] the angle of a finger is noise, and does not count.
-_CENTRE_RADIUS = 0.006
+_DIAL_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle where that is more
+_DEGREES_15 = 0.26179938779914946  # rad; as the units of a file convert it
+_CENTRE_RADIUS = 0.006  # m; nearer to the centre the angle of a finger is noise
 
 
 class Dial(Effect):
@@ -250,7 +235,7 @@ class _DialRun(EffectRun):
             self._notches = Notches(
                 self._angle,
                 spacing=self._dial.spacing,
-                hysteresis=max(_DIAL_HYSTERESIS, _HYSTERESIS_LENGTH / radius),
+                hysteresis=max(_DIAL_HYSTERESIS, _HYSTERESIS / radius),
                 duration=self._dial.duration,
                 level_db_sl=self._level,
             )
@@ -317,18 +302,12 @@ class _RampRun(EffectRun):
         return EffectStimulus(self.levels[index], until, pulse=pulse)
 
 
-# Speed is measured over this time [s]; panels report 60 to 200 times a second.
-_SPEED_WINDOW = 0.060
-# A finger without movement for so long [s] is at rest.
-_REST_TIMEOUT = 0.080
-# Levels are this far apart [dB], so that not every report is another command.
-_LEVEL_STEP = 2.0
-# The level changes when the speed asks for one this far [dB] from it: hysteresis.
-_LEVEL_HYSTERESIS = 1.5
-# Reports closer together [s] are treated as this far apart; no panel is faster.
-_MIN_REPORT_INTERVAL = 0.002
-# Movement below this distance [m] is sensor noise.
-_NOISE = 0.0002
+_SPEED_WINDOW = 0.060  # s; over which speed is measured: panels report 60 to 200 times a second
+_REST_TIMEOUT = 0.080  # s; a finger without movement for so long is at rest
+_LEVEL_STEP = 2.0  # dB; between levels, so that not every report is another command
+_LEVEL_HYSTERESIS = 1.5  # dB; the level changes when the speed gives one this far from it
+_MIN_REPORT_INTERVAL = 0.002  # s; no panel is faster
+_NOISE = 0.0002  # m; movement below it is sensor noise
 
 
 class Texture(Effect):

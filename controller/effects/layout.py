@@ -1,6 +1,7 @@
-"""A surface layout: which regions of the plate have which effects.
+"""Surface layouts: which regions of the plate have which effects, and the files that say so.
 
-The file of a surface layout: read, checked, and a kind of configuration for `era config`.
+A file is read and checked as a whole, with every problem; `LAYOUT` makes it a kind of configuration
+for `era config`.
 """
 
 import math
@@ -23,7 +24,7 @@ from controller.effects.effect import (
     TunedSection,
 )
 from controller.effects.kinds import BUILT_IN, effect_kind, effect_kinds, named_effects
-from controller.play.intent import Band, band_problem
+from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
 from model.config.document import Document, KeyPath, read_document
@@ -51,14 +52,12 @@ def default_effects(level_db_sl: float = STRONG_DB_SL) -> dict[str, Effect]:
 
 @dataclass(frozen=True)
 class SurfaceLayout:
-    """Regions, later ones on top of earlier ones, and effects by name.
-
-    elsewhere: the effect outside of all regions, of the newest finger there; None for none.
-    """
+    """Regions, later ones on top of earlier ones, and effects by name."""
 
     regions: tuple[Region, ...] = ()
     effects: Mapping[str, Effect] = field(default_factory=default_effects)
     elsewhere: str | None = BUZZ
+    """Effect outside of all regions, felt by the newest finger there."""
 
     def region_at(self, x: float, y: float) -> Region | None:
         """Return the topmost region at a position [m], or None."""
@@ -77,7 +76,7 @@ class SurfaceLayout:
             yield None, ELSEWHERE, self.elsewhere
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it as it is played at the frequencies of a table [Hz], prepared at its levels."""
+        """Return the layout for the frequencies of a table [Hz], with its effects prepared."""
         effects = {name: each.for_table(frequencies) for name, each in self.effects.items()}
         for each in effects.values():
             each.prepare(each.level_db_sl)
@@ -105,20 +104,12 @@ class SurfaceLayout:
             return region.level_db_sl
         return self.effects[name].level_db_sl
 
-    def gives_level(self, name: str, region: Region | None) -> bool:
-        """Whether it gives an effect, by name, a level of its own in a region."""
-        return self.effects[name].gives_level_in(region)
-
-    def band_of(self, name: str, region: Region | None) -> Band | None:
-        """Return the band of an effect [Hz], by name, in a region or outside of all; None: any."""
-        return self.effects[name].band_in(region)
-
     def band_problems(self, frequencies: FloatArray) -> list[str]:
         """Return what a table of frequencies [Hz] plays instead of bands that it lacks."""
         problems = [
             f"{ELSEWHERE if region is None else region.name}: {problem}"
             for region, _, name in self.uses()
-            if (band := self.band_of(name, region)) is not None
+            if (band := self.effects[name].band_in(region)) is not None
             and (problem := band_problem(band, frequencies)) is not None
         ]
         return [*dict.fromkeys(problems)]
@@ -131,7 +122,7 @@ class SurfaceLayout:
         }
 
 
-_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # more are one problem, of which none is looked at
+_MAX_REGIONS, _MAX_EFFECTS = 256, 64  # those beyond are one problem, and not checked
 
 
 _HighestLevel = Annotated[

@@ -1,136 +1,18 @@
-"""From contacts to a haptic intent by a surface layout: which finger feels which effect.
+"""The player of a surface layout: from contacts to a haptic intent, which finger feels which
+effect."""
 
-What a strength may be, over the API and in the file that keeps it.
-
-Strengths: a gain on what a source or client brings, or a region has, kept by its name.
-"""
-
-import json
 import math
-import os
-import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from pathlib import Path
-from typing import Annotated, Any, TypeAlias
-
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from controller.effects.effect import Effect, EffectRun, EffectStimulus, NoStimulus, Region
 from controller.effects.layout import SurfaceLayout
+from controller.effects.strengths import Strengths
 from controller.play.intent import NO_CONTACTS, Band, HapticIntent, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
-from model.config.document import read_bytes
-from model.errors import InputError, shown
-from model.files.array_file import whole_or_nothing
 from model.transients.excursions import CLICKS_APART
 from registry.plugins import WrongResultError
-
-SourceName: TypeAlias = Annotated[str, Field(min_length=1, max_length=2048)]
-"""A name that has a strength; those of senders are escaped, and so may be long."""
-
-GainDb: TypeAlias = Annotated[float, Field(ge=-40, le=0)]
-"""The gain [dB] of a name."""
-
-
-MAX_NAMES = 64
-"""How many touch sources are remembered, and how many names may have a gain."""
-
-UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
-"""Clients that no strength is kept for: commands, and browsers that have given no name."""
-
-_MAX_SIZE = 1 << 21  # bytes; of as many names of the greatest length, each character escaped
-
-_Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
-_GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
-
-
-class Strengths:
-    """Gains [dB] by name, 0 at most, which is what holds where none is set.
-
-    A name is that of a touch input of the configuration, of a sender there
-    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, of a client, or of a
-    region of a layout. At a finger the gains of its names, of its region and of the client that
-    plays its effect add up, each once.
-    """
-
-    def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
-        self.gains_db = gains_db or {}
-        """Those that were set, by name; also to 0."""
-        self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
-        """The clients: the origin with which the keys of their sources begin, and their names."""
-        self.sources: Sequence[str] = ()
-        """Names of touch sources that had fingers."""
-
-    def note(self, source: str) -> None:
-        """Note that a touch source has a finger."""
-        name, _ = self._names_of(source)
-        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
-
-    def gain_db(self, source: str, player: str | None = None, region: str | None = None) -> float:
-        """Return the gain at a finger of a source; player: the client that plays its effect.
-
-        region: in which the effect is felt.
-        """
-        names = {*self._names_of(source), player, region} if self.gains_db else ()
-        return sum([gain for name, gain in self.gains_db.items() if name in names])
-
-    def set(self, name: str, gain_db: float) -> None:
-        """Set the gain [dB] of a name from now on.
-
-        For one name more than there may be the oldest at 0 is removed. Raises InputError if all
-        others are lower.
-        """
-        gains = {**self.gains_db, name: gain_db}
-        if len(gains) > MAX_NAMES:
-            gains.pop(next((each for each, gain in gains.items() if not gain), name))
-        if gain_db and name not in gains:
-            raise InputError(
-                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
-                "another to 0 dB first"
-            )
-        self.gains_db = gains
-
-    def save(self, file: Path) -> None:
-        """Write the gains that are set, atomically; raises OSError."""
-        with whole_or_nothing(file) as stream:
-            stream.write(json.dumps(self.gains_db, indent=1).encode())
-
-    def _names_of(self, source: str) -> tuple[str, str]:
-        """Return the two names of a source, its own first."""
-        first, second, *rest = f"{source}::".split(":", 2)
-        client = dict(self.clients()).get(f"{first}:{second}")
-        return (source, first) if client is None else (rest[0][:-2], client)
-
-
-def read_strengths(file: Path | None) -> Mapping[str, float]:
-    """Read the gains [dB] of a file, none where there is no file; raises InputError."""
-    if file is None or not os.path.lexists(file):
-        return {}
-    text = read_bytes(file, _MAX_SIZE, is_for="remove it", give="a file of strengths")
-    try:
-        # A number of many digits becomes infinite, and is refused as such.
-        gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
-        return _GAINS.validate_python(gains, strict=True)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
-    except ValidationError as error:
-        raise InputError(
-            f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
-            "remove it"
-        ) from error
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Make an object of JSON; raises InputError for a name that is repeated."""
-    found = dict[str, Any]()
-    for name, value in pairs:
-        if name in found:
-            raise InputError(f"strengths must have each name once, got {shown(name)} twice")
-        found[name] = value
-    return found
-
 
 # A finger on the edge of a region must not flip between regions with sensor noise: it stays in one
 # until it is this far [m] from where it entered.
@@ -139,9 +21,11 @@ _NOISE = 0.001
 REQUESTED_PRIORITY = 1_000_000
 """Priority of an effect requested by name, above all regions."""
 
-CLICK_ABOVE_DB, NOTICED_ABOVE_DB = 6.0, 3.0
-"""Level [dB] of a short pulse above what lasts at its finger: where a layout gives it none, and
-from which on it is noticed."""
+CLICK_ABOVE_DB = 6.0
+"""Level [dB] of a short pulse above what lasts at its finger, where a layout gives it none."""
+
+NOTICED_ABOVE_DB = 3.0
+"""Level [dB] above what lasts from which on a short pulse is noticed."""
 
 # A short pulse that would have to wait longer [s], two turns with rounding, is left out.
 _MAX_WAIT = 2 * CLICKS_APART + 0.005
@@ -149,22 +33,18 @@ _MAX_WAIT = 2 * CLICKS_APART + 0.005
 
 @dataclass
 class _Play:
-    """A run of an effect at one finger, numbered in order of start.
-
-    is_elsewhere: whether it is the effect outside of all regions; above_db: as of targets; player:
-    who requested it.
-    """
+    """A run of an effect at one finger."""
 
     name: str
     effect: Effect
     run: EffectRun
-    number: int
+    number: int  # in order of start
     priority: int
     band: Band | None
     region: Region | None
-    is_elsewhere: bool
-    above_db: float | None
-    player: str | None = None
+    is_elsewhere: bool  # the effect outside of all regions
+    above_db: float | None  # as of targets
+    player: str | None = None  # client that requested it
 
     @property
     def outlasts_its_layout(self) -> bool:
@@ -175,27 +55,23 @@ class _Play:
 
 @dataclass
 class _Finger:
-    """The region of a finger that is down since a time [s], where it entered, and its plays.
+    """The state of a finger."""
 
-    ended: name of the effect that ended last, "" before any has.
-    """
-
-    since: float
+    since: float  # s; when it came down
     region: Region | None
-    entered: tuple[float, float]
+    entered: tuple[float, float]  # m; where it entered the region
     plays: list[_Play] = field(default_factory=list)
-    ended: str = ""
+    ended: str = ""  # name of the effect that ended last
 
 
 class EffectPlayer:
-    """Plays the effects of a layout. Deterministic: times are arguments.
+    """Plays the effects of a layout; times are arguments.
 
-    Every finger feels its newest play that lasts; when that is over, the one before continues; and
-    beside it the newest short pulse, 6 dB above it where no level is given. Of the fingers that
-    feel the effect outside of all regions only the newest does. Short pulses of two fingers are 60
-    ms apart: of each finger the newest waits its turn, for 0.12 s at most. A play without a
-    stimulus at the moment (no detent passed, no movement) does not count. strengths: of sources,
-    clients and regions.
+    Every finger feels its newest play that lasts; when that is over, the one before continues.
+    Beside it the finger feels its newest short pulse, 6 dB above it where no level is given. The
+    effect outside of all regions is felt by the newest finger there alone. Short pulses of two
+    fingers are 60 ms apart: the newest of each finger waits its turn, for 0.12 s at most. A play
+    without a stimulus at the moment (no detent passed, no movement) does not count.
     """
 
     def __init__(self, layout: SurfaceLayout, strengths: Strengths | None = None) -> None:
@@ -261,7 +137,7 @@ class EffectPlayer:
         )
 
     def why_not(self, key: ContactKey) -> str:
-        """Return why a finger shall feel nothing by the last intent, "" if it shall."""
+        """Return why a finger feels nothing by the last intent; "" if it feels something."""
         finger = self._fingers.get(key)
         if finger is None or key in self._felt:
             return ""
@@ -281,17 +157,17 @@ class EffectPlayer:
         return "no effect plays there; touch again, in a region that has one"
 
     def replace(self, layout: SurfaceLayout) -> None:
-        """Play another layout from now on; fingers that rest feel no press of it.
+        """Play another layout from now on; fingers on the plate feel no press of it.
 
-        What was requested for them, and what ends by itself, goes on to its end. Of the layout only
-        effects for motion or without an end start.
+        Requested effects, and those that end by themselves, go on to their ends. At these fingers
+        only effects for motion or without an end of the new layout start.
         """
         self.layout = layout
         self._already_pressed |= self._fingers
         self._fingers = {}
 
     def effect_of(self, key: ContactKey) -> str | None:
-        """Return the name of the effect that plays for a finger, None for none."""
+        """Return the name of the effect that plays at a finger, or None."""
         finger = self._fingers.get(key)
         return finger.plays[-1].name if finger and finger.plays else None
 
@@ -305,17 +181,17 @@ class EffectPlayer:
         player: str | None = None,
         effect: Effect | None = None,
     ) -> None:
-        """Start a named effect at a finger, again if it was requested there before.
+        """Start a named effect at a finger, in place of an earlier request of that name.
 
-        level_db_sl: replaces its own unless None. player: the client whose strength it has; effect:
-        in place of that of the layout. Raises KeyError for an unknown effect.
+        level_db_sl: replaces the level of the effect unless None; player: client whose strength it
+        has; effect: replaces that of the layout. Raises KeyError for an unknown effect.
         """
         effect = effect or self.layout.effects[name]
         level = effect.level_db_sl if level_db_sl is None else level_db_sl
         finger = self._fingers.get(contact.key)
         if finger is None or finger.since != contact.since:
             finger = self._add(contact, now)
-        # Replacing the earlier one keeps requests from piling up.
+        # Requests must not pile up.
         finger.plays = [
             play
             for play in finger.plays
@@ -329,7 +205,7 @@ class EffectPlayer:
         finger.plays[-1].player = player
 
     def _waits(self, target: Target, now: float, ends: list[float]) -> bool:
-        """Whether a short pulse must wait at a time [s] for its turn after those of others."""
+        """Whether a short pulse waits for its turn at a time [s]; if so, add its end to ends."""
         key, pulse = target.key, target.pulse
         if pulse is None or not target.is_short or pulse.started_at is not None:
             return False
@@ -348,7 +224,7 @@ class EffectPlayer:
         return False
 
     def _line_up(self, key: ContactKey, pulse: Pulse) -> None:
-        """Give a short pulse its turn: that of the one of its finger that waits, or the last."""
+        """Give a short pulse its turn: that of its finger's pulse that waits, or the last."""
         before = self._waiting.get(key)
         if before is None:
             others = [each.due_at for each in self._waiting.values()]
@@ -451,10 +327,9 @@ class EffectPlayer:
     def _current_stimuli(
         self, finger: _Finger, contact: Contact, now: float, ends: list[float]
     ) -> Collection[tuple[_Play, EffectStimulus]]:
-        """Return the plays that a finger feels now and their stimuli; add all `until` to ends.
+        """Return what a finger feels: the newest play that lasts, and the newest short pulse.
 
-        The newest that lasts, and the newest short pulse. All its plays are called, because those
-        for motion follow the finger.
+        Adds every `until` to ends. All plays are called, since those for motion follow the finger.
         """
         felt: dict[bool, tuple[_Play, EffectStimulus]] = {}
         lasting: list[_Play] = []

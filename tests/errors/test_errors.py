@@ -24,7 +24,7 @@ import pytest
 from controller.cli.main import run
 from controller.content.formats import read_content
 from controller.effects.layout import load_layout
-from controller.effects.player import read_strengths
+from controller.effects.strengths import read_strengths
 from controller.gateway.settings import read_token
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError

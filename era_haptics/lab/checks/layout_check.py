@@ -182,7 +182,7 @@ def strongest_target(
     if strongest is None:
         return None
     priority = 0 if region is None else region.priority
-    band = layout.band_of(name, region)
+    band = layout.effects[name].band_in(region)
     return strongest.target(_KEY, name, region, band=band, priority=priority)
 
 
@@ -452,7 +452,7 @@ def _unnoticed(
     at: Position,
 ) -> Iterator[str]:
     """Short effects whose given level hides below what lasts in the region."""
-    if on == ON_RELEASE or not click.is_short or not layout.gives_level(name, region):
+    if on == ON_RELEASE or not click.is_short or not layout.effects[name].gives_level_in(region):
         return
     for other, beside, lasting in layout.uses():
         if other is not region or beside in (on, ON_RELEASE):

@@ -29,7 +29,7 @@ from controller.api.client import AsyncClient, Client
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.cli.main import BAD_INPUT, run
 from controller.demo.demonstration import layout_of_people
-from controller.effects.player import MAX_NAMES
+from controller.effects.strengths import MAX_NAMES
 from controller.operation.fault_dumps import (
     MAX_DECISIONS,
     MAX_LINE,

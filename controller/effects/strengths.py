@@ -1,0 +1,118 @@
+"""Strengths: gains on what a touch source or client brings, or a region has, kept by name.
+
+The types of names and gains bound them, over the API as in the file that keeps them.
+"""
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from model.config.document import read_bytes
+from model.errors import InputError, shown
+from model.files.array_file import whole_or_nothing
+
+SourceName: TypeAlias = Annotated[str, Field(min_length=1, max_length=2048)]
+"""Type of a name that has a strength; names of senders are escaped, and so may be long."""
+
+GainDb: TypeAlias = Annotated[float, Field(ge=-40, le=0)]
+"""Type of the gain [dB] of a name."""
+
+MAX_NAMES = 64
+"""Most touch sources that are remembered, and most names with a gain."""
+
+UNNAMED = re.compile(r"gateway|era|web:\d+ .*|http .*")
+"""Pattern of clients without a strength: commands, and browsers without a name."""
+
+_MAX_SIZE = 1 << 21  # bytes; of as many names of the greatest length, each character escaped
+_Gains = Annotated[dict[SourceName, GainDb], Field(max_length=MAX_NAMES)]
+_GAINS = TypeAdapter(_Gains, config=ConfigDict(allow_inf_nan=False))
+
+
+class Strengths:
+    """Gains [dB] by name, 0 at most and by default.
+
+    A name is that of a touch input of the configuration, of a sender there
+    (`table:tuio:10.0.0.2/left`), of a touch source as its client calls it, of a client, or of a
+    region of a layout. At a finger the gains of its names, of its region and of the client that
+    plays its effect add up, each once.
+    """
+
+    def __init__(self, gains_db: Mapping[str, float] | None = None) -> None:
+        self.gains_db = gains_db or {}
+        """Gains that were set, by name; also to 0."""
+        self.clients: Callable[[], Sequence[tuple[str, str]]] = tuple
+        """Returns, for each client, the beginning of the keys of its sources, and its name."""
+        self.sources: Sequence[str] = ()
+        """Names of touch sources that had fingers."""
+
+    def note(self, source: str) -> None:
+        """Note that a touch source has a finger."""
+        name, _ = self._names_of(source)
+        self.sources = [*dict.fromkeys([*self.sources, name])][-MAX_NAMES:]
+
+    def gain_db(self, source: str, player: str | None = None, region: str | None = None) -> float:
+        """Return the gain [dB] at a finger of a source.
+
+        player: the client that plays its effect; region: where the effect is felt.
+        """
+        names = {*self._names_of(source), player, region} if self.gains_db else ()
+        return sum([gain for name, gain in self.gains_db.items() if name in names])
+
+    def set(self, name: str, gain_db: float) -> None:
+        """Set the gain [dB] of a name from now on.
+
+        Beyond the most names the oldest with a gain of 0 is removed; without any raises InputError.
+        """
+        gains = {**self.gains_db, name: gain_db}
+        if len(gains) > MAX_NAMES:
+            gains.pop(next((each for each, gain in gains.items() if not gain), name))
+        if gain_db and name not in gains:
+            raise InputError(
+                f"strengths must be of at most {MAX_NAMES} names, got one more; set that of "
+                "another to 0 dB first"
+            )
+        self.gains_db = gains
+
+    def save(self, file: Path) -> None:
+        """Write the gains that are set, atomically; raises OSError."""
+        with whole_or_nothing(file) as stream:
+            stream.write(json.dumps(self.gains_db, indent=1).encode())
+
+    def _names_of(self, source: str) -> tuple[str, str]:
+        """Return the two names of a source, its own first."""
+        first, second, *rest = f"{source}::".split(":", 2)
+        client = dict(self.clients()).get(f"{first}:{second}")
+        return (source, first) if client is None else (rest[0][:-2], client)
+
+
+def read_strengths(file: Path | None) -> Mapping[str, float]:
+    """Read the gains [dB] of a file, by name; without a file there are none. Raises InputError."""
+    if file is None or not os.path.lexists(file):
+        return {}
+    text = read_bytes(file, _MAX_SIZE, is_for="remove it", give="a file of strengths")
+    try:
+        # A number of many digits becomes infinite, and is refused as such.
+        gains = json.loads(text, object_pairs_hook=_unique, parse_int=float)
+        return _GAINS.validate_python(gains, strict=True)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{file}: is not JSON ({error}); correct or remove it") from error
+    except ValidationError as error:
+        raise InputError(
+            f"{file}: must have strengths of -40 to 0 dB by name, {MAX_NAMES} at most; correct or "
+            "remove it"
+        ) from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object of JSON; raises InputError for a name that is repeated."""
+    found = dict[str, Any]()
+    for name, value in pairs:
+        if name in found:
+            raise InputError(f"strengths must have each name once, got {shown(name)} twice")
+        found[name] = value
+    return found

@@ -1,13 +1,10 @@
 """Touch panels of a Linux machine, read from the kernel's input devices.
 
-Requests and structures are those of the kernel's include/uapi/linux/input.h, with the layout of
-request numbers that x86, Arm and RISC-V share (asm-generic/ioctl.h).
-
-Multi-touch protocol type B: the contacts in the slots of a Linux touch panel.
-
-A panel for a single finger is one with a single slot, see `as_slot_event`. Events are described in
-the Linux kernel's Documentation/input/multi-touch-protocol.rst; the numbers are those of its
-input-event-codes.h.
+Panels use multi-touch protocol type B, with contacts in slots; one for a single finger is treated
+as one with a single slot (`as_slot_event`). Events are described in the kernel's
+Documentation/input/multi-touch-protocol.rst, with the numbers of its input-event-codes.h. Requests
+and structures are those of include/uapi/linux/input.h, with the layout of request numbers that x86,
+Arm and RISC-V share (asm-generic/ioctl.h).
 """
 
 import asyncio
@@ -38,7 +35,7 @@ TYPE_A = (
     "multi-touch protocol must be type B (slots), got type A, which does not say which contact is "
     "which; use another panel or driver, or a program that sends its touches as TUIO"
 )
-"""Why a panel is refused."""
+"""Refusal of a panel."""
 
 EV_SYN, EV_KEY, EV_ABS = 0x00, 0x01, 0x03
 SYN_REPORT, SYN_MT_REPORT, SYN_DROPPED = 0, 2, 3
@@ -56,7 +53,7 @@ SINGLE_TOUCH_AXES = {
     ABS_MT_POSITION_Y: ABS_Y,
     ABS_MT_PRESSURE: ABS_PRESSURE,
 }
-"""Axes of a slot, and those in their place of a panel for a single finger."""
+"""Axes of a slot, and the corresponding axes of a panel for a single finger."""
 
 _OF_ONE_FINGER = {(EV_ABS, single): (EV_ABS, axis) for axis, single in SINGLE_TOUCH_AXES.items()}
 _OF_ONE_FINGER[EV_KEY, BTN_TOUCH] = (EV_ABS, ABS_MT_TRACKING_ID)
@@ -65,7 +62,7 @@ _GRAVITY = 9.81  # m/s²
 
 
 def as_slot_event(event: InputEvent) -> InputEvent:
-    """Return an event of a panel for a single finger as that of the only slot of another."""
+    """Return an event of a panel for a single finger as that of a panel with one slot."""
     time, kind, code, value = event
     id_or_value = value - 1 if kind == EV_KEY else value  # pressed is 1, released 0
     return (time, *_OF_ONE_FINGER.get((kind, code), (kind, code)), id_or_value)
@@ -73,31 +70,28 @@ def as_slot_event(event: InputEvent) -> InputEvent:
 
 @dataclass(frozen=True)
 class PanelReport:
-    """Events of a panel up to a SYN_REPORT.
-
-    states: all its touches, for each state within the report, so that a contact is seen that comes
-    and goes within it or is replaced in its slot. is_partial: events were lost before it, so that
-    all contacts are unknown.
-    """
+    """Events of a panel up to a SYN_REPORT."""
 
     states: tuple[tuple[Touch, ...], ...]
+    """All touches in each state within the report: a contact may come and go within it, or be
+    replaced in its slot."""
     is_partial: bool = False
+    """Whether events were lost before it, so that all contacts are unknown."""
 
 
 @dataclass
 class SlotState:
-    """A slot as the kernel has it: values of its axes.
-
-    tracking_id: of the contact, negative without one; x, y: None until reported; tool: palms and
-    pens are no fingers; distance: above 0 while hovering. Values of axes that the panel does not
-    have are 0.
-    """
+    """The values of a slot's axes in the kernel; 0 for axes that the panel does not have."""
 
     tracking_id: int = -1
+    """Of the contact; negative without one."""
     x: int | None = None
+    """None until reported, as y."""
     y: int | None = None
     tool: int = MT_TOOL_FINGER
+    """Palms and pens are no fingers."""
     distance: int = 0
+    """Above 0 while hovering."""
     pressure: int = 0
     touch_major: int = 0
 
@@ -115,12 +109,12 @@ SLOT_AXES = {
 
 
 class SlotReader:
-    """Decoder of events into reports, without I/O.
+    """Decodes events into reports, without I/O.
 
     A contact appears once both its coordinates are known. A slot keeps the coordinates of its last
-    contact, since the kernel omits values that did not change. Palms, pens and what hovers are no
-    touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and _Y.
-    light_press: values of force and size under a finger that presses lightly.
+    contact, since the kernel omits values that did not change. Palms, pens and hovering fingers are
+    no touches: a finger that becomes a palm is lifted. ranges: of the axes ABS_MT_POSITION_X and
+    _Y; light_press: values of force and size under a finger that presses lightly.
     """
 
     def __init__(
@@ -139,7 +133,7 @@ class SlotReader:
 
     @property
     def touches(self) -> tuple[Touch, ...]:
-        """All touches, by slot; of two with one tracking id the second has an id of its slot."""
+        """All touches, by slot; the second of two with one tracking id gets an id of its slot."""
         touches: dict[int, Touch] = {}
         for number, slot in sorted(self._slots.items()):
             if (touch := self._touch(slot)) is not None:
@@ -163,7 +157,7 @@ class SlotReader:
         return None
 
     def resynchronise(self, slots: Mapping[int, SlotState], *, current: int) -> None:
-        """Replace all state by the kernel's, with the slot of the next event."""
+        """Replace all state by the kernel's; current: slot of the next event."""
         self._current = current
         self._slots = {number: replace(state) for number, state in slots.items()}
 
@@ -464,10 +458,9 @@ class EvdevSource(TouchSource):
 
 
 def _panel_options(options: str) -> tuple[dict[str, str], dict[int, float]]:
-    """Split the options of a panel: others, and `light_pressure` and `light_major` by axis.
+    """Return the options of a panel: others, and values under a light press by axis.
 
-    These are the values of the axes under a finger that presses lightly; one that is no number of
-    at least 0 is among the others.
+    A value that is no number of at least 0 is among the others.
     """
     others, by_axis = dict(parse_qsl(options, keep_blank_values=True)), {}
     for name, axis in _LIGHT_PRESS.items():

@@ -1,25 +1,18 @@
-"""Touch sources: frames of all touches at one moment, by the scheme of a URL, mapped to the plate.
+"""Touches: sources and their frames, calibration to the plate, and the contacts that follow.
 
-A calibration is an affine map from coordinates of a sensor to those of the plate: x' = a x + b y +
-c, y' = d x + e y + f on coordinates 0..1 from the top left corner.
+A source delivers frames of all its touches at one moment. A calibration is an affine map from
+coordinates of a sensor to those of the plate: x' = a x + b y + c, y' = d x + e y + f on coordinates
+0..1 from the top left corner. A tracker follows the contacts on the plate through any sequence of
+frames, and decides which gives way where there are as many as a plate can have.
 
-Counting rejected input without flooding the log.
+The load of a finger is relative to the rig's `fingertip`, a finger that presses lightly, and grows
+with the area of contact (`Fingertip.scaled`). Area grows as the force to the power of two thirds
+(Hertz), and so does the load: between the third of Hertz's stiffness and the first power of a pulp
+that stiffens exponentially. docs/concepts/people.md has the sources, and how well this is known.
 
-Loads of fingers, by what a panel reports: force, or size of the contact.
-
-A load is relative to the rig's `fingertip`, a finger that presses lightly, and grows with the area
-of contact (`Fingertip.scaled`). Area grows as the force to the power of two thirds (Hertz), and so
-does the load: between the third of Hertz's stiffness and the first power of a pulp that stiffens
-exponentially. docs/concepts/people.md has the sources, and how well this is known.
-
-How fast a finger moves, from the places that its source reports, whose errors are a millimetre.
-
-Velocity is the slope of places over time by least squares, of the last 60 ms. Of a finger whose
-places differ by less than 3 mm in that time nothing is known but that it moves slowly: it rests.
-
-Which contact gives way where a plate has as many as it can, so that no sender takes all.
-
-The contacts on the plate, from any sequence of touch frames.
+The velocity of a finger is the slope of its places over time by least squares, over the last 60 ms.
+Reported places have errors of a millimetre: a finger whose places differ by less than 3 mm in that
+time counts as resting.
 """
 
 import logging
@@ -42,7 +35,7 @@ LOG_INTERVAL = 1.0  # s
 
 
 class RejectCounter:
-    """Counts by reason, and logs each new one, others at most once per LOG_INTERVAL; clock [s]."""
+    """Counts rejections by reason; logs new reasons, and others at most once per LOG_INTERVAL."""
 
     def __init__(
         self,
@@ -79,39 +72,38 @@ class RejectCounter:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One finger as reported by its source.
-
-    id: constant from down to up; x, y: 0..1 across the sensor from its top left corner, y downwards
-    (the convention of TUIO and most panels). Not validated: may be NaN. load: on the plate relative
-    to the rig's fingertip, not bounded (`contacts`); None where nothing is reported.
-    """
+    """One finger as reported by its source, not validated: coordinates may be NaN."""
 
     id: int
+    """Constant from down to up."""
     x: float
+    """0..1 across the sensor from its top left corner, as in TUIO and most panels."""
     y: float
+    """0..1 downwards."""
     load: float | None = None
+    """Load on the plate relative to the rig's fingertip, not bounded; None where nothing is
+    reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class TouchFrame:
-    """All touches of a source at one moment; a touch missing from it has been lifted.
-
-    time: of arrival, by the event loop's clock [s]. timeout [s]: time without a frame of this
-    source after which its touches are lifted; None: CONTACT_TIMEOUT. origin: the host or client,
-    which may have several sources; None: the source itself.
-    """
+    """All touches of a source at one moment; a touch missing from it has been lifted."""
 
     source: str
     time: float
+    """When it arrived [s], by the event loop's clock."""
     touches: tuple[Touch, ...]
     timeout: float | None = None
+    """Time [s] without a frame of the source after which its touches are lifted; None:
+    CONTACT_TIMEOUT."""
     origin: str | None = None
+    """Host or client, which may have several sources; None: the source itself."""
 
 
 class TouchSource(ABC):
-    """Source of touch frames, repeated at least every 100 ms while there are touches.
+    """A source of touch frames, repeated at least every 100 ms while there are touches.
 
-    A source that cannot repeat them states a longer timeout in its frames.
+    A source that cannot repeat its frames states a longer timeout in them.
     """
 
     @cached_property
@@ -121,20 +113,20 @@ class TouchSource(ABC):
 
     @property
     def problem(self) -> str | None:
-        """Why no touches come although it runs, and what to do; None if they may."""
+        """Why a running source delivers no touches, and the remedy; None if nothing is wrong."""
         return None
 
     @abstractmethod
     async def run(self, deliver: Callable[[TouchFrame], None]) -> None:
         """Deliver frames until cancelled or, for a recording, until its end.
 
-        Malformed input must be counted in `rejects`, not raised; that it cannot be opened, or is
-        lost, is raised as InputError.
+        Malformed input must be counted in `rejects`, not raised. Raises InputError if the source
+        cannot be opened, or is lost.
         """
 
 
 def number_option(options: str, name: str, *, default: float) -> float:
-    """Return the number of the only option that there may be; NaN for anything else."""
+    """Return the number of an option that must be the only one; NaN for anything else."""
     given = dict(parse_qsl(options, keep_blank_values=True))
     text = given.pop(name, str(default))
     try:
@@ -168,11 +160,11 @@ def open_source(url: str) -> TouchSource:
 Row: TypeAlias = tuple[float, float, float]
 Point: TypeAlias = tuple[float, float]
 
-# m; with a larger residual a point was not touched where it should be (a fingertip's radius is
-# 6.5 mm).
 MAX_RESIDUAL = 0.005
-# Below this determinant the plate's points lie on a line for practical purposes.
-_MIN_DETERMINANT = 1e-3
+"""Largest residual [m] of a point that was touched where it should be: less than the radius of a
+fingertip, 6.5 mm."""
+
+_MIN_DETERMINANT = 1e-3  # below it the points on the plate lie nearly on a line
 
 _ROTATIONS: dict[int, tuple[Row, Row]] = {
     0: ((1, 0, 0), (0, 1, 0)),
@@ -199,6 +191,7 @@ class TouchCalibration:
 
 
 ALIGNED = TouchCalibration()
+"""Of a sensor whose coordinates are those of the plate."""
 
 
 def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
@@ -258,12 +251,12 @@ LIGHT_MAJOR = 9.4
 MIN_REPORTED, MAX_REPORTED = 0.4, 2.5
 """Bounds of a reported load: contacts of 6 to 15 mm, forces of 0.13 to 2 N.
 
-Two standard deviations of the rig's default `uncertainty` of a load. What a panel reports beyond
-them tells more of the panel than of the finger.
+They are two standard deviations of the rig's default `uncertainty` of a load. Reports beyond them
+say more about the panel than about the finger.
 """
 
 LANDING = 0.1
-"""Time [s] after which a finger that lands has its area of contact; until then none is reported."""
+"""Time [s] after which a finger that lands has its area of contact; loads before it are ignored."""
 
 MIN_CHANGE = 1.5
 """Factor by which a reported load must differ from a contact's before that changes."""
@@ -282,7 +275,7 @@ class LightPress:
     touch_major: float | None = None
 
     def load(self, *, pressure: float, touch_major: float) -> float | None:
-        """Return the load of a contact with these values, not bounded; the force goes first.
+        """Return the load of a contact with these values, not bounded; force is preferred.
 
         None without a positive value of an axis.
         """
@@ -294,10 +287,7 @@ class LightPress:
 
 
 def followed(known: float, reported: float) -> float:
-    """Return the load of a contact: the known one, unless the reported one differs enough.
-
-    Bounded.
-    """
+    """Return the load of a contact: the known, or the reported (bounded) if it differs enough."""
     if not reported > 0:  # NaN is not
         return known
     bounded = min(max(reported, MIN_REPORTED), MAX_REPORTED)
@@ -306,19 +296,20 @@ def followed(known: float, reported: float) -> float:
 
 
 OVER = 0.060
-"""Time [s] over which a velocity is found; of frames that are older nothing counts."""
+"""Time [s] over which a velocity is found; older frames do not count."""
 
 _LEAST_TIME, _LEAST_WAY = 0.020, 0.003  # s, m; of a velocity
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The way of a finger: places x, y [m] at times [s], the last one where it is."""
+    """The recent way of a finger."""
 
     places: tuple[tuple[float, float, float], ...] = ()
+    """Time [s], x and y [m] of each place; the last one is where the finger is."""
 
     def followed(self, time: float, x: float, y: float) -> "Motion":
-        """Return it with another place at a time [s]."""
+        """Return the way with another place at a time [s]."""
         since = time - OVER
         return Motion((*[each for each in self.places if since < each[0] < time], (time, x, y)))
 
@@ -341,15 +332,15 @@ class Motion:
 
 
 AT_REST = Motion()
-"""Of a finger of which nothing is known."""
+"""Of a finger whose way is unknown."""
 
 
 def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) -> int | None:
-    """Return which contact to lift for one of a newcomer's source, by number; None for none.
+    """Return the number of the contact to lift for one of a newcomer's source, or None.
 
-    sources: of all contacts in order of arrival; origins: by source. The newest contact of the
-    input, then the origin, then the source with most contacts, if it has at least two more than the
-    newcomer's.
+    It is the newest contact of the input, then the origin, then the source with most contacts, if
+    that has at least two more than the newcomer's. sources: of all contacts in order of arrival;
+    origins: by source.
     """
     groupings: tuple[Callable[[str], str], ...] = (_input_of, origins.__getitem__, str)
     left: list[int] = [*range(len(sources))]
@@ -366,7 +357,7 @@ def to_evict(sources: Sequence[str], newcomer: str, origins: Mapping[str, str]) 
 
 
 def _input_of(source: str) -> str:
-    """Return the input of a source, the beginning of its name; without one its kind."""
+    """Return the beginning of the name of a source: its input, or its kind where it has none."""
     return source.partition(":")[0]
 
 
@@ -376,18 +367,21 @@ RIM = 0.0065
 Where cameras and frames report a finger on the edge depends on noise and calibration.
 """
 
-# s; most sources repeat their frames at least every 100 ms, others state their own timeout. A
-# contact that is not confirmed must not be driven.
 CONTACT_TIMEOUT = 0.150
+"""Default contact timeout [s]: a contact that is not confirmed must not be driven.
 
-# s; no sensor may stay silent for longer under a resting finger.
+Most sources repeat their frames at least every 100 ms; others state their own timeout.
+"""
+
 MAX_CONTACT_TIMEOUT = 60.0
+"""Longest time [s] for which a sensor may be silent under a resting finger."""
 
-# s; no finger leaves the plate so soon: its frames were held up and came together.
 MAX_GLIMPSE = 0.005
+"""Time [s] after which no finger leaves the plate: earlier frames were held up and came
+together."""
 
-# s; how long such a contact is kept, so that a click is decided, loaded and felt.
 TAP_TIME = 0.060
+"""Time [s] for which such a contact is kept, so that a click is decided, loaded and felt."""
 
 
 class ContactKey(NamedTuple):
@@ -399,32 +393,32 @@ class ContactKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A finger on the plate at x, y [m] from its south-west corner, down since a time [s].
-
-    load: relative to the rig's fingertip, bounded and in steps, 1 where nothing is
-    reported. motion: its way of late.
-    """
+    """A finger on the plate."""
 
     key: ContactKey
     x: float
+    """[m] from the south-west corner of the plate."""
     y: float
+    """[m]"""
     since: float
+    """When [s] it came down."""
     load: float = 1.0
+    """Relative to the rig's fingertip, bounded and in steps; 1 where nothing is reported."""
     motion: Motion = field(default=AT_REST, compare=False)
+    """Its recent way."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Contacts that came down, moved, pressed harder or less and lifted, each as it is or was.
-
-    rejected: a reason for each touch that was not accepted.
-    """
+    """Contacts that have changed, each as it is or was."""
 
     down: tuple[Contact, ...] = ()
     moved: tuple[Contact, ...] = ()
     pressed: tuple[Contact, ...] = ()
+    """Contacts with another load."""
     up: tuple[Contact, ...] = ()
     rejected: tuple[str, ...] = ()
+    """A reason for each touch that was not accepted."""
 
     def __bool__(self) -> bool:
         """Whether any contact changed."""
@@ -436,26 +430,22 @@ _UNCHANGED = Change()
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """A source with contacts: the time [s] of its last frame, and its origin.
+    """A source with contacts."""
 
-    expiry [s]: when its contacts are lifted unless another frame arrives.
-    """
-
-    received: float
-    timeout: float
-    expiry: float
+    received: float  # s; time of its last frame
+    timeout: float  # s
+    expiry: float  # s; when its contacts are lifted unless another frame arrives
     origin: str
 
 
 class ContactTracker:
-    """The contacts on one plate. Deterministic: times are arguments.
+    """Follows the contacts on one plate; times are arguments.
 
     x = X L and y = (1 - Y) W, since touch sensors count Y downwards. A touch at most `RIM` outside
-    the plate (0..1) is at its edge. Rejects touches that are farther off, have non-finite
-    coordinates or repeat an id within a frame (the last one counts); a contact whose touch is
-    rejected is lifted. Where the maximum number of contacts
-    is reached, a contact of the input, origin or source with most is evicted if it has at least
-    two more than that of the touch; else the touch is rejected.
+    the plate (0..1) is at its edge. Touches that are farther off, have non-finite coordinates or
+    repeat an id within a frame (the last one counts) are rejected; a contact whose touch is
+    rejected is lifted. Beyond the maximum number of contacts one is evicted (`to_evict`), or the
+    touch is rejected.
     """
 
     def __init__(self, plate: Plate) -> None:
@@ -469,22 +459,22 @@ class ContactTracker:
         self.next_expiry = math.inf
         """When [s] the first contacts are lifted unless a frame of their source arrives."""
         self.changed: dict[ContactKey | None, float] = {}
-        """When [s] contacts changed first that no set has answered; None: the first that lifted."""
+        """When [s] contacts first changed that no set has answered; None: the first that lifted."""
 
     def expiry_of(self, key: ContactKey) -> float:
-        """Return when [s] a contact is lifted unless a frame arrives; -inf for none of that key."""
+        """Return when [s] a contact is lifted unless a frame arrives; -inf without that contact."""
         if key not in self._contacts:
             return -math.inf
         return min(self._sources[key.source].expiry, self._taps.get(key, math.inf))
 
     def sources_of(self, prefix: str) -> list[str]:
-        """Return the sources with contacts whose names begin so."""
+        """Return the sources with contacts whose names have a prefix."""
         return [name for name in self._sources if name.startswith(prefix)]
 
     def update(self, frame: TouchFrame, *, keeps_taps: bool = False) -> Change:
         """Apply a frame, which replaces the previous one of its source.
 
-        keeps_taps: whether a contact is kept for a while whose lift comes together with it.
+        keeps_taps: whether a contact whose lift comes together with it is kept for a while.
         """
         rejected: list[str] = []
         touches: dict[ContactKey, Touch] = {}
@@ -544,7 +534,7 @@ class ContactTracker:
         return Change(up=up) if up else _UNCHANGED
 
     def wait_again(self, answered: Mapping[ContactKey | None, float]) -> None:
-        """Note contacts as changed since times [s], whose answer has not been played after all."""
+        """Note contacts as changed since times [s] whose answer has not been played after all."""
         for key, at in answered.items():
             waiting = key if key in self._contacts else None  # it has lifted meanwhile
             self.changed[waiting] = min(at, self.changed.get(waiting, at))
@@ -564,7 +554,7 @@ class ContactTracker:
         return Contact(key, x, y, since, load, motion.followed(time, x, y))
 
     def _keep_taps(self, frame: TouchFrame) -> None:
-        """Keep contacts that have just come down and are not in a frame any more."""
+        """Keep contacts that have just come down and are missing in a frame."""
         ids = {touch.id for touch in frame.touches}
         for key, contact in self._contacts.items():
             is_lifted = key.source == frame.source and key.id not in ids

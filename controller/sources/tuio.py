@@ -1,15 +1,12 @@
-"""TUIO 1.1 cursors (/tuio/2Dcur) over UDP: what touch tables and their simulators send.
+"""TUIO 1.1 cursors (/tuio/2Dcur) over UDP, as touch tables and their simulators send them.
 
 A bundle has the name of its sender (source), the session ids that are down (alive), the positions
 of those that changed (set) and a sequence number (fseq); see tuio.org, "TUIO 1.1 Protocol
-Specification". Numbers count by their value, whatever their type; what follows the arguments that
-are needed is ignored. A malformed message is counted, and the others of its bundle are read.
+Specification". Numbers count by their value, whatever their type, and further arguments are
+ignored. A malformed message is counted, and the others of its bundle are read. Messages are those
+of Open Sound Control 1.0 (opensoundcontrol.stanford.edu/spec-1_0.html), from untrusted datagrams.
 
-Open Sound Control messages from untrusted datagrams: bundles, texts and numbers of any type.
-
-See the Open Sound Control 1.0 Specification (opensoundcontrol.stanford.edu/spec-1_0.html).
-
-Recorded TUIO streams: the datagrams of a sender with their times, in a text file.
+A capture is a text file with the datagrams of a sender and their times, to be replayed:
 
     # era-haptics TUIO capture 1
     0.000000 2362756e646c6500...
@@ -143,51 +140,44 @@ _MIN_REPEATS = 20  # frames without cursors in a row, of a sender that repeats i
 
 @dataclass
 class _Bundle:
-    """The messages of one bundle; None where missing.
-
-    malformed: why messages were refused; others: addresses that are not served, and whether they
-    had touches.
-    """
+    """The messages of one bundle; None where missing."""
 
     source: str | None = None
     alive: tuple[int, ...] | None = None
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     sequence: int | None = None
-    malformed: list[str] = field(default_factory=list)
-    others: dict[str, bool] = field(default_factory=dict)
+    malformed: list[str] = field(default_factory=list)  # why messages were refused
+    others: dict[str, bool] = field(default_factory=dict)  # unserved addresses; if with touches
 
 
 @dataclass
 class _Sender:
-    """The state of one sender; peer, former: host and port of it, and before.
-
-    alive: None until stated; resting: frames in a row without cursors.
-    """
+    """The state of one sender."""
 
     last_heard: float
-    peer: Peer
-    former: Peer | None = None
+    peer: Peer  # its host and port
+    former: Peer | None = None  # those before
     sequence: int = 0
     sequence_time: float = -math.inf  # when that sequence number arrived
-    alive: tuple[int, ...] | None = None
+    alive: tuple[int, ...] | None = None  # until stated
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
-    resting: int = 0
+    resting: int = 0  # frames in a row without cursors
 
 
 class TuioReader:
-    """Decoder of datagrams into touch frames, without I/O; times are arguments.
+    """Decodes datagrams into touch frames, without I/O; times are arguments.
 
     Senders are distinguished by the name in their source message and their host, or without a name
-    by host and port, as are programs that send under one name by turns; where there are too many,
-    a sender of the busiest peer is dropped. Every bundle with cursors or an alive message confirms
-    all contacts of its sender for the timeout [s]. Of a sender that never states what is alive,
-    that is what a bundle sets. Never raises: what is not used is counted in `rejects`.
+    by host and port, as are programs that send under one name by turns. Beyond the most senders,
+    one of the busiest peer is dropped. Every bundle with cursors or an alive message confirms all
+    contacts of its sender for the timeout [s]. If a sender never states which cursors are alive,
+    those of a bundle are. Never raises: unusable input is counted in `rejects`.
     """
 
     def __init__(self, rejects: RejectCounter, *, timeout: float = DEFAULT_TIMEOUT) -> None:
         self.rejects = rejects
         self.others: set[str] = set()
-        """Profiles that have come and are not served."""
+        """Profiles that were received and are not served."""
         self._timeout = timeout
         self._senders: dict[str, _Sender] = {}
 
@@ -224,7 +214,7 @@ class TuioReader:
     def is_mute(self, *, since: float, now: float) -> bool:
         """Whether nothing was read since a time [s] though it should have been.
 
-        Nothing at all; or nothing more of a sender that has repeated itself without cursors.
+        That is no sender at all, or no more frames of one that has repeated itself without cursors.
         """
         if not self._senders:
             return now - since >= MUTE_AFTER
@@ -232,7 +222,7 @@ class TuioReader:
         return last.resting >= _MIN_REPEATS and now - last.last_heard >= MUTE_AFTER
 
     def _count(self, bundle: _Bundle, place: str) -> None:
-        """Count what of a bundle from a place is not used: other profiles, malformed messages."""
+        """Count the unusable messages of a bundle from a place: other profiles, malformed ones."""
         for address, has_touches in bundle.others.items():
             profile = _PROFILE.match(address)
             if profile:
@@ -246,7 +236,7 @@ class TuioReader:
             self.rejects.count("malformed", f"message from {place}: {problem}")
 
     def _name(self, bundle: _Bundle, peer: Peer, now: float) -> str:
-        """Return the name of a sender: of host and source, with the port where that is not unique.
+        """Return the name of a sender: host and source, and the port where these are not unique.
 
         A name that comes from another port is that of a program that was restarted, or that takes
         another port for each datagram and goes on counting its frames. It is that of a second
@@ -405,7 +395,7 @@ class TuioSource(UdpSource):
 
     @cached_property
     def _reader(self) -> TuioReader:
-        """Made once a daemon has set its own counter of rejects."""
+        """The reader, made once a daemon has set its own counter of rejects."""
         return TuioReader(self.rejects, timeout=self.timeout)
 
     @property
@@ -425,7 +415,7 @@ class TuioSource(UdpSource):
         return self._reader.read(datagram, peer, now=arrived)
 
     def drop_superseded(self, waiting: Sequence[Datagram]) -> list[Datagram]:
-        """Return those that the newest bundle of their sender does not supersede."""
+        """Return the datagrams that the newest bundle of their sender does not supersede."""
         return without_superseded(waiting)
 
 
@@ -436,9 +426,10 @@ MAX_BYTES = 16 << 20  # 100 s of ten fingers at 100 Hz; of one finger a quarter 
 
 @dataclass(frozen=True, slots=True)
 class RecordedDatagram:
-    """One datagram and when it was sent [s] from the start of the capture."""
+    """A datagram of a capture."""
 
     time: float
+    """When it was sent [s] from the start."""
     payload: bytes
 
 

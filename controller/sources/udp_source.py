@@ -1,11 +1,9 @@
-"""Touch sources over UDP: host, port and timeout of their URL, the port, a frame per datagram.
-
-UDP datagrams with their times of arrival, several per iteration of the event loop.
+"""Touch sources over UDP: their URLs, and datagrams with their times of arrival.
 
 The event loop's own endpoint reads one datagram per iteration and knows only when it did so:
 touches would be outdated and the queueing delay unmeasured. Here one iteration reads all that has
-arrived and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each.
-In a flood the newest are kept; the kernel would keep the oldest.
+arrived and delivers the backlog in slices of at most 0.25 ms. On Linux the kernel timestamps each
+datagram. In a flood the newest are kept; the kernel would keep the oldest.
 """
 
 import asyncio
@@ -50,7 +48,7 @@ class Datagram(NamedTuple):
 
 
 DropSuperseded: TypeAlias = Callable[[Sequence[Datagram]], Iterable[Datagram]]
-"""Returns the waiting datagrams, in order, that no later one supersedes."""
+"""Returns those of the waiting datagrams, in order, that no later one supersedes."""
 
 _TIMESTAMPS = 35  # SO_TIMESTAMPNS and SCM_TIMESTAMPNS of Linux, which Python does not name
 _TIMESPEC = struct.Struct("@ll")
@@ -186,9 +184,9 @@ class UdpSource(TouchSource):
     """
 
     default_port: ClassVar[str] = ""
-    """Where the URL has none; empty: it must have one."""
+    """Port of URLs without one; empty if they must have one."""
     default_timeout: ClassVar[float] = CONTACT_TIMEOUT
-    """Where the URL has none [s]."""
+    """Timeout [s] of URLs without one."""
     max_size: ClassVar[int] = MAX_DATAGRAM
     """Bytes of the longest datagram; longer ones are cut to one byte more."""
 

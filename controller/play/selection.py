@@ -348,9 +348,9 @@ _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away f
 def _is_met_by(intended: Intention, chosen: Selection) -> bool:
     """Whether what was chosen also serves what lasts of what is intended now."""
     is_whole, then = chosen.is_whole, chosen.contacts
-    wanted, had = _targets_of(intended.lasting), _targets_of(chosen.targets)
+    requested, had = _targets_of(intended.lasting), _targets_of(chosen.targets)
     # Others would gain from the end of one only where fingers share or are not served.
-    if not (had and (wanted == had or (wanted < had and is_whole))):
+    if not (had and (requested == had or (requested < had and is_whole))):
         return False
     now = {each.key: each for each in intended.contacts}
     same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()

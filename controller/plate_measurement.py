@@ -1,19 +1,13 @@
-"""Driving the channels of a rig one by one while sensors measure the plate.
+"""Measuring a rig's plate by its own ERAs and the sensors of its amplifiers.
 
-Interleaved tones: every ERA plays at the same time, each at a frequency of its own.
+`plate_sensors` reads what the amplifiers' sensors measure and where. `TonePlayer` plays small tones
+on the path of every pattern: routed by the wiring, admitted by the ledgers, over the wire, with the
+levels that amplifiers confirm. `PlateSelfMeasurement` plays the whole schedule and reads it.
 
-The range is cut into as many bands as ERAs play at once. In each step every band sounds at the same
-place within it, so that the tones of a step are a band apart; from step to step the ERAs take turns
-over the bands. One round plays every tone once; as many rounds as ERAs play it on each of them.
-
-The sensors of a rig's amplifiers as those of its plate: where they are, what they read.
-
-Small tones on the ERAs of a rig, on the path of every pattern.
-
-Routed by the wiring, admitted by the ledgers, over the wire, with the levels that amplifiers
-confirm.
-
-Measuring a rig's plate by its own ERAs and the sensors of its amplifiers.
+Tones are interleaved: every ERA plays at the same time, each at a frequency of its own. The range
+is cut into as many bands as ERAs play at once. In each step every band sounds at the same place
+within it, so that the tones of a step are a band apart; from step to step the ERAs take turns over
+the bands. One round plays every tone once; as many rounds as ERAs play it on each of them.
 """
 
 import asyncio

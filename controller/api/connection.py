@@ -1,25 +1,23 @@
-"""One client's connection to the API server: bytes in, lines out, bounds on both.
+"""Clients' connections to the API server: bytes and lines, who is admitted, and whose turn it is.
 
-Nothing here waits. The server takes lines one at a time from all connections in turn, so that a
-flood on one costs the others nothing; output that a client does not read is bounded, then dropped.
+`Connection` never waits. The server takes lines one at a time from all connections in turn, so
+that a flood on one costs the others nothing; output that a client does not read is bounded, then
+dropped.
 
-Which clients are connected: acceptance of connections, and places for clients.
+`Acceptor` accepts one connection per turn and refuses those above a rate per process. A refusal
+takes some microseconds, so that processes that connect again and again delay neither the control
+loop nor the clients that wait behind them in the queue.
 
-Connections to the daemon's socket are accepted one per turn, and refused above a rate per process.
-A refusal costs some microseconds, so that processes that connect again and again delay neither the
-control loop nor the clients that wait behind them in the queue.
+`Admission` keeps places in reserve for methods that silence, so that another client can always
+connect and `stop`. It evicts a client that has sent nothing yet first, then an idle subscriber,
+then any idle client; never one that holds the arming lease or waits for a response. The reserve is
+shared among processes: a client of the process with the most there is evicted, silent ones first,
+but none whose first bytes have arrived unread.
 
-However many clients there are, another one can connect and `stop`, as there are places in reserve
-for methods that silence. A client that has sent nothing yet is evicted first, then an idle
-subscriber, then any idle client; never one that holds the arming lease or waits for a response. The
-reserve is shared among processes: a client of the one with the most there is evicted, silent ones
-first, but none whose first bytes have arrived unread.
-
-When clients of the API are served: in short turns, with what the control loop leaves.
-
-A share of the event loop's processor time, saved up for bursts, is for clients that touch or hold
-the lease, another one for all other clients. A turn is short, and waits while a touch is on its way
-to the wire. A client whose input may hold a stop is served at once, within neither limit.
+`Turns` serves clients in short turns, with what the control loop leaves. A share of the event
+loop's processor time, saved up for bursts, is for clients that touch or hold the lease, another one
+for all other clients. A turn waits while a touch is on its way to the wire. A client whose input
+may hold a stop is served at once, within neither limit.
 """
 
 import asyncio
@@ -56,9 +54,9 @@ MAX_PENDING_STOPS = 64  # requests without responses, above which no further lin
 class Connection(asyncio.BufferedProtocol):
     """A client's connection.
 
-    process: its id, 0 if unknown; on_connect: called at the beginning; on_lines: lines wait to be
-    served; on_disconnect: called once at the end. ahead: a request that was read from the next
-    line, but not served.
+    process: id of the client's process, 0 if unknown.
+    on_connect, on_disconnect: called once at the beginning and at the end.
+    on_lines: called when lines wait to be served.
     """
 
     def __init__(
@@ -80,7 +78,7 @@ class Connection(asyncio.BufferedProtocol):
         self.pending: set[asyncio.Task[None]] = set()
         self.silenced = 0  # its stops and disarms
         self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
-        self.ahead: Any = None
+        self.ahead: Any = None  # a request that was read from the next line, but not served
         self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: unperiodic
         self.lease = ""  # token of the last lease that it armed or renewed
         self.number: int | None = None  # of those that have touched
@@ -261,7 +259,7 @@ _PAUSE = 0.1  # s; while there is no descriptor at all
 
 
 class Admission:
-    """The connected clients; holds_lease: whether a client does."""
+    """The connected clients; holds_lease: whether a client holds the arming lease."""
 
     def __init__(
         self, *, holds_lease: Callable[[Connection], bool], clock: Callable[[], float]
@@ -284,7 +282,7 @@ class Admission:
         self.admitted.add(new)
 
     def promote(self, one: Connection) -> bool:
-        """Whether a client is now served all methods."""
+        """Move a client out of the reserve if there is room; return whether it is out of it."""
         if one.is_reserve and self._has_room():
             one.is_reserve = False
         return not one.is_reserve
@@ -334,7 +332,7 @@ def _evictable(reserve: list[Connection], new: Connection) -> Connection | None:
 class Acceptor:
     """Accepts connections of a bound Unix socket.
 
-    make_connection: called with the id of the connecting process; clock [s].
+    make_connection: called with the id of the connecting process. clock [s].
     """
 
     def __init__(
@@ -428,13 +426,10 @@ _RECHECK = 0.0005  # s; of a turn that is deferred
 
 @dataclass(eq=False, slots=True)
 class _Lane:
-    """Clients that wait, and what is known of their next turn.
+    """Clients that wait, and their next turn."""
 
-    budget: of processor time; is_urgent: they wait for nothing, but count in it.
-    """
-
-    budget: RateLimiter
-    is_urgent: bool = False
+    budget: RateLimiter  # of processor time
+    is_urgent: bool = False  # served at once, whatever is left of the budget
     waiting: deque[Connection] = field(default_factory=deque)
     is_scheduled: bool = False
     deferred_since: float | None = None
@@ -443,9 +438,10 @@ class _Lane:
 class Turns:
     """Serves waiting clients in turn, a line of each.
 
-    serve: serves one line of a client; is_first: whether a client touches or holds the lease;
-    is_busy: whether a touch is on its way to the wire; clock [s]; processor_time: of this thread
-    [s].
+    serve: serves one line of a client.
+    is_first: whether a client touches or holds the lease.
+    is_busy: whether a touch is on its way to the wire.
+    clock, processor_time: of the process, and of this thread [s].
     """
 
     def __init__(

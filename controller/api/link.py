@@ -1,11 +1,11 @@
-"""A client's connection to the daemon: lines, passed on as they are, or calls over them.
+"""The client's side of the API: where the daemon's socket is, and one connection to it.
 
-The client's side of the API without I/O: arguments to parameters, lines to responses and events.
-
-A daemon of a later minor version sends keys that this program does not know: they are ignored here,
-whereas the server is strict about every request.
-
-Where the daemon's socket is by default, and whether the process behind it is to be believed.
+`find_socket` chooses the socket, `check_peer` decides whether the process behind it is trusted.
+`DaemonLink` is a connection in the name of a client: lines passed on as they are, or calls over
+them. Without I/O are arguments to parameters (`make_params`, `touches_at`) and lines to responses
+and notifications (`read_line`, `result_of`, `read_result`). A daemon of a later minor version sends
+keys that this program does not know: they are ignored here, whereas the server is strict about
+every request.
 """
 
 import asyncio

@@ -350,15 +350,13 @@ class InputsEvent(ApiMessage):
 
 
 class TopicData(NamedTuple):
-    """A topic: its data, its summary, and when it is sent.
-
-    At every change; or the newest of several changes, at most 60 times per second; or at the rate
-    that a client has subscribed with.
-    """
+    """A topic of notifications."""
 
     data: type[ApiMessage]
     summary: str
     sent: Literal["always", "newest", "periodically"] = "always"
+    """At every change; or the newest of several changes, at most 60 times per second; or at the
+    rate that a client has subscribed with."""
 
 
 TOPICS: dict[Topic, TopicData] = {
@@ -396,23 +394,22 @@ class EventParams(ApiMessage):
 
 
 class Method(NamedTuple):
-    """A method of the API, and how its requests are treated.
-
-    is_limited: whether they count in a client's rate; silences: whether they end what plays;
-    in_reserve: whether they are served to clients in reserve; needs_reply: whether they are carried
-    out only for a client that gets the reply; is_repeated: whether clients send them again if the
-    connection is lost, after which they may have been carried out; over_http: whether they need no
-    lasting connection.
-    """
+    """A method of the API, and how its requests are treated."""
 
     params: type[ApiMessage]
     result: type[ApiMessage]
     is_limited: bool = True
+    """Whether requests count in a client's rate."""
     silences: bool = False
+    """Whether the method ends what plays."""
     in_reserve: bool = False
+    """Whether clients in reserve are served, too."""
     needs_reply: bool = False
+    """Whether a request is carried out only for a client that gets the reply."""
     is_repeated: bool = True
+    """Whether clients send it again after a lost connection, so that it may be done twice."""
     over_http: bool = True
+    """Whether it needs no lasting connection."""
 
 
 _HandlerT = TypeVar("_HandlerT", bound=Callable[..., Any])

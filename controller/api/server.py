@@ -1,11 +1,8 @@
-"""The API's server: serves all clients in turn, within the control loop's event loop.
+"""The API's server and the hub of its notifications, within the control loop's event loop.
 
-However much was sent, they are served in short turns (`controller/api/connection.py`). What takes
-longer, such as arming, runs as a task of its own.
-
-The topics of `event` notifications, the data of each, and subscriptions to them.
-
-`TOPICS` says how often each topic is sent.
+However much was sent, clients are served in short turns (`controller/api/connection.py`). What
+takes longer, such as arming, runs as a task of its own. How often a topic is sent is a row of
+`TOPICS` (`controller/api/methods.py`).
 """
 
 import asyncio
@@ -57,14 +54,14 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class _Call:
-    """A line as read: a method with its parameters, or an error; record: what is noted of it."""
+    """A line as read: a method with its parameters, or an error."""
 
     id: Id
     expects_response: bool
     method: str = ""
     params: ApiMessage | None = None
     error: Exception | None = None
-    record: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)  # for dumps, with the outcome
 
     def is_superseded_by(self, other: "_Call | None") -> bool:
         """Whether both are touch frames of one source without an id, and the newer one is enough.
@@ -97,14 +94,16 @@ def _read_call(line: bytes) -> _Call:
 
 
 class ApiServer:
-    """Serves the methods of the API.
+    """Serves the methods of the API to clients on a Unix socket.
 
-    handlers: of all METHODS, called with the client and the parameters; on_disconnect: called with
-    every client that disconnects; holds_lease: whether a client does, and must not be evicted;
-    is_busy: whether a touch is on its way to the wire,
-    for which clients wait; stop_all: requests a stop of all amplifiers, whatever has failed on the
-    way of a client's; requested: notes a request by its client, its method and when it came [s],
-    and returns the record that gets its outcome; clock [s]; processor_time: of this thread [s].
+    handlers: by name of all METHODS, called with the client and the parameters.
+    on_disconnect: called with every client that disconnects.
+    holds_lease: whether a client holds the arming lease, so that it must not be evicted.
+    is_busy: whether a touch is on its way to the wire, for which clients wait.
+    stop_all: stops all amplifiers where a client's stop has failed on its way.
+    requested: notes a request by its client, its method and when it came [s], and returns the
+        record that gets its outcome.
+    clock, processor_time: of the process, and of this thread [s].
     """
 
     def __init__(
@@ -127,7 +126,10 @@ class ApiServer:
         self._admission = Admission(holds_lease=holds_lease, clock=clock)
         self._turns = Turns(
             self._serve_line,
-            is_first=lambda client: self._is_touching(client) or holds_lease(client),
+            # Fingers that a client no longer reports count as lifted.
+            is_first=lambda client: (
+                clock() - client.touched_at <= CONTACT_TIMEOUT or holds_lease(client)
+            ),
             is_busy=is_busy,
             clock=clock,
             processor_time=processor_time,
@@ -161,10 +163,6 @@ class ApiServer:
     def _disconnected(self, connection: Connection) -> None:
         self._admission.admitted.discard(connection)
         self._on_disconnect(connection)
-
-    def _is_touching(self, connection: Connection) -> bool:
-        """Whether fingers of a client are down; those that it no longer reports count as lifted."""
-        return self._clock() - connection.touched_at <= CONTACT_TIMEOUT
 
     def _serve_line(self, connection: Connection) -> None:
         """Serve the next line of a client, or start to."""
@@ -320,7 +318,10 @@ DEFAULT_RATE = 10.0  # Hz
 
 
 class Hub:
-    """Sends notifications to subscribers; current: a topic's present data, None if it has none."""
+    """Sends notifications to subscribers.
+
+    current: makes the present data of a topic, None if it has none.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The commands of this package, of its share of the `era` command; here `gateway`."""
+"""The controller's commands of `era`; `gateway` is defined here."""
 
 import os
 from pathlib import Path
@@ -75,7 +75,7 @@ def gateway(
     )
 
     def announce(port: int) -> None:
-        scheme = "https" if settings.is_encrypted else "http"
+        scheme = "https" if settings.certificate else "http"
         token = f"#token={settings.token}" if token_file is None else f" (token in {token_file})"
         print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
 

@@ -1,7 +1,7 @@
-"""`era daemon` and its clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`,
-`reload`, `strength`, `touch`, `watch`.
+"""`era daemon`, the commands that are its clients, and how they show status and events.
 
-Status and events of the daemon, as commands show them to people.
+Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`, `reload`, `strength`, `touch`,
+`watch`, `layout use`. `show_status` and `show_event` format what the daemon reports for people.
 """
 
 import json

@@ -27,7 +27,10 @@ from registry.plugins import failed_plugin, failure_text
 from registry.wording import reworded
 
 COMMANDS = (
-    *("controller.cli.commands", "drivers.by_hand.cli", "model.cli", "sim.cli"),
+    "controller.cli.commands",
+    "drivers.by_hand.cli",
+    "model.cli",
+    "sim.cli",
     "era_haptics.lab.cli",
 )
 """Modules with commands, by name: packages beside this one do not import each other."""
@@ -35,12 +38,29 @@ COMMANDS = (
 SECTIONS = {
     "Try": ("demo", "sim", "figure"),
     "Plate": (
-        *("config", "plate", "table", "layout", "calibrate", "rig", "design", "outputs"),
+        "config",
+        "plate",
+        "table",
+        "layout",
+        "calibrate",
+        "rig",
+        "design",
+        "outputs",
         "measure",
     ),
     "Run": (
-        *("daemon", "status", "arm", "disarm", "stop", "clear", "touch", "watch", "gateway"),
-        *("forget", "reload", "report"),
+        "daemon",
+        "status",
+        "arm",
+        "disarm",
+        "stop",
+        "clear",
+        "touch",
+        "watch",
+        "gateway",
+        "forget",
+        "reload",
+        "report",
     ),
     "Amplifier": ("amp", "soft-amp", "witness"),
 }

@@ -1,8 +1,7 @@
-"""`era rig check`: whether a rig is wired and built as its file says; the group `era rig`.
+"""The group `era rig`: `check`, whether a rig is wired and built as its file says; `identify`.
 
-`era rig identify`: the plate on the table, by its own ERAs and the sensors of its amplifiers.
-
-Also how commands measure it.
+`era rig identify` finds the parameters of the plate in place. Both measure by the rig's own ERAs
+and the sensors of its amplifiers, or read a file of responses.
 """
 
 import sys

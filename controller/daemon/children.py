@@ -1,13 +1,13 @@
 """Child processes of the daemon that must not disturb its loop: the gateway, a reader of its files.
 
-The gateway is an ordinary API client. One that exits is restarted after a growing pause; it ends
-with the daemon, even if that is killed.
+The gateway is an ordinary API client. It is restarted after a growing pause when it exits, and
+ends with the daemon, even if that is killed.
 
 A configuration is read by `python -m controller.daemon.children FILE`, which renders its content
-for the frequencies that it is given, and writes it, or the text of its problems, in Python's pickle
-format: a thread that parses for a second holds the
-interpreter's lock up to 5 ms at a time, and for as long as another program has its processor, so
-that the loop and its heartbeats would wait for it.
+for the frequencies that it is given, and writes the configuration, or the text of its problems, in
+Python's pickle format. A thread that parses for a second would hold the interpreter's lock up to
+5 ms at a time, and longer while another program has its processor, so that the loop and its
+heartbeats would wait for it.
 """
 
 import asyncio

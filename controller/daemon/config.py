@@ -1,6 +1,7 @@
-"""Loads and validates a daemon's configuration and the files that it names.
+"""The daemon's configuration: sections, keys, defaults and bounds, and how its files are loaded.
 
-The schema of the daemon's configuration: sections, keys, defaults and bounds.
+`DaemonSection` is the schema of the file, `DaemonConfig` the validated configuration with its rig
+and layouts. All problems of a file are reported together, each with its key and line.
 """
 
 import re
@@ -143,30 +144,31 @@ class TouchInput:
 
 @dataclass(frozen=True)
 class DaemonConfig:
-    """A validated configuration.
-
-    rig_text: content of the rig's file; urls: by amplifier name; table: its file, or None to build
-    it or take it from the cache; learn: file of what is learned of the plate, None for nothing;
-    layouts: by name, in their order; without any one that buzzes at every touch, by None;
-    strengths: file in which they are kept, None for as long as the daemon runs.
-    """
+    """A validated configuration."""
 
     source: Path
     section: DaemonSection
     rig: Rig
     rig_text: str
+    """Content of the rig's file."""
     urls: Mapping[str, str]
+    """URL of each amplifier by name."""
     table: Path | None
+    """File of the localization table; None: it is built or taken from the cache."""
     learn: Path | None
+    """File of what is learned of the plate; None: nothing is learned."""
     layouts: Mapping[str | None, SurfaceLayout]
+    """Layouts by name, in the file's order; if it has none, one under None that buzzes at every
+    touch."""
     strengths: Path | None
+    """File in which strengths are kept; None: they last as long as the daemon runs."""
     touch: tuple[TouchInput, ...]
     socket: Path
     log_file: Path | None
     dump_folder: Path | None
 
     def for_table(self, frequencies: FloatArray) -> Self:
-        """Return it with all that its layouts play made for the frequencies of a table [Hz]."""
+        """Return a copy whose layouts are rendered for the frequencies of a table [Hz]."""
         layouts = {name: each.for_table(frequencies) for name, each in self.layouts.items()}
         return replace(self, layouts=layouts)
 

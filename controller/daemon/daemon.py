@@ -1,6 +1,8 @@
-"""The daemon: control loop, drivers and API assembled from a configuration.
+"""The daemon: control loop, drivers and API assembled from a configuration, from start to end.
 
-`era daemon`: from a configuration file to a running daemon.
+`run_daemon` is `era daemon CONFIG`: it checks limits, files and socket, builds or loads the
+localization table, and runs a `Daemon` until it is terminated. The daemon starts disarmed; at its
+end the amplifiers are silenced before anything else is closed.
 """
 
 import asyncio
@@ -55,9 +57,10 @@ _logger = logging.getLogger(__name__)
 class Daemon:
     """A daemon; create it within the event loop that runs it.
 
-    dashboard: HOST:PORT at which the gateway serves the page, or None. observe: adds observers of
-    the control loop. lines: makes the lines to its amplifiers. watchdog [s]: of these, a longer one
-    for simulated amplifiers on a machine that is busy.
+    dashboard: HOST:PORT at which the gateway serves the page, or None.
+    observe: adds observers of the control loop.
+    lines: makes the lines to the amplifiers.
+    watchdog [s]: of the amplifiers; longer for simulated ones on a busy machine.
     """
 
     def __init__(

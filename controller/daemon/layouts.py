@@ -1,10 +1,8 @@
-"""The surface layouts of a running daemon, of which one is in use.
+"""What a running daemon can exchange: its surface layouts, its configuration, its touch inputs.
 
-A configuration that is read again while its daemon runs: what has changed, and may be applied.
-
-Nothing here runs in the event loop, as large layouts take a while to compare.
-
-Touch inputs of the daemon: the configured sources.
+`LayoutChoice` holds the layouts, one of which is in use. `read_again` reads the configuration a
+second time and `ConfigChange` says what may be applied; both block and run outside the event loop,
+as large layouts take a while to compare. `TouchInputs` runs the configured touch sources.
 """
 
 import asyncio
@@ -36,22 +34,21 @@ _APPLIED = ("layouts", "level_db_sl")  # keys that a running daemon can apply
 
 @dataclass(frozen=True)
 class ConfigChange:
-    """A configuration, and how it differs from the one in use.
-
-    restart: changed keys that need a restart; changes: all others, in words; layouts: names of
-    those that differ, None for what every touch feels without any; old_max_db_sl, max_db_sl: the
-    highest level of all layouts before and after [dB SL].
-    """
+    """A configuration, and how it differs from the one in use."""
 
     config: DaemonConfig
     restart: list[str]
+    """Changed keys that need a restart."""
     changes: list[str]
+    """All other changes, in words."""
     layouts: frozenset[str | None]
+    """Names of the layouts that differ; None is the layout of a configuration without any."""
     old_max_db_sl: float
     max_db_sl: float
+    """Highest level of all layouts, before and after [dB SL]."""
 
     def refusals(self, *, is_armed: bool) -> list[str]:
-        """Why nothing of it may be applied; empty if all may."""
+        """Return the reasons why the configuration must not be applied; empty if it may be."""
         reasons = [f"{key}: changed, which needs a restart" for key in self.restart]
         if is_armed and self.max_db_sl > self.old_max_db_sl:
             reasons.append(
@@ -77,7 +74,7 @@ def read_again(old: DaemonConfig, frequencies: FloatArray) -> ConfigChange:
 def warn_of_bands(
     layouts: Mapping[str | None, SurfaceLayout | None], frequencies: FloatArray
 ) -> None:
-    """Log what layouts play in place of bands that a table of frequencies [Hz] lacks."""
+    """Log what layouts play where a table of frequencies [Hz] has none within a band."""
     for name, layout in layouts.items():
         for problem in layout.band_problems(frequencies) if layout else ():
             _logger.warning("layout %s: %s", name, problem)
@@ -105,10 +102,10 @@ def config_change(old: DaemonConfig, new: DaemonConfig) -> ConfigChange:
 
 
 class LayoutChoice:
-    """The layouts of a daemon's configuration; in use is the first until another one is chosen.
+    """The layouts of a daemon's configuration; the first is in use until another one is chosen.
 
-    config: made for a table; frequencies [Hz]: of that, to log bands that it lacks; changed: called
-    when another layout, or the same with other content, is in use.
+    config: rendered for the table with these frequencies [Hz].
+    changed: called when another layout, or the same with other content, is in use.
     """
 
     def __init__(
@@ -117,7 +114,7 @@ class LayoutChoice:
         self._layouts = config.layouts
         self._changed = changed
         self.name = next(iter(self._layouts))
-        """Of the layout in use; None if none is configured."""
+        """Name of the layout in use; None if no layout is configured."""
         self.player = EffectPlayer(
             self._layouts[self.name], Strengths(read_strengths(config.strengths))
         )
@@ -145,7 +142,7 @@ class LayoutChoice:
     def apply(self, change: ConfigChange) -> list[str]:
         """Take the layouts of a configuration that was read again; the one in use stays in use.
 
-        If it was removed it is the first, of which it returns a note.
+        If that was removed, the first is in use; the result is a note of it, otherwise empty.
         """
         before, self._layouts = self.name, change.config.layouts
         name = before if before in self._layouts else next(iter(self._layouts))
@@ -171,12 +168,13 @@ _WATCH_INTERVAL = 1.0  # s; in which the state of all inputs is looked at
 
 
 class TouchInputs:
-    """Runs touch sources concurrently.
+    """Runs touch sources concurrently; a source that fails is restarted after a growing pause.
 
-    deliver receives their frames in coordinates of the plate, each source name prefixed with the
-    configured name; lift, that prefix: of a source that ends, fails or is cancelled. One that fails
-    is restarted after a growing pause. rejects: counter of all sources. changed: called when
-    `event` has changed.
+    deliver: receives their frames in coordinates of the plate, with the configured name as prefix
+        of the source's name.
+    lift: receives the prefix of a source that ends, fails or is cancelled.
+    rejects: counter of all sources.
+    changed: called when `event` has changed.
     """
 
     def __init__(

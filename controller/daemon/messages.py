@@ -1,6 +1,7 @@
-"""The state of the control loop and the amplifiers as messages of the API.
+"""The state of the control loop and the amplifiers as messages of the API, and their publication.
 
-Publishes what happens in the daemon to its clients, and keeps the current state of it.
+`PlateView` holds the contacts and what plays; `EventPublisher` keeps the daemon's current state and
+publishes every change of it to subscribed clients.
 """
 
 import asyncio
@@ -69,7 +70,6 @@ from drivers.host.joint_sets import is_lost
 from drivers.host.line import LinkStatistics
 from drivers.protocol.definition import FAULTS, QUANTITIES, READINGS, STATES, has_flag, name_of
 from model.answer.answer import is_felt
-from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads
 
@@ -78,17 +78,15 @@ _LEVEL = QUANTITIES["level"]
 
 @dataclass
 class PlateView:
-    """Contacts on the plate, and what the control loop has last reported of what plays.
-
-    effect_of: the effect that plays for a contact; report: None before the first, and once others
-    have silenced what played; why_not: why a contact feels nothing that these do not say, "" if it
-    shall.
-    """
+    """Contacts on the plate, and what the control loop has last reported of what plays."""
 
     effect_of: Callable[[ContactKey], str | None]
+    """The effect that plays for a contact."""
     contacts: tuple[Contact, ...] = ()
     report: PlayReport | SilenceReport | None = None
+    """None before the first report, and once another part of the daemon has silenced the plate."""
     why_not: Callable[[ContactKey], str] = lambda key: ""
+    """Why a contact feels nothing, where the report does not say so; "" if it should feel."""
 
     @property
     def applied(self) -> PlayReport | None:
@@ -169,7 +167,7 @@ class PlateView:
 
 
 def playing_of(applied: PlayReport | None) -> dict[str, Any]:
-    """What `PatternFields` say of a pattern: its tones, what is promised and predicted, if any."""
+    """The values of `PatternFields`: tones of a pattern, and its promised and predicted figures."""
     felt = None if applied is None else applied.felt
     contents = {} if applied is None else applied.contents
     return {
@@ -240,10 +238,28 @@ def hello_result(
     layout: dict[str, object] | None,
 ) -> HelloResult:
     """Describe what the daemon drives."""
+    rig = config.rig
     return HelloResult(
         api_version=API_VERSION,
         software_version=version("era-haptics"),
-        rig=_rig_summary(config.rig, amplifiers),
+        rig=RigSummary(
+            length_m=rig.plate.length,
+            width_m=rig.plate.width,
+            eras=[
+                EraPosition(
+                    name=era.name,
+                    x_m=era.x,
+                    y_m=era.y,
+                    amplifier=rig.wiring[era.name].amplifier,
+                    channel=rig.wiring[era.name].number,
+                )
+                for era in rig.eras
+            ],
+            simulated=any(
+                "simulated" in each.identity.get("product", "") for each in amplifiers.values()
+            ),
+            frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
+        ),
         table=TableSummary(
             fingerprint=table.fingerprint,
             mode=drive_mode,
@@ -276,27 +292,6 @@ def effects_result(layout: SurfaceLayout) -> EffectsResult:
     )
 
 
-def _rig_summary(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> RigSummary:
-    return RigSummary(
-        length_m=rig.plate.length,
-        width_m=rig.plate.width,
-        eras=[
-            EraPosition(
-                name=era.name,
-                x_m=era.x,
-                y_m=era.y,
-                amplifier=rig.wiring[era.name].amplifier,
-                channel=rig.wiring[era.name].number,
-            )
-            for era in rig.eras
-        ],
-        simulated=any(
-            "simulated" in each.identity.get("product", "") for each in amplifiers.values()
-        ),
-        frequency_hz=[rig.limits.frequency_min, rig.limits.frequency_max],
-    )
-
-
 def amplifier_statuses(
     amplifiers: Mapping[str, Amplifier],
     urls: Mapping[str, str],
@@ -309,9 +304,11 @@ def amplifier_statuses(
 ) -> list[AmplifierStatus]:
     """Describe all amplifiers from their last statuses, without sending a request.
 
-    are_open: whether all are open together; else their last statuses are left out. lost: the loss
-    that has closed the others. what_may_play: by name, of those that do not reply. clock_errors:
-    see `Group`. targets: the fingers that feel something now.
+    are_open: whether all are open together; otherwise their last statuses are left out.
+    lost: the loss that has closed the others.
+    what_may_play: what an amplifier that does not reply may play, by its name.
+    clock_errors: see `Group`.
+    targets: the fingers that feel something now.
     """
     missing = () if lost is None else lost.names
     return [
@@ -397,7 +394,7 @@ def plate_event(status: LearningStatus) -> PlateEvent:
 
 
 def _same(status: object, message: type[ApiMessage]) -> dict[str, Any]:
-    """What of a status has a key of the same name in a message."""
+    """The attributes of a status that are fields of a message."""
     return {key: getattr(status, key) for key in message.model_fields if hasattr(status, key)}
 
 
@@ -414,9 +411,11 @@ _logger = logging.getLogger(__name__)
 class EventPublisher:
     """Keeps the current state of the plate and publishes every change at `hub`.
 
-    operation: of the plate; amplifiers: their statuses; layouts: of the surface; inputs: state of
-    the touch inputs; learning: what learns the plate, None where nothing is to be learned; noted:
-    called with a record of each change of contacts and each decision.
+    operation, amplifiers, inputs: return the present state of the daemon, its amplifiers and its
+        touch inputs.
+    layouts: the surface layouts.
+    learning: returns the learning of the plate, None where nothing is learned.
+    noted: called with a record of each change of contacts and each decision.
     """
 
     def __init__(

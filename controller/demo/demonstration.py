@@ -1,6 +1,7 @@
-"""Runs the demonstration: a daemon over simulated amplifiers, scenes of recorded touches, rows.
+"""The demonstration: a daemon over simulated amplifiers, recorded touches, rows and pictures.
 
-Pictures of a demonstration: some of the touches, and where each of several contents is felt.
+`run_demo` plays scenes and returns a row per touch, `run_live` serves the page instead.
+`write_pictures` draws some of the touches, and where each of several contents is felt.
 """
 
 import asyncio

@@ -1,11 +1,9 @@
-"""Observes the daemon and the simulated plate, and makes a row of every touch.
+"""The simulated plate of the demonstration, and a row for every touch on it.
 
-One row of the demonstration: a touch, what was predicted for it and what was measured.
-
-Simulated amplifiers and their plate, in a process of their own behind a real wire.
-
-The controller reaches the amplifiers over the wire only; the control socket places the fingers and
-reads their vibration.
+`simulated_plate` starts amplifiers in a process of their own behind a real wire. The controller
+reaches them over the wire only; `SimulatedPlate` places the fingers and reads their vibration over
+the control socket. `TouchRecorder` observes the control loop and makes a `TouchRow` of each touch:
+what was predicted for it and what was measured.
 """
 
 import asyncio
@@ -295,9 +293,15 @@ async def _start(
 ) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         # -P: do not import a folder named sim in the working directory
-        *(sys.executable, "-P", "-m", "sim", str(rig_file), *SIM_OPTIONS[wire]),
+        sys.executable,
+        "-P",
+        "-m",
+        "sim",
+        str(rig_file),
+        *SIM_OPTIONS[wire],
         *(("--exact",) if seed is None else ("--seed", str(seed))),
-        *("--control", str(control)),
+        "--control",
+        str(control),
         "--until-eof",  # ends with the pipe below, however this process ends
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,

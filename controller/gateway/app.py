@@ -1,6 +1,7 @@
-"""The gateway's routes: the page, the API over HTTP with its OpenAPI description, the WebSocket.
+"""The gateway's routes and process: page, API over HTTP with OpenAPI, WebSocket and metrics.
 
-The gateway's server process: aiohttp, its socket, and its end within a second.
+`Gateway` holds the routes, `serve` runs them in aiohttp until SIGINT or SIGTERM and ends within a
+second.
 """
 
 import asyncio
@@ -289,7 +290,10 @@ class Gateway:
         if method in SILENCING:  # over the own connection, from any client
             return await self._silence(name, method, params)
         line = await connection.link.request(
-            *(self._daemon, name, method, params),
+            self._daemon,
+            name,
+            method,
+            params,
             may_open=lambda: self.may_connect(request.remote),
         )
         return result_of(read_line(line))
@@ -332,7 +336,9 @@ class Gateway:
         try:
             await socket.prepare(request)
             await bridge(
-                *(socket, connection.address, self._daemon),
+                socket,
+                connection.address,
+                self._daemon,
                 field=self.field if "field" in request.query else None,
             )
         finally:
@@ -436,7 +442,8 @@ def load_certificate(settings: GatewaySettings) -> ssl.SSLContext | None:
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         tls.load_cert_chain(
-            *(settings.certificate, settings.key),
+            settings.certificate,
+            settings.key,
             password="",  # without it OpenSSL would prompt for one
         )
     except (OSError, ValueError) as error:

@@ -1,13 +1,10 @@
-"""Connections of clients, and the bounds that the web server lacks.
+"""Clients' connections to the gateway and theirs to the daemon, with the bounds that aiohttp lacks.
 
 Silent, slow or non-reading clients cannot exhaust connections or memory. Timeouts count from the
-last complete request, so sending byte by byte gains nothing.
-
-Clients' connections to the daemon: of a browser on a WebSocket, and those that HTTP keeps.
-
-On a WebSocket frames are lines of the API to the daemon, and the other way.
-
-Heads of the frames that a WebSocket client sends, checked for what aiohttp does not bound.
+last complete request, so sending byte by byte gains nothing. `bridge` passes lines of the API
+between a browser's WebSocket and the daemon; `KeptLink` is the connection to the daemon that an
+HTTP connection keeps. `FrameHeads` checks the heads of WebSocket frames for what aiohttp does not
+bound.
 """
 
 import asyncio

@@ -1,9 +1,7 @@
-"""Settings of the gateway: where it listens and who has access; unsafe ones are refused.
+"""Settings of the gateway and access control: where it listens, and who may use it.
 
-Access control of the gateway by Host, Origin and token.
-
-The Host list stops DNS rebinding, the Origin list stops cross-site requests and WebSockets, and the
-token stops other users of the machine.
+Unsafe settings are refused. The Host list stops DNS rebinding, the Origin list cross-site requests
+and WebSockets, and the token other users of the machine.
 """
 
 import hmac
@@ -31,22 +29,23 @@ _MAX_TOKEN_FILE = 4096  # bytes
 
 @dataclass(frozen=True, kw_only=True)
 class GatewaySettings:
-    """Settings of the gateway; raises InputError if they are unsafe.
-
-    socket: the daemon's; host: an IP address to bind; port: 0 for any free one; token: gives full
-    access to the API, random by default; extra_hosts: further allowed Hosts, without port, besides
-    those of the loopback; origins: further allowed Origins; is_token_user_supplied: False for a
-    random one.
-    """
+    """Settings of the gateway; raises InputError if they are unsafe."""
 
     socket: Path
+    """The daemon's socket."""
     host: str = "127.0.0.1"
+    """IP address to listen on."""
     port: int = 0
+    """Port to listen on; 0: any free one."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
+    """Gives full access to the API; random by default."""
     certificate: Path | None = None
+    """TLS certificate chain, PEM; None: no TLS."""
     key: Path | None = None
     extra_hosts: tuple[str, ...] = ()
+    """Allowed Hosts without port, besides those of the loopback."""
     origins: tuple[str, ...] = ()
+    """Allowed Origins besides the gateway's own."""
     is_token_user_supplied: bool = False
 
     def __post_init__(self) -> None:
@@ -110,11 +109,6 @@ class GatewaySettings:
     def is_loopback(self) -> bool:
         """Whether only this machine can connect."""
         return ipaddress.ip_address(self.host).is_loopback
-
-    @property
-    def is_encrypted(self) -> bool:
-        """Whether TLS is used."""
-        return self.certificate is not None
 
     @property
     def allowed_names(self) -> frozenset[str]:
@@ -243,7 +237,7 @@ class Access:
         """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
         headers = request.headers
         host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
-        own = sent_origin(f"{'https' if self._settings.is_encrypted else 'http'}://{host}")
+        own = sent_origin(f"{'https' if self._settings.certificate else 'http'}://{host}")
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
         is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
         for is_refused, error, text in (

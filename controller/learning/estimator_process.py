@@ -1,17 +1,15 @@
-"""Keeps an estimator running in a process of its own, and hands it one pattern at a time.
+"""The estimator as the daemon sees it: its messages, its process, and the answers it corrects.
 
-Whatever happens to the process, the daemon goes on: one that dies, or does not answer in time, is
-replaced after a growing pause, and after so many in a row without an answer no longer.
+A message is its length, 8 bytes, and a pickle. The estimator answers each request by one message, a
+list of replies. Both sides are the same program, and no other process has their pipes.
 
-Messages between the daemon and its estimator, in Python's pickle format.
+`EstimatorProcess` hands the process one pattern at a time. Whatever happens to the process, the
+daemon goes on: a process that dies, or does not answer in time, is replaced after a growing pause,
+until several in a row have failed without an answer.
 
-A message is its length, 8 bytes, and its pickle. The estimator answers each request by one message,
-a list of replies. Both sides are the same program, and no other process has their pipes.
-
-The answers that the control loop gives, and their replacement in one step.
-
-A replacement is prepared before: by the estimator, and here, a frequency at a time, the onsets and
-endings, whose shapes are taken over from the answers before until then.
+`AnswersInUse` replaces the answers of the control loop in one step. They were prepared before: by
+the estimator, and for onsets and endings here, one frequency at a time; until then these keep the
+shapes of the previous answers.
 """
 
 import asyncio

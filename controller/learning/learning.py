@@ -1,15 +1,15 @@
-"""The daemon's plate stays known: patterns that settle correct the answers to the next touches.
+"""Learning of the plate while the daemon drives it: settled patterns correct the next answers.
 
     control loop -> pattern -> SettledReadings -> EstimatorProcess -> table -> control loop
 
 The control loop never waits for any of this, and stops do not pass through it. Answers are replaced
-in one step, whole and prepared. Without an estimator they stay as they were, for a while.
+in one step, whole and prepared. Without an estimator they stay as they were for `CAUTIOUS_AFTER`
+seconds, then they are those of a plate that is not known.
 
-Reads the sensors of the plate once in every pattern that has settled.
-
-A pattern has settled some time after its last fade and after the last change of the contacts. What
-plays is never delayed for a reading: its requests go last on the line, and none is sent while
-contacts change. A renewal disturbs a reading, which is then repeated.
+`SettledReadings` reads the sensors once in every pattern that has settled: some time after its last
+fade and after the last change of the contacts. What plays is never delayed for a reading: its
+requests go last on the line, and none is sent while contacts change. A renewal disturbs a reading,
+which is then repeated.
 """
 
 import asyncio

@@ -1,9 +1,7 @@
-"""Notifications to systemd by the protocol of sd_notify(3): READY=1, WATCHDOG=1, STATUS=...
+"""The daemon as a system service: notifications to systemd, and the Unix socket reserved for it.
 
-Datagrams to the socket in NOTIFY_SOCKET, non-blocking; errors are ignored. Without the variable
-nothing is sent.
-
-The Unix socket at which clients reach the daemon, reserved for one daemon.
+Notifications follow sd_notify(3), as READY=1, WATCHDOG=1, STATUS=...: datagrams to the socket in
+NOTIFY_SOCKET, non-blocking; errors are ignored. Without the variable nothing is sent.
 """
 
 import contextlib

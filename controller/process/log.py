@@ -1,10 +1,11 @@
-"""The daemon's log, in JSON lines, written by a thread (`QueueListener`).
+"""The daemon's log, in JSON lines, written by a thread (`QueueListener`); rate limits.
 
 Logging never blocks: lines go into a bounded queue; lines that do not fit or cannot be written are
 lost. Each logging call in the code is limited to a few lines a second; the next line says how many
 were skipped. JSON escapes control characters, so that messages cannot forge lines.
 
-A token bucket: of actions at a rate, or of processor time at a share.
+`RateLimiter` is a token bucket, of actions at a rate or of processor time at a share; the API's
+server and the gateway use it, too.
 """
 
 import contextlib

@@ -59,7 +59,7 @@ Step = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True)
 class ToneSchedule:
-    """Steps of interleaved tones; settling, window [s]: of each step."""
+    """Steps of interleaved tones, each with its settling time and window [s]."""
 
     steps: tuple[Step, ...]
     settling: float
@@ -116,16 +116,16 @@ _DERIVATIVES = {"ACCELERATION": 0, "VELOCITY": 1, "DISPLACEMENT": 2}
 
 @dataclass(frozen=True)
 class PlateSensor:
-    """A sensor of an amplifier: which of its sensors, and its place; derivatives to acceleration.
-
-    frequency_max [Hz]: of its tones.
-    """
+    """A sensor of an amplifier that measures the plate."""
 
     amplifier: str
     number: int
+    """Its number among the sensors of the amplifier."""
     place: Sensor
     derivatives: int
+    """Number of derivatives in time from what it measures to acceleration."""
     frequency_max: float
+    """Highest frequency of a tone that it measures [Hz]."""
 
     def accelerations(self, reading: Reading, frequencies: FloatArray) -> ComplexArray:
         """Complex amplitudes [m/s²] (f,) of the tones [Hz] of a reading."""
@@ -136,10 +136,11 @@ class PlateSensor:
 
 @dataclass(frozen=True)
 class PlateSensors:
-    """Sensors that are used; unused: why others are not, one line each."""
+    """The sensors of a rig's amplifiers as those of its plate."""
 
     used: tuple[PlateSensor, ...]
     unused: tuple[str, ...]
+    """Why other sensors are not used, a line each."""
 
 
 async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateSensors:
@@ -214,14 +215,13 @@ _LEVEL_STEP = QUANTITIES["level"].from_wire(1)
 
 
 class TonePlayer:
-    """Plays tones on the amplifiers of a rig; lines: to them, urls: by their names.
-
-    group: of all amplifiers; ramp [s]: of what was played last; token: of its set.
-    """
+    """Plays tones on the amplifiers of a rig; urls: by the amplifiers' names."""
 
     def __init__(self, rig: Rig, lines: Callable[[], Lines], urls: Mapping[str, str]) -> None:
         self.ramp = RAMP
+        """Ramp [s] of what was played last."""
         self.token = 0
+        """Token of the set that was played last."""
         self.amplifiers: Mapping[str, Amplifier] = {}
         self._rig = rig
         self._lines = lines()
@@ -230,7 +230,10 @@ class TonePlayer:
         self._ramp_max = RAMP
 
     async def open(self) -> PlaybackCapabilities:
-        """Open all amplifiers, disarmed; what they can play. Raises DriverError, InputError."""
+        """Open all amplifiers, disarmed; return what they can play.
+
+        Raises DriverError and InputError.
+        """
         self.amplifiers = {
             name: await self._lines.amplifier(
                 url, self._rig.limits, name=name, is_output=name in self._rig.outputs
@@ -249,7 +252,7 @@ class TonePlayer:
         await self.group.silence(RAMP)
 
     async def play(self, excitation: Excitation) -> Drive:
-        """Play on all amplifiers; what each driven ERA plays, by name, as its amplifier confirms.
+        """Play on all amplifiers; return the tone of each driven ERA by name, as confirmed.
 
         Raises CommandRefused for a level that is not played.
         """
@@ -300,8 +303,10 @@ class _StepResponses:
 class PlateSelfMeasurement:
     """Plays interleaved tones on all ERAs of a rig and reads the sensors of its amplifiers.
 
-    lines: to its amplifiers, urls: by name. level: of every tone, 0..1 of full stroke, None for the
-    usual one; is_quick: one round; progress: called with the number of steps done and of all.
+    urls: of the amplifiers by name.
+    level: of every tone, 0..1 of full stroke; None: the usual one.
+    is_quick: play one round only.
+    progress: called with the number of steps done and of all.
     """
 
     def __init__(

@@ -257,7 +257,7 @@ def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
 
 
 def require_untouched(*, is_known: bool, has_terminal: bool) -> None:
-    """Raise InputError, or typer.Abort, unless somebody says that nothing touches the plate."""
+    """Raise InputError, or typer.Abort, unless the user confirms that nothing touches the plate."""
     if is_known:
         return
     if not (has_terminal and sys.stdin.isatty()):

@@ -44,18 +44,18 @@ SAME_FREQUENCY = 1.0
 
 @dataclass(frozen=True)
 class FingerVibration:
-    """Measured vibration of one fingertip over a window.
-
-    frequencies (f,) [Hz]; amplitudes (f, p) [m/s²] of the steady part at each point of the tip;
-    peaks (p,) [m/s²], the largest acceleration there, transients included; weights (p,) of the
-    points in the mean over the tip; threshold: name of the set that levels are above.
-    """
+    """Measured vibration of one fingertip over a window, at p points of the tip."""
 
     frequencies: FloatArray
+    """Frequencies (f,) [Hz]."""
     amplitudes: FloatArray
+    """Amplitudes (f, p) [m/s²] of the steady part."""
     peaks: FloatArray
+    """Largest accelerations (p,) [m/s²], transients included."""
     weights: FloatArray
+    """Weights (p,) of the points in the mean over the tip."""
     threshold: str = DEFAULT_THRESHOLD
+    """Name of the set of thresholds that levels refer to."""
 
     @property
     def level_db_sl(self) -> float:
@@ -369,17 +369,16 @@ class _Touch:
 
 @dataclass(eq=False)
 class _PlayedPattern:
-    """What plays from its commit to the next command [s], with its measurements.
-
-    touches: those that feel a content; steady, onset: vibration by finger over the longest rest of
-    the fingers and over its first 100 ms.
-    """
+    """What plays from its commit to the next command [s], with its measurements."""
 
     applied: PlayReport
     touches: Sequence[_Touch]
+    """Touches that feel a content."""
     until: float = math.inf
     steady: Measured | None = None
+    """Vibration by finger over the longest time in which no finger moved."""
     onset: Measured | None = None
+    """Vibration by finger over the first 100 ms."""
 
     @property
     def duration(self) -> float:
@@ -389,8 +388,9 @@ class _PlayedPattern:
 class TouchRecorder:
     """Collects a row per touch: pass `observe` to the daemon.
 
-    tasks: measure and make rows; all are made once it has ended. Times of rows count from `start`.
-    on_row is called with each row once the touch was lifted and its pattern measured.
+    tasks: group of the tasks that measure and make rows; once it has ended, all rows are made.
+    on_row: called with each row once the touch was lifted and its pattern measured.
+    Times of rows count from `start`.
     """
 
     def __init__(

@@ -42,6 +42,7 @@ from controller.api.link import RESPONSE_TIMEOUT, Unreachable, read_line, result
 from controller.api.methods import METHODS, SILENCING, Method
 from controller.api.schema import API_VERSION, ApiMessage
 from controller.api.summaries import SUMMARIES
+from controller.gateway.access import SUBPROTOCOL, VERSIONS, Access
 from controller.gateway.connections import (
     CLIENT_TIMEOUT,
     CONNECTION,
@@ -51,7 +52,7 @@ from controller.gateway.connections import (
 )
 from controller.gateway.field import DrawnField
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import SUBPROTOCOL, VERSIONS, Access, GatewaySettings
+from controller.gateway.settings import GatewaySettings
 from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections

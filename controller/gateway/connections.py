@@ -25,8 +25,8 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from controller.api.jsonrpc import ErrorCode, RpcError, read_request
 from controller.api.link import DaemonLink, Unreachable
 from controller.api.methods import SILENCING
+from controller.gateway.access import HEADERS
 from controller.gateway.field import DrawnField
-from controller.gateway.settings import HEADERS
 from controller.process.log import RateLimiter
 
 SEND_TIMEOUT = 5.0  # s; for one frame
@@ -120,12 +120,10 @@ MAX_KEPT = 8  # connections; the daemon has 32
 
 @dataclass(eq=False)
 class KeptLink:
-    """The connection to the daemon that an HTTP connection keeps, from its first request on.
-
-    kept: those of all HTTP connections, which leave places of the daemon to others.
-    """
+    """The connection to the daemon that an HTTP connection keeps, from its first request on."""
 
     kept: "set[KeptLink]"
+    """The open ones of all HTTP connections, bounded so that the daemon has room for others."""
     _link: DaemonLink | None = None
     _is_over: bool = False
 
@@ -229,7 +227,10 @@ _PROTOCOL_ERROR = b"\x88\x02\x03\xea"  # close frame with code 1002 of RFC 6455
 
 @dataclass
 class Deadlines:
-    """What has to happen within a time, in a bounded number: the oldest expires for a new one."""
+    """Deadlines of things that must happen within `CLIENT_TIMEOUT`.
+
+    Above the limit the oldest expires for a new one.
+    """
 
     limit: int
     _all: dict[Hashable, tuple[Callable[[], object], asyncio.TimerHandle]] = field(
@@ -237,7 +238,7 @@ class Deadlines:
     )
 
     def start(self, key: Hashable, expire: Callable[[], object]) -> None:
-        """Start the time of something, anew if it runs already; expire: called at its end."""
+        """Start a deadline, or start it anew; expire: called when it has passed."""
         self.cancel(key)
         if len(self._all) >= self.limit:
             oldest, (expire_oldest, _) = next(iter(self._all.items()))
@@ -247,25 +248,21 @@ class Deadlines:
         self._all[key] = expire, timer
 
     def cancel(self, key: Hashable) -> None:
-        """Cancel it: it has happened."""
+        """Cancel a deadline: what it waited for has happened."""
         if key in self._all:
             self._all.pop(key)[1].cancel()
 
 
 class ClientConnection(asyncio.Protocol):
-    """Stands between a transport and the web server's protocol, and is each of them to the other.
-
-    link: the connection to the daemon that ends with this one; is_refused: whether the rest of a
-    request is discarded, which was answered before its end.
-    """
+    """Stands between a transport and the web server's protocol, and is each to the other."""
 
     _transport: Any = None
 
     def __init__(self, acceptor: "ConnectionAcceptor") -> None:
-        self.link = KeptLink(acceptor.links)
+        self.link = KeptLink(acceptor.links)  # ends with this connection
         self._acceptor = acceptor
         self._frames: FrameHeads | None = None
-        self.is_refused = False
+        self.is_refused = False  # whether the rest of a request is discarded, after its answer
         self._is_answering = False
         self._received = b""  # the first bytes since the last response
 
@@ -351,7 +348,7 @@ class ClientConnection(asyncio.Protocol):
         return f"{peer[0]}:{peer[1]}"
 
     def upgrade(self) -> bool:
-        """Expect frames, unless some came too early, before this was accepted; whether it does."""
+        """Expect WebSocket frames from now on; return False if some came before it was accepted."""
         if self._received.split(_END_OF_HEAD)[1:] == [b""] and len(self._received) < _MAX_UPGRADE:
             self._frames = FrameHeads()
         return self._frames is not None
@@ -363,12 +360,10 @@ CONNECTION: ContextVar[ClientConnection] = ContextVar("CONNECTION")
 
 @dataclass
 class ConnectionAcceptor:
-    """Accepts connections of a listening socket for a web server.
-
-    make_server: makes the web server's protocol of a connection; tls: None without.
-    """
+    """Accepts connections of a listening socket for a web server."""
 
     make_server: Callable[[], asyncio.Protocol]
+    """Makes the web server's protocol of a connection."""
     tls: ssl.SSLContext | None
     links: set[KeptLink] = field(default_factory=set)
     idle: Deadlines = field(default_factory=lambda: Deadlines(MAX_WAITING))

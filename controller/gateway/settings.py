@@ -1,10 +1,8 @@
-"""Settings of the gateway and access control: where it listens, and who may use it.
+"""Settings of the gateway: where it listens, and who may use it; unsafe ones are refused.
 
-Unsafe settings are refused. The Host list stops DNS rebinding, the Origin list cross-site requests
-and WebSockets, and the token other users of the machine.
+It loads no library of the gateway, as the daemon and the command line check for these here.
 """
 
-import hmac
 import ipaddress
 import os
 import re
@@ -12,8 +10,6 @@ import secrets
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-
-from aiohttp import HttpVersion10, HttpVersion11, web
 
 from model.errors import InputError
 from registry.files import regular_file
@@ -189,118 +185,3 @@ def require_gateway() -> None:
                 f"the gateway needs {name}, which is not installed; "
                 "install it in a checkout with  pip install -e '.[gateway]'"
             )
-
-
-SUBPROTOCOL = "era-haptics.v1"
-_TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)
-VERSIONS = (HttpVersion10, HttpVersion11)
-_PORT = re.compile(r":[0-9]+\Z")
-_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-
-HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-        "connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'none'"
-    ),
-    "Cache-Control": "no-cache",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-}
-"""Headers of every response: the page loads nothing from elsewhere and cannot be framed."""
-
-_CORS = {
-    "Access-Control-Allow-Methods": "POST",
-    "Access-Control-Allow-Headers": "Authorization, Content-Type",
-    "Access-Control-Max-Age": "600",
-    "Vary": "Origin",
-}
-
-
-class Access:
-    """Refuses requests that are not allowed, and protects responses.
-
-    Everything under /api except the OpenAPI description needs the token, and so do the metrics
-    outside the loopback: `Authorization: Bearer TOKEN`, or for a WebSocket, where browsers cannot
-    set headers, the subprotocol `era-haptics.token.TOKEN` beside `era-haptics.v1`.
-    """
-
-    def __init__(self, settings: GatewaySettings) -> None:
-        self._settings = settings
-        self._origins = settings.allowed_origins
-
-    def check(self, request: web.Request) -> None:
-        """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
-        headers = request.headers
-        host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
-        own = sent_origin(f"{'https' if self._settings.certificate else 'http'}://{host}")
-        is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
-        is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
-        for is_refused, error, text in (
-            (request.version not in VERSIONS, web.HTTPVersionNotSupported, "use HTTP/1.1"),
-            # Small chunks would take the time of others.
-            ("Transfer-Encoding" in headers, web.HTTPLengthRequired, "send a Content-Length"),
-            # Routes would take an escaped line feed for another path, and ignore the host in a URL.
-            (
-                _CONTROL.search(request.path) or not request.raw_path.startswith("/"),
-                web.HTTPBadRequest,
-                "the target must be a path without control characters",
-            ),
-            (
-                _PORT.sub("", host).lower() not in self._settings.allowed_names,  # with any port
-                web.HTTPMisdirectedRequest,
-                "this Host is not allowed; see --allow-host",
-            ),
-            (
-                "Origin" in headers and origin.lower() not in {own, *self._origins} - {""},
-                web.HTTPForbidden,
-                "this Origin is not allowed; see --allow-origin",
-            ),
-            (is_embedded, web.HTTPForbidden, "cross-site requests are not allowed"),
-            (
-                self._needs_token(request) and not self._has_token(request),
-                web.HTTPUnauthorized,
-                "the token is missing or wrong; open the URL that the gateway printed",
-            ),
-        ):
-            if is_refused:
-                raise error(text=text)
-
-    async def preflight(self, _: web.Request) -> web.Response:
-        """Answer what a page of another, allowed origin may do (CORS): what `protect` adds."""
-        return web.Response(headers={"Allow": "OPTIONS, POST"})
-
-    async def protect(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Add the security headers to a response, and remove the name of the web server."""
-        response.headers.update(HEADERS)
-        response.headers.pop("Server", None)
-        if request.headers.get("Origin", "").lower() in self._origins:
-            response.headers.update(_CORS)
-            response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
-
-    def _needs_token(self, request: web.Request) -> bool:
-        """Whether it needs the token, unlike the page, the OpenAPI description and a preflight."""
-        path = request.path
-        is_method = path.startswith("/api/") and path != "/api/v1/openapi.json"
-        is_remote = path == "/metrics" and not self._settings.is_loopback
-        return (is_method or is_remote) and request.method != "OPTIONS"
-
-    def _has_token(self, request: web.Request) -> bool:
-        tokens = [
-            value.removeprefix("Bearer ")
-            for value in request.headers.getall("Authorization", [])
-            if value.startswith("Bearer ")
-        ]
-        tokens += [
-            name.strip().removeprefix(_TOKEN_SUBPROTOCOL)
-            for value in request.headers.getall("Sec-WebSocket-Protocol", [])
-            for name in value.split(",")
-            if name.strip().startswith(_TOKEN_SUBPROTOCOL)
-        ]
-        return len(tokens) == 1 and hmac.compare_digest(  # in constant time
-            tokens[0].encode(errors="surrogateescape"), self._settings.token.encode()
-        )

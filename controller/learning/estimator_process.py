@@ -41,71 +41,69 @@ HEAD = 8
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What an estimator starts from.
-
-    table: of the rig as built, never changed; sensors: where readings are from; drive_mode: of the
-    questions that answers are prepared for; file: of what is learned.
-    """
+    """What an estimator starts from."""
 
     rig: Rig
     table: LocalizationTable
+    """Table of the rig as built, never changed."""
     sensors: tuple[Sensor, ...]
+    """Sensors that readings come from."""
     drive_mode: str
+    """Drive mode of the questions that answers are prepared for."""
     file: Path
+    """File of what is learned."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """A table in place of the one that it corrects, prepared for its first touch.
-
-    base: fingerprint of the table that it corrects; is_complete: whether onsets and endings are
-    shaped anew for it, too.
-    """
+    """A corrected table, prepared for its first touch."""
 
     base: str
+    """Fingerprint of the table that it corrects."""
     table: LocalizationTable
     is_complete: bool
+    """Whether onsets and endings are to be shaped anew for it, too."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ready:
-    """The estimator takes patterns.
-
-    settling [s]: until the plate has settled; note: why it starts anew although there is a file, or
-    nothing; only_alarms: why it does not correct answers, or nothing; answers: those of the plate
-    as learned before, None for the table as built; cautious: for a plate that is not known;
-    change: how it had changed in a way that nothing known explains, as found then, or nothing.
-    """
+    """The estimator is ready to take patterns."""
 
     settling: float
+    """Time [s] until the plate has settled."""
     note: str
+    """Why it starts anew although there is a file; else ""."""
     only_alarms: str
+    """Why it does not correct answers; else ""."""
     answers: Answers | None
+    """Answers of the plate as learned before; None: of the table as built."""
     cautious: Answers
+    """Answers of a plate that is not known."""
     change: str
+    """How the plate had changed in a way that nothing known explains; else ""."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a pattern has shown.
-
-    time [s]: of the pattern; alarm: whether the plate is not as known; is_held: whether answers
-    wait for an explanation; explanation: what has changed, where that was found now; change: how
-    the plate has changed in a way that nothing known explains, or nothing; answers: None for the
-    same.
-    """
+    """What a pattern has shown of the plate."""
 
     time: float
+    """Time of the pattern [s]."""
     alarm: bool
+    """Whether the plate is not as known."""
     is_held: bool
+    """Whether answers wait for an explanation."""
     explanation: str
+    """What has changed, if this pattern has settled it; else ""."""
     change: str
+    """How the plate has changed in a way that nothing known explains; else ""."""
     answers: Answers | None
+    """Corrected answers; None: they stay as they are."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefreshedAnswers:
-    """Answers prepared whole while nothing else was to be done, and cautious ones of that plate."""
+    """Completely prepared answers, made in idle time, and cautious ones of the same plate."""
 
     answers: Answers
     cautious: Answers
@@ -113,10 +111,11 @@ class RefreshedAnswers:
 
 @dataclass(frozen=True)
 class Note:
-    """For the log; is_final: why the estimator cannot work."""
+    """A line for the log."""
 
     text: str
     is_final: bool = False
+    """Whether it says why the estimator cannot work at all."""
 
 
 Request: TypeAlias = Start | SettledPattern | None
@@ -158,15 +157,14 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EstimatorTimeouts:
-    """How long an estimator may take [s], and how often it is replaced.
-
-    start: until it takes patterns; estimate: for one pattern, of which the search for an
-    explanation takes longest; max_failures: in a row.
-    """
+    """How long an estimator may take [s], and how often it is replaced."""
 
     start: float = 60.0
+    """Until it takes patterns."""
     estimate: float = 30.0
+    """For one pattern; the search for an explanation takes longest."""
     max_failures: int = 8
+    """Failures in a row after which it is not replaced any more."""
 
 
 DEFAULT_TIMEOUTS = EstimatorTimeouts()
@@ -175,8 +173,9 @@ DEFAULT_TIMEOUTS = EstimatorTimeouts()
 class EstimatorProcess:
     """An estimator that is replaced when it fails.
 
-    start: what each starts from, with answers that it knows; received: called with each reply;
-    failed: called with the reason when one has ended, and whether no other is started.
+    start: first request to each process.
+    received: called with each reply.
+    failed: called when a process has ended, with the reason and whether it is the last one.
     """
 
     def __init__(
@@ -204,11 +203,11 @@ class EstimatorProcess:
 
     @property
     def waiting(self) -> int:
-        """Patterns that were handed over and are still to be estimated, but for the present one."""
+        """Number of patterns that wait for the estimator, without the one it is working on."""
         return 0 if self._is_over else self._waiting.qsize()
 
     async def run(self) -> None:
-        """Keep an estimator running until cancelled, refused, or given up; lets it end then."""
+        """Keep an estimator running until cancelled, or until its failure is final."""
         timeouts, failures = self._timeouts, 0
         backoff = Backoff(first=1.0, maximum=60.0)
         while True:

@@ -61,11 +61,13 @@ _logger = logging.getLogger(__name__)
 
 
 class SettledReadings:
-    """Follows what the control loop reports, and reads it.
+    """Follows what the control loop reports, and reads each pattern once it has settled.
 
-    sensors: of amplifiers, by name, of one time; settling [s]: of the plate; take: receives
-    each pattern with what was read of it, at the time [s] when the window ended; disturbed: called
-    for each reading that a change, an overload or the link has spoilt.
+    amplifiers: by name; their clocks must agree.
+    sensors: of these amplifiers.
+    settling: time [s] until the plate has settled.
+    take: receives each pattern with its reading, at the time [s] when the window ended.
+    disturbed: called for each reading that a change, an overload or the link has spoilt.
     """
 
     def __init__(
@@ -235,9 +237,10 @@ _FAILED_REMEDY = "see the log above; era forget starts anew"
 class Learning:
     """Learning of one plate, from `open` on, when all amplifiers are open, until `close`.
 
-    table, timing: of the rig as built; file: of what is learned; changed: called at each change of
-    state or cause; estimated: with the time [s] from the end of a reading to the answers that
-    follow it.
+    table, timing: of the rig as built.
+    file: of what is learned.
+    changed: called at each change of state or cause.
+    estimated: called with the time [s] from the end of a reading to the answers that follow it.
     """
 
     def __init__(
@@ -405,7 +408,7 @@ class Learning:
             self._say_followed(f"the plate is followed from {known} on")
 
     def _say_followed(self, cause: str) -> None:
-        """Say that the plate is as known, or only watched."""
+        """Report that the plate is followed, or only watched."""
         if self._only_alarms:
             self._say(
                 "only_alarms",
@@ -484,7 +487,7 @@ class Learning:
             self._outage = None
 
     def _answer_cautiously(self) -> None:
-        """Trust what was learned no longer, since nobody watches the plate."""
+        """Stop trusting what was learned, since no estimator watches the plate."""
         if self._cautious is None or self.status.cautious:
             return
         self._correct(self._cautious, is_cautious=True)
@@ -502,7 +505,7 @@ class Learning:
         *,
         is_alarm: bool = False,
     ) -> None:
-        """Note a state, and tell of it."""
+        """Set state, cause and remedy, log them and report the change."""
         said = {"state": state, "cause": cause, "remedy": remedy}
         self.status = self.status.model_copy(update=said)
         level = logging.WARNING if state in BAD or is_alarm else logging.INFO
@@ -531,7 +534,7 @@ class Learning:
             self._say("failed", failure_text(error), _FAILED_REMEDY)
 
     async def _read(self, settling: float) -> None:
-        """Read what settles; what fails is said, and started anew."""
+        """Read settled patterns; report failures and start again after them."""
         while True:
             self._readings = SettledReadings(
                 self._rig,

@@ -1,7 +1,4 @@
-"""The daemon's socket: reserved for one daemon, with permissions, in a safe place.
-
-The `era` command: commands of modules, errors and their exit statuses.
-"""
+"""The `era` command, errors and their exit statuses, and the socket reserved for one daemon."""
 
 import errno
 import os

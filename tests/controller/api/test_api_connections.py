@@ -1,8 +1,6 @@
-"""Clients and the drawn field with a daemon of a later version.
+"""Connections of the API's clients: their bounds, their turns, and daemons of a later version.
 
-Turns of the API's clients, by counting requests, in virtual time.
-
-Bounds of one connection, to the byte and the request, in virtual time.
+Bounds are to the byte and the request, turns are counted in requests; both in virtual time.
 """
 
 import asyncio

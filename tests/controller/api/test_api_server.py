@@ -1,7 +1,4 @@
-"""The API's server: what it replies, in which order it serves, and which touches count.
-
-Lines of the API: what is read, what is refused with which code and key, what is written.
-"""
+"""The API's server and its lines: refusals, the order of service, and which touches count."""
 
 import asyncio
 import inspect

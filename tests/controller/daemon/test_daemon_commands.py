@@ -1,7 +1,4 @@
-"""The daemon's commands: what they print of a daemon, and what they refuse.
-
-A whole daemon in virtual time: requests of clients, actions at the amplifier, events.
-"""
+"""A daemon in virtual time: requests of clients, its commands, actions at the amplifier, events."""
 
 import asyncio
 import os

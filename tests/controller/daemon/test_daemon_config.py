@@ -1,6 +1,7 @@
-"""The daemon's configuration file: defaults, paths, calibrations, and problems by line and key.
+"""The daemon's configuration file and its reload.
 
-What a reload applies and refuses, read in another process, and what it costs the loop.
+Defaults, paths, calibrations, and problems by line and key; what a reload applies and refuses, that
+it is read in another process, and what it costs the loop.
 """
 
 import asyncio

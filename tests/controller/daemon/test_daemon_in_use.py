@@ -1,10 +1,7 @@
-"""What a daemon keeps of the time before something has stopped its plate.
+"""A daemon in use, in virtual time: dumps, layouts, signals and the service manager, strengths.
 
-Layouts by name: what the next finger feels, what goes on, and the commands on a real daemon.
-
-Signals and the service manager of a daemon, and jumps of the wall clock, in virtual time.
-
-The strength of touch sources, clients and regions, from the API to the skin, in virtual time.
+Dumps have what came before the plate was stopped; layouts are chosen by name; strengths of touch
+sources, clients and regions act from the API to the skin.
 """
 
 import asyncio

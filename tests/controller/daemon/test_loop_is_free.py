@@ -1,6 +1,6 @@
-"""What clients, files and panels send holds the control loop of an armed plate for 5 ms at most.
+"""Clients, files and panels hold the control loop of an armed plate for 5 ms at most.
 
-Measured by the processor time of the loop's thread: unlike a time on the wall it is much the same
+Measured by the processor time of the loop's thread, which, unlike wall-clock time, is much the same
 on a busy machine.
 """
 

@@ -1,7 +1,4 @@
-"""What the gateway reads once for all: metrics of the daemon, and the field that is drawn.
-
-The gateway for allowed clients: HTTP, OpenAPI and the WebSocket.
-"""
+"""The gateway for allowed clients: HTTP, OpenAPI, the WebSocket, metrics and the drawn field."""
 
 import asyncio
 import contextlib
@@ -29,10 +26,11 @@ from controller.api.methods import METHODS, LogEvent, PatternEvent, RequestedBy,
 from controller.api.schema import ApiMessage, PlayedTone
 from controller.api.server import Hub
 from controller.gateway import app
+from controller.gateway.access import Access
 from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import Access, GatewaySettings
+from controller.gateway.settings import GatewaySettings
 from daemons import PATIENCE, ready_daemon, until
 from gateway_bench import (
     TOKEN,

@@ -1,6 +1,4 @@
-"""A stop is passed on or answered, whatever other browsers and the daemon do.
-
-Attacks on the gateway: each is refused, and the daemon receives no call.
+"""Attacks on the gateway are refused; stops through it are passed on or answered.
 
 An attack is a request to arm that would be granted but for one thing, or an invalid frame. The
 gateway is a process connected to a daemon that records its calls.

@@ -1,7 +1,4 @@
-"""`era gateway` as a process: how it begins, what it refuses, TLS, and its end within a second.
-
-A stop of a fresh client gets through while others attack the whole gateway over TLS.
-"""
+"""`era gateway` as a process: start, refusals, TLS, end, and stops during attacks."""
 
 import asyncio
 import contextlib

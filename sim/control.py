@@ -1,12 +1,7 @@
-"""Control of a running simulation over a socket: fingers, sensors, faults and time.
+"""Control of a running simulation: its context, and JSON lines over a Unix socket, version 3.
 
-What requests of the control socket must hold; other keys are ignored unless a form says so.
-
-The running simulation: its bench, devices, sensors and recording.
-
-Control operations on fingers, sensors, recordings and the plate.
-
-Operations of the control socket, version 3: one JSON object per line in each direction.
+Only the owner of the socket may open it. One JSON object per line in each direction; keys that a
+request does not know are ignored, except by `sensors` and `plate`.
 
     {"op": "hello"}                            {"protocol": "era-sim-control", "version": 3,
                                                 "clock": "wall" or "virtual", "ops": [...],
@@ -51,12 +46,8 @@ Operations of the control socket, version 3: one JSON object per line in each di
     {"op": "finish"}                                   write it: {"file", "seconds", "is_full"}
 
 Times are seconds of the simulation's clock: time.monotonic(), or virtual time from 0. Felt, signals
-and tones cover the last ten seconds. An invalid request returns {"error": TEXT}
-and changes nothing.
-
-The control socket: JSON lines over a Unix socket that only its owner may open.
-
-The operations are documented in `sim.control`.
+and tones cover the last ten seconds. An invalid request returns {"error": TEXT} and changes
+nothing.
 """
 
 import asyncio

@@ -1,11 +1,11 @@
-"""Fault injection into amplifiers and wires.
+"""Fault injection: which fault is active on an amplifier or its wire, and when.
 
-Fault windows: which fault is active on an amplifier or its wire, and when; and files of them:
+Fault files list fault windows:
 
-seed: 7                      # makes faults reproducible
-faults:
-  - {fault: drop, at: 2, lasts: 10, share: 0.2}         # seconds
-  - {fault: unplug, at: 15, lasts: 0.5, amplifier: main}
+    seed: 7                      # makes faults reproducible
+    faults:
+      - {fault: drop, at: 2, lasts: 10, share: 0.2}         # seconds
+      - {fault: unplug, at: 15, lasts: 0.5, amplifier: main}
 
 Faults of frames (drop, delay, duplicate, corrupt, truncate) apply to whole frames sent by the
 amplifier, and to pieces of the stream received from the host. Not modelled: noise between frames,

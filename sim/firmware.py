@@ -1,8 +1,7 @@
-"""The project's firmware in the place of simulated amplifiers: its samples move the plate.
+"""The project's firmware in place of simulated amplifiers: its samples move the plate of a bench.
 
-The firmware as a process for each amplifier, and a bench whose plate is moved by its samples.
-
-`make firmware` builds it from the sources of a checkout; it is not part of the wheel.
+`make firmware` builds it from the sources of a checkout; it is not part of the wheel. It runs as
+one process for each amplifier.
 """
 
 import asyncio

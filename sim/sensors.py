@@ -1,14 +1,8 @@
-"""Virtual accelerometers, recordings, and measures of their signals.
+"""Accelerometers on a bench, and recordings of them and of fingers: CSV, WAV, universal files.
 
-Recordings, readings of sensors over time, and their files: CSV, WAV, universal files.
-
-The suffix selects the format: WAV is for audio tools, universal files are for modal software. Files
-are replaced atomically.
-
-Accelerometers on a bench, and recordings of them and of fingers to a file.
-
-Samples are spooled to an unnamed file in the same folder; the recording is written at the end, so a
-killed run leaves nothing behind. A recording stops at its maximum size.
+The suffix selects the format: WAV is for audio tools, universal files are for modal software.
+Samples are spooled to an unnamed file in the same folder and written at the end, replacing a file
+atomically, so that a killed run leaves nothing behind. A recording stops at its maximum size.
 """
 
 import csv

@@ -1,12 +1,8 @@
-"""An amplifier as it must be after what it was sent: sessions, tokens, sets and what plays.
+"""An amplifier as it must be after the requests it was sent: states, sessions, sets and outputs.
 
-What it was sent was carried out at some time between the request and its reply, and what it shows
-was true at some time between, so both are compared with all of that interval. Nothing is known at
-first: the first status says how it is.
-
-The set under way to an amplifier: its parts as they were sent, and what is said of them.
-
-The states of an amplifier as they must be: latch, watchdog, faults, high voltage.
+A request was carried out at some time between itself and its reply, and a status was true at some
+time between, so both are compared with all of that interval. Nothing is known until the first
+status.
 """
 
 import math

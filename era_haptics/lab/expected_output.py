@@ -1,15 +1,8 @@
-"""What the channels and layers of an amplifier must show: levels, tokens, sums that are limited.
+"""What an amplifier must show of its outputs and clock after sets whose times are intervals.
 
-A set begins at some time between its commit and the reply, or a little later; what plays then is
-asked of `era_haptics.lab.expected_output`.
-
-The clock of an amplifier as statuses and Marks show it, and the moments that commits name.
-
-What channels may play by sets whose commits are known only as intervals.
-
-The playback has each commit in the middle of its interval. Every transition has by how much sooner
-or later it may have begun, and a radius by which its first amplitude may differ. Times [s] are of
-any one clock; intervals are two times.
+A set begins at some time between its commit and the reply, or a little later. The playback has each
+commit in the middle of its interval; every transition has by how much sooner or later it may have
+begun, and a radius by which its first amplitude may differ. Times [s] are of any one clock.
 """
 
 import math

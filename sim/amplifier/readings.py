@@ -1,11 +1,9 @@
-"""What a simulated amplifier says: capabilities, what its channels play, faults; how warm it is.
-
-The clock of a simulated amplifier: what its samples count, as a function of the bench's time.
+"""What a simulated amplifier reports: capabilities, measurements, faults, temperature and clock.
 
     Crystal: counts age + error * age + warm_up * tau * (age - tau * (1 - exp(-age / tau))) [s]
     Clock:   runs 1 + rate times as fast as its crystal, from each change of its rate on
 
-Sums are whole numbers, so that nothing adds up over hours of steering.
+The clock sums whole numbers, so that no rounding adds up over hours of steering.
 """
 
 import math
@@ -75,13 +73,22 @@ def capabilities(channels: int, *, is_output: bool = False) -> Values:
     low, high = QUANTITIES["frequency"].to_wire(LOWEST), full["frequency"]
     limits = {"frequency_min": low, "frequency_max": high, "level_max": full["level"]}
     return {
-        **{"channels": channels, "layers": LAYERS, "voices": VOICES, "set_words": 4096},
-        **{"knots": full["knots"], "features": sum(1 << FEATURES[each] for each in features)},
+        "channels": channels,
+        "layers": LAYERS,
+        "voices": VOICES,
+        "set_words": 4096,
+        "knots": full["knots"],
+        "features": sum(1 << FEATURES[each] for each in features),
         **limits,
-        **{"frequency_step": 1, "level_step": 1, "phase_step": 1, "slew": full["slew"]},
-        **{"ramp_max": full["ramp"], "watchdog_min": QUANTITIES["watchdog"].minimum},
-        **{"watchdog_max": full["watchdog"]},
-        **{"envelope_step_min": 10, "envelope_step_max": full["envelope_step"]},
+        "frequency_step": 1,
+        "level_step": 1,
+        "phase_step": 1,
+        "slew": full["slew"],
+        "ramp_max": full["ramp"],
+        "watchdog_min": QUANTITIES["watchdog"].minimum,
+        "watchdog_max": full["watchdog"],
+        "envelope_step_min": 10,
+        "envelope_step_max": full["envelope_step"],
         "clock_error": QUANTITIES["clock_error"].to_wire(1e-6),
         "limits": [dict(limits) for _ in range(channels)],
     }
@@ -136,15 +143,20 @@ def achieved(playback: Playback, layer: int) -> Values:
     playing = playback.playing(layer)
     commands = [
         {
-            **{"channel": each.channel, "frequency": each.frequency},
-            **{"level": each.level, "phase": each.phase},
+            "channel": each.channel,
+            "frequency": each.frequency,
+            "level": each.level,
+            "phase": each.phase,
         }
         for each in playing.commands
     ]
     return {
-        **{"token": playback.tokens.get(layer, 0), "layer": layer},
-        **{"count": len(commands), "commands": commands},
-        **{"ramp": playing.ramp, "valid_for": playing.valid_for},
+        "token": playback.tokens.get(layer, 0),
+        "layer": layer,
+        "count": len(commands),
+        "commands": commands,
+        "ramp": playing.ramp,
+        "valid_for": playing.valid_for,
     }
 
 

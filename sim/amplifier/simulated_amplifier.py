@@ -4,19 +4,14 @@ Requests and replies are the values of their records (`drivers.protocol.definiti
 the wire. Events happen at their own time: a watchdog that expired between two calls expired when it
 was due, and what plays is a description in time (`drivers.playing`), not samples.
 
+`TRANSITIONS` has the requests that are allowed in each state, and the state that follows; any other
+request is refused (WRONG_STATE). Transitions without a request: OPERATION_ENABLED to
+FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once silent; SWITCHED_ON,
+entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence. Arm passes through
+READY_TO_SWITCH_ON and SWITCHED_ON at once.
+
 Not modelled: the rise time of high voltage, the voltage waveform of a tone, and the distortion
 where the sum of layers is limited.
-
-State table: which request is allowed in which state, and the state that follows.
-
-Any other request is refused (WRONG_STATE). Transitions without a request are in the amplifier:
-OPERATION_ENABLED to FAULT_REACTION_ACTIVE when the watchdog expires, from there to FAULT once
-silent; SWITCHED_ON, entered by Disarm, to SWITCH_ON_DISABLED once silent. Clear needs silence.
-READY_TO_SWITCH_ON and SWITCHED_ON are passed through at once: Arm goes all the way.
-
-Sets of a simulated amplifier: collected from their parts, checked as a whole, staged, committed.
-
-All numbers are integers of the wire; see drivers.protocol.sets.
 """
 
 import math
@@ -246,8 +241,11 @@ class SimulatedAmplifier:
         clock: AmplifierClock | None = None,
     ) -> None:
         self.identity: Values = {
-            **{"versions": 1 << VERSION, "vendor": "era-haptics", "product": "simulated amplifier"},
-            **{"serial_number": f"SIM-{name}", "firmware": "1"},
+            "versions": 1 << VERSION,
+            "vendor": "era-haptics",
+            "product": "simulated amplifier",
+            "serial_number": f"SIM-{name}",
+            "firmware": "1",
         }
         self.capabilities = capabilities(channels, is_output=is_output)
         self.state = "SWITCH_ON_DISABLED"
@@ -363,12 +361,15 @@ class SimulatedAmplifier:
         layers = self.capabilities["layers"]
         return with_readings(
             {
-                **{"state": STATES[self.state], "fault": FAULTS[self.fault]},
+                "state": STATES[self.state],
+                "fault": FAULTS[self.fault],
                 "flags": sum(1 << STATUS_FLAGS[each] for each, is_set in flags.items() if is_set),
                 "latch": self.latch,
                 "watchdog_left": _Q["watchdog_left"].to_wire(max(left, 0.0)),
                 "clock": clock,
-                **{"token": self._intake.committed, "channels": len(levels), "layers": layers},
+                "token": self._intake.committed,
+                "channels": len(levels),
+                "layers": layers,
                 "levels": [_Q["level"].to_wire(level) for level in levels],
                 "tokens": [tokens.get(layer, 0) for layer in range(layers)],
             },
@@ -528,8 +529,10 @@ class SimulatedAmplifier:
             self._start_waiting(now)
             self._play(taken, token, now)
         return {
-            **{"token": token, "exact": not (is_missing or self.is_derated)},
-            **{"staged": is_staged, "played": not (is_missing or is_staged)},
+            "token": token,
+            "exact": not (is_missing or self.is_derated),
+            "staged": is_staged,
+            "played": not (is_missing or is_staged),
             "missing": taken if is_missing else 0,
         }
 
@@ -577,7 +580,9 @@ class SimulatedAmplifier:
             self.clock.steer(0, moment)
         self.state = state
         event = {
-            **{"state": STATES[state], "fault": FAULTS[self.fault], "latch": self.latch},
+            "state": STATES[state],
+            "fault": FAULTS[self.fault],
+            "latch": self.latch,
             "channel": NO_CHANNEL if channel is None else channel,
         }
         for listener in self.listeners:

@@ -1,1 +1,1 @@
-"""The simulated rig: amplifiers on one plate, their clock, and their devices."""
+"""The simulated rig: amplifiers and sensors on one plate, and the amplifiers' devices."""

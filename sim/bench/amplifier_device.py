@@ -1,4 +1,4 @@
-"""A simulated amplifier as its far ends serve it: on a bench, with faults at their times."""
+"""An amplifier of a bench as far ends serve it, with faults injected at their times."""
 
 import asyncio
 import math

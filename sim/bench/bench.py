@@ -1,18 +1,15 @@
-"""The simulated rig: its amplifiers, its plate in the time domain, and fingers on it.
+"""The simulated rig: amplifiers, sensors and fingers on one plate in the time domain.
 
 Time is passed in; only `keep_time` reads a clock. Channels drive the ERAs by the rig's wiring,
 level 1 being the full stroke, with the imperfections given.
 
-The clocks of a bench's amplifiers as its plate has them: straight on, while that is true enough.
+The plate is solved anew where the motion of a base changes, and a host changes the rate of an
+amplifier's clock with every Ping. So the plate continues with a straight clock for each amplifier
+until that differs by `WRONG` from the amplifier's own.
 
-A plate is solved anew where the motion of a base changes, and a host changes the rate of a clock
-with every Ping. So the plate goes on with a straight clock until that is wrong by `WRONG`.
-
-The sensors of one simulated amplifier: one at the foot of each ERA that it drives, and others.
-
-They read the acceleration of the plate in time. Tones are fitted by least squares over a window:
-the normal equations of all tones and a constant are summed sample by sample, so that tones played
-together do not leak into each other.
+Sensors read the acceleration of the plate at the foot of each ERA, and at other points. Tones are
+fitted by least squares over a window: the normal equations of all tones and a constant are summed
+sample by sample, so that tones played together do not leak into each other.
 """
 
 import asyncio
@@ -295,11 +292,9 @@ class Sensing:
         return {
             "unit": SENSOR_UNITS["ACCELERATION"],
             "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
-            **{
-                "x": _place(sensor.x),
-                "y": _place(sensor.y),
-                "range": float(np.float32(sensor.reach)),
-            },
+            "x": _place(sensor.x),
+            "y": _place(sensor.y),
+            "range": float(np.float32(sensor.reach)),
             "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
         }
 
@@ -358,10 +353,14 @@ class Sensing:
                 ]
                 record.append(words, {"flags": int(is_overloaded), "tones": rows})
         return {
-            **{"reading": reader.measurement.number, "state": READING_STATES[state]},
+            "reading": reader.measurement.number,
+            "state": READING_STATES[state],
             "window_left": _Q["window_left"].to_wire(left),
-            **{"window_start": reader.window_start, "token": reader.token},
-            **{"tones": tones, "count": listed, "sensors": words},
+            "window_start": reader.window_start,
+            "token": reader.token,
+            "tones": tones,
+            "count": listed,
+            "sensors": words,
         }
 
 

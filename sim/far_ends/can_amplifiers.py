@@ -1,24 +1,18 @@
-"""The amplifiers' side of CAN: a bus, CANopen nodes and adapters.
+"""The amplifiers' side of CAN: CANopen nodes on a bus within this process, and adapters to it.
 
-Objects of an amplifier, read and written by SDO (CiA 301).
+Objects of a node are read and written by SDO (CiA 301). 2000 has the identity: four texts, then the
+versions. 2001 and 2002 have the words of the replies to GetCaps and GetStatus, a subindex each.
+Uploads are expedited or segmented, downloads expedited; no object that can be written is longer
+than four bytes. Far ends exchange packed frames (`drivers.wires.can_frames`), those of a message
+together.
 
-2000 has the identity: four texts, then the versions. 2001 and 2002 have the words of the replies to
-GetCaps and GetStatus, a subindex each. Uploads are expedited and segmented, downloads expedited;
-others are refused, since nothing longer than four bytes can be written.
+A frame of one member of the bus is received by all others, at one time. Not modelled: arbitration,
+retransmission, bus-off.
 
-The amplifiers' side of a CAN bus, without I/O.
-
-Frames come and go packed (`drivers.wires.can_frames`), those of a message together.
-
-A CAN bus within this process: a frame of one member is received by all others, at one time.
-
-Not modelled: arbitration, retransmission, bus-off.
-
-Simulated CAN adapters: LAWICEL's serial ASCII commands (slcan), and socketcand over TCP.
-
-Commands of slcan end with CR; replies are CR, or BELL for errors; elements of socketcand are
-`< ... >`. Not modelled: acceptance masks, time stamps and polling, which are accepted without
-effect; modes other than raw mode, extended identifiers, discovery by broadcast.
+Adapters speak LAWICEL's serial ASCII commands (slcan), which end with CR and are answered with CR,
+or BELL for errors, and socketcand over TCP, with elements `< ... >`. Acceptance masks, time stamps
+and polling are accepted without effect. Not modelled: modes other than raw mode, extended
+identifiers, discovery by broadcast.
 """
 
 import asyncio

@@ -1,12 +1,9 @@
-"""Fingers as sensors: accelerations at the points of each fingertip, and the vibration felt there.
+"""Sensors on the plate: fingertips, whose samples are kept for ten seconds, and accelerometers.
 
-Samples are kept for ten seconds. The load of a finger on the plate is in `sim.plant.plant`.
-
-Virtual accelerometers: scale, noise, range and resolution of their readings.
-
-A reading is the acceleration times the scale, plus white noise up to half the sampling rate,
-clipped to the range and rounded to the resolution. Not modelled: mass, resonance, anti-alias
-filter, cross-axis sensitivity, delay.
+The load of a finger on the plate is in `sim.plant.plant`. A reading of an accelerometer is the
+acceleration times its scale, plus white noise up to half the sampling rate, clipped to its range
+and rounded to its resolution. Not modelled: its mass, resonance, anti-alias filter, cross-axis
+sensitivity and delay.
 """
 
 import math

@@ -1,15 +1,10 @@
 """Imperfections of a bench: of its amplifiers, its plate and ERAs, and the fingers on it.
 
-Errors of gain and phase and delays of the amplifiers; a plate and ERAs that differ
-from the rig's and stand elsewhere, fingers that do not weigh alike, and crystals of the amplifiers.
-ERAs move with a second harmonic. Not modelled: other distortion, drifting errors of channels.
-
-Second harmonics of ERAs: the tones that these play beside those that they are to play.
-
-A share of each tone's own amplitude, at twice its frequency and twice its phase, and an angle of
-each ERA. Of signals there are none, and of several tones together no sums and differences.
-
-Motion of an ERA's base by the voices of its channel, in terms for the plate in time.
+Amplifiers have errors of gain and phase, delays, and crystals that are not exact; plate and ERAs
+differ from the rig's, ERAs stand elsewhere, and fingers do not weigh alike. Each ERA adds a second
+harmonic: a share of each tone's amplitude at twice its frequency and phase, with an angle of its
+own. Not modelled: sums and differences of several tones, harmonics of signals, other distortion,
+and drifting errors of channels.
 """
 
 import cmath

@@ -1,26 +1,18 @@
 """The plate in the time domain, advanced from one change of drive or contacts to the next.
 
-The exact solutions are those of `model.transients.time_response`; the plant adds the clock, the
-present base motion, and the free vibration that remains after each change.
-
-The plate's equations of motion under fingers, solved once for each set of contacts.
+No step size enters. Between changes the motion is a sum of free vibrations, which decay, and of
+forced ones (`model.transients.time_response`); every change adds free vibrations that keep
+displacement and velocity continuous. Accelerations are sampled from tables of these exponentials,
+one product of matrices for a block of samples.
 
 A fingertip acts at a point, and its phalanx moves: a low-rank change and one more coordinate. The
 reduced basis is extended by the static vectors of the point, and the small system diagonalised
-again. Solutions are cached. Structural damping remains that of the plate on its ERAs.
+again; solutions are cached by the set of contacts. Structural damping remains that of the plate on
+its ERAs. Fingers that come to rest are solved apart: a large plate takes a tenth of a second, in
+which its amplifiers must continue to reply.
 
-Fingers that come to rest are solved apart: a large plate takes a tenth of a second, in which its
-amplifiers must go on replying.
-
-Accelerations of a vibrating plate on a grid of times, at points that stay for a while.
-
-A free vibration is a sum of exponentials that decay, a forced one of a few that do not. All are
-tabulated for a block of samples, so that a block is one product of matrices.
-
-The plate in the time domain under bases that move along samples, joined by straight lines.
-
-For amplifiers that make waveforms of their own. As in `sim.plant.plant` no step size enters: a base
-that moves along a straight line has a closed-form solution, and every corner adds a free vibration.
+`SampledPlant` is moved by amplifiers that make their own waveforms: bases move along straight lines
+between samples, which has a closed-form solution, too.
 """
 
 import math

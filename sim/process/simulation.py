@@ -1,8 +1,8 @@
 """The simulation as a process: a bench behind its wires, until a signal ends it.
 
-An event loop with a virtual clock that is stepped explicitly; I/O is served as usual.
-
-The live view of a simulation on the terminal: amplifiers, peak accelerations, fingers.
+Time is that of the event loop: the wall clock, or a virtual clock that is stepped explicitly while
+I/O is served as usual. The live view shows amplifiers, peak accelerations and fingers on the
+terminal.
 """
 
 import asyncio

@@ -1,12 +1,8 @@
-"""The engine as a library: of a wheel of this platform, or compiled at first use.
+"""The engine of a software amplifier: its library, settings, lines and counters.
 
-What a software amplifier is to do, as the command line hands it on, and where hosts reach it.
-
-A terminal or a port is kept while the process that plays restarts.
-
-The engine of `firmware/ports/sound/sound.h` in this process, and what it counts.
-
-Counters are in memory shared with the process that watches it.
+The library is `firmware/ports/sound/sound.h`, of a wheel of this platform or compiled at first use.
+A terminal or port is kept while the process that plays restarts. Counters are in memory that the
+process that watches it shares.
 """
 
 import ctypes

@@ -1,7 +1,4 @@
-"""What an amplifier plays through: ports of a JACK client, or a device of PortAudio.
-
-What can play and record: clients of the JACK server, and devices of PortAudio.
-"""
+"""What a software amplifier plays through: ports of a JACK client, or a device of PortAudio."""
 
 import ctypes
 import os

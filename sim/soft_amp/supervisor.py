@@ -142,7 +142,10 @@ class SoftAmplifierSupervisor:
         inherited = [self._file.fileno(), self._place.terminal, self._place.listening, life]
         self._process = subprocess.Popen(  # noqa: S603  this program
             [
-                *(sys.executable, "-P", "-m", "sim.soft_amp"),
+                sys.executable,
+                "-P",
+                "-m",
+                "sim.soft_amp",
                 json.dumps(asdict(self._settings)),
                 *map(str, inherited),
                 str(self._rate),

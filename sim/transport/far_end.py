@@ -1,6 +1,7 @@
-"""Far ends without I/O, served in the running event loop: on pseudo-terminals and TCP ports.
+"""Far ends without I/O, served in the running event loop on pseudo-terminals and TCP ports.
 
-Pseudo-terminals: the host opens one side, the far end the other; symbolic links name them.
+The host opens one side of a pseudo-terminal, the far end the other. Symbolic links give them other
+paths.
 """
 
 import asyncio

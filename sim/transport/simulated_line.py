@@ -1,12 +1,9 @@
-"""What lines add to the time of the bits: operating system, USB frames, latency timers, networks.
+"""A simulated line: transmission time, the delays of its kind, and injected faults.
 
-Not modelled: retransmission, other devices on the same USB, the trigger levels of UARTs, a packet
-of an FTDI chip that a second reply fills up.
-
-A simulated wire: transmission time, the delays of its kind of line, and injected faults.
-
-What takes long arrives in pieces, each at the time of its last bit, so that an amplifier that minds
-pauses between bytes sees none. Not modelled: gaps between the bytes of a frame.
+Delays are those of operating systems, USB frames, latency timers and networks. What takes long
+arrives in pieces, each at the time of its last bit, so that an amplifier that minds pauses between
+bytes sees none. Not modelled: gaps between the bytes of a frame, retransmission, other devices on
+the same USB, the trigger levels of UARTs, an FTDI packet that a second reply fills up.
 """
 
 import asyncio

@@ -244,7 +244,9 @@ def test_reading_without_a_set_has_no_token(coarse_rig: Rig) -> None:
     bench.amplifiers["main"].restart(5.45)
     assert reading(bench, 5.6) == {
         **dict.fromkeys(("reading", "state", "window_left", "window_start", "token"), 0),
-        **{"tones": 0, "count": 0, "sensors": []},
+        "tones": 0,
+        "count": 0,
+        "sensors": [],
     }
 
 

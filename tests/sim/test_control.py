@@ -290,10 +290,16 @@ def test_parse_endpoint_splits_a_url(url: str, place: str, address: int) -> None
 @pytest.mark.parametrize(
     "url",
     [
-        *("sim://rig.yaml", "serial://", "modbus+tcp://host/1", "nonsense"),
-        *("serial:///dev/ttyUSB0?address=300", "serial:///dev/ttyUSB0?baud=fast"),
-        *("modbus+tcp://127.0.0.1:502/0", "modbus+tcp://127.0.0.1:99999/1"),
-        *("can+slcan:///dev/ttyACM0#128", "modbus+rtu:///dev/ttyS1#two"),
+        "sim://rig.yaml",
+        "serial://",
+        "modbus+tcp://host/1",
+        "nonsense",
+        "serial:///dev/ttyUSB0?address=300",
+        "serial:///dev/ttyUSB0?baud=fast",
+        "modbus+tcp://127.0.0.1:502/0",
+        "modbus+tcp://127.0.0.1:99999/1",
+        "can+slcan:///dev/ttyACM0#128",
+        "modbus+rtu:///dev/ttyS1#two",
     ],
 )
 def test_parse_endpoint_refuses_an_invalid_url(url: str) -> None:

@@ -135,7 +135,9 @@ async def test_amplifiers_of_one_rig_share_its_simulation(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "url",
     [
-        *("sim://", "sim://?control=x", "sim:///no/such/rig.yaml"),
+        "sim://",
+        "sim://?control=x",
+        "sim:///no/such/rig.yaml",
         *(f"sim://{example_rig_path()}?{rest}" for rest in ("speed=2", "amplifier=aux", "seed=x")),
     ],
 )

@@ -1,7 +1,4 @@
-"""Check of content on the plate of a table: how much of what it asks for a finger will feel.
-
-Picture of checked content: level over time, expected and felt, and what plays.
-"""
+"""How much of a content file a finger will feel, simulated in time on the plate of a table."""
 
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,4 @@
-"""`era content`: what of content that people have will be felt on a plate.
-
-`era play`: content at a finger of a running daemon, or of a simulated plate.
-"""
+"""`era content check` and `era play`: content on a simulated plate, or at a finger of a daemon."""
 
 import math
 from collections.abc import Iterator

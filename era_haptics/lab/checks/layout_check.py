@@ -1,9 +1,4 @@
-"""One touch of an effect simulated in time: what the finger feels, and what a resting one does.
-
-What an effect makes felt in general: its strongest stimulus, at rest and along some ways.
-
-Check of a surface layout on the plate of a table: how every region will feel.
-"""
+"""How every region of a surface layout will feel, simulated in time on the plate of a table."""
 
 import math
 from collections.abc import Iterator, Sequence

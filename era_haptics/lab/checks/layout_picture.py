@@ -1,7 +1,4 @@
-"""Which regions of a layout can be felt apart at the same time: two and three fingers at once.
-
-Picture of a checked layout: level, frequency and contrast of every touch over the plate.
-"""
+"""Which regions of a layout are felt apart at once, and the picture of a checked layout."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence

@@ -1,19 +1,15 @@
-"""A host below the host: one raw message at a time, the times of all that is heard, and findings.
+"""A host below the host: one raw message at a time, and the findings that end a check.
 
-A client of a kind of wire makes frames and reads them; nothing is repeated or given up by itself,
-and what was not asked for is kept, so that checks see it. A check finds a violation of the
-contract, nothing to check, or that it came too late.
+A client of a kind of wire makes frames and reads them. It repeats nothing and gives nothing up by
+itself; it keeps messages that no request was waiting for, so that checks see them. A check finds a
+violation of the contract, that it does not apply, or that this machine was too late.
 
-Times by an amplifier's own clock, however late this machine was.
+`Dating` gives times by the amplifier's own clock, however late this machine was: a reading that
+shows u seconds came between s and r, so the clock is ahead of that of this machine by u - r to
+u - s. What is common to all these intervals is short.
 
-A reading that shows u seconds came between s and r, so its clock is ahead of that of this machine
-by u - r to u - s. What is common to all these intervals is short.
-
-What an amplifier states and can play, and the rows of a check: what is sent in turn.
-
-Capabilities are read beyond their ranges too, and which of them cannot be so.
-
-The judge of an amplifier under conformance: what it finds ends a check.
+`Capabilities` and `PlayableMaterial` are what the amplifier states and can play, `Row` what a check
+sends, and `Judge` the amplifier as it must be.
 """
 
 import asyncio
@@ -740,7 +736,9 @@ class PlayableMaterial:
         others = [layer(number, self.beside(number, 0.05)) for number in self.layers[4:]]
         changes = [
             layer(0, tones[0], ramp=ramp, valid_for=60_000),
-            *(layer(1, ramp=ramp), layer(2, other, ramp=ramp), layer(3, tones[3], ramp=ramp)),
+            layer(1, ramp=ramp),
+            layer(2, other, ramp=ramp),
+            layer(3, tones[3], ramp=ramp),
         ]
         shaped = layer(0, begins[0]), layer(1, ends[1]), layer(2, ends[2]), layer(3, begins[3])
         return [

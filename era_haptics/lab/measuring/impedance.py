@@ -1,28 +1,29 @@
 """An exciter by its electrical impedance, hanging free and glued, and its weight.
 
-A coil of resistance R_e and inductance L in a field Bl, on a suspension k, c, has
-
-    Z = R_e + i w L + K sqrt(i w) + R_m / (1 + i Q (f / f_0 - f_0 / f)),    R_m = Bl² / c,
-
-K the semi-inductance of eddy currents, and w_0² = k / u, u the reduced mass of what moves against
-each other: coil m and magnet M hanging free, m + B and M glued to a mass B. With the whole weight
-W = m + M and r = (f_g / f_f)² therefore
-
-    m = r W / (1 + (1 - r) W / B),    k = u w_0²,    Bl² = R_m w_0 u / Q,    Q_es = Q R_e / R_m.
-
-A rig's resonance and Q are those of one mass m_0 on a held spring, the magnet where the coil was
-glued, otherwise the coil: f = f_0 sqrt(u / m_0), and Q sqrt(m_0 / u).
-
-A resistor that is s S in place of S, and a first input that has g times the gain of the second,
-make (Z / s + S) g - S of Z: another circuit of this kind, so that each fitted value tells the true.
-
-An impedance through a sound card: voltage before a resistor, and over it, of one multisine.
+The impedance is measured through a sound card, with one multisine and two voltages:
 
     output ──┬── exciter ──┬── resistor R ── ground
             V_1           V_2                         Z = R (V_1 / V_2 - 1)
 
 Delay, filters and gain of the two inputs are taken as the same; one input that is moved from the
 first place to the second has them the same, whatever they are.
+
+A coil of resistance R_e and inductance L in a field Bl, on a suspension k, c, has
+
+    Z = R_e + i w L + K sqrt(i w) + R_m / (1 + i Q (f / f_0 - f_0 / f)),    R_m = Bl² / c,
+
+K the semi-inductance of eddy currents, and w_0² = k / u, u the reduced mass of the two masses that
+move against each other: coil m and magnet M hanging free, m + B and M glued to a mass B. With the
+whole weight W = m + M and r = (f_g / f_f)² therefore
+
+    m = r W / (1 + (1 - r) W / B),    k = u w_0²,    Bl² = R_m w_0 u / Q,    Q_es = Q R_e / R_m.
+
+A rig's resonance and Q are those of one mass m_0 on a held spring, the magnet where the coil was
+glued, otherwise the coil: f = f_0 sqrt(u / m_0), and Q sqrt(m_0 / u).
+
+A resistor of s S instead of S, and a first input with g times the gain of the second, make
+(Z / s + S) g - S of Z: another circuit of this kind, so that the true values follow from the fitted
+ones.
 """
 
 from collections.abc import Callable

@@ -1,24 +1,21 @@
-"""What cables tell, and what a measurement is refused for, with its cause.
+"""Checks of a measurement by its loop-back cable, and responses from recordings of a stepped sine.
 
-Of the loop-back: delay, converters, lost blocks, and whether inputs have the clock of the outputs.
-Two devices, or an aggregate of two, drift by 10 to 100 millionths. What is played in several runs
-is then no longer orthogonal, and nothing else shows it where the loop-back has the right clock.
+The loop-back shows delay, converters, lost blocks, and whether inputs have the clock of the
+outputs. Two devices, or an aggregate of two, drift by 10 to 100 millionths: runs are then no longer
+orthogonal, and nothing else shows it where the loop-back has the right clock.
 
-A recording of a stepped sine: where its tones are, and what each sensor heard of them.
+A stepped sine, measured with any converter, is read from WAV or CSV files (`read_stepped`).
 
-Channels are the inputs of the sensors and, behind the last one, the references: one cable for each
-ERA in the order of the rig, or one for all. In that case each ERA plays ascending frequencies, one
-ERA after the other in the order of the rig; a frequency that is not higher begins the next.
+- WAV: channels are the inputs of the sensors and, behind the last one, the references: a cable for
+  each ERA in the order of the rig, or one for all. With one cable each ERA plays ascending
+  frequencies, one ERA after the other in the order of the rig; a frequency that is not higher
+  begins the next ERA. A tone is where the frequency of the analytic reference stays. The first
+  half of each is left for the plate to settle; sensor by reference follows from products with
+  both, under a Hann window.
+- CSV: columns `frequency_hz`, `output`, `sensor`, and `magnitude` or `magnitude_db` with
+  `phase_deg`, or `real` with `imag`. An output is an ERA's name, or its number from 1.
 
-Tones are where the frequency of the analytic reference stays. Of each, the first half is left for
-the plate to settle; sensor by reference follows from products with both, under a Hann window.
-
-Responses from a stepped sine that any converter has measured: CSV or WAV files.
-
-Of a sensor's samples by those of a reference, an input that a cable connects with what plays: the
-same that `era measure` finds by itself. CSV columns are `frequency_hz`, `output`, `sensor`, and
-`magnitude` or `magnitude_db` with `phase_deg`, or `real` with `imag`. An output is an ERA's name,
-or its number from 1. What a file does not say is in its name: SENSOR-OUTPUT.csv, or SENSOR.wav.
+What a file does not say is in its name: SENSOR-OUTPUT.csv, or SENSOR.wav.
 """
 
 import cmath

@@ -1,10 +1,8 @@
-"""Responses in plain text while they are measured: a line for each sensor, one screen in all.
+"""Responses of a rig's plate: measured through a sound card by multisines, or simulated.
 
-A rig's plate measured through a sound card: runs of a multisine; stepped tones as a check.
-
-A plate measured through a sound card for its identification: multisines, some of them again.
-
-Responses that a desk would measure of a simulated plate, which deviates from its rig's file.
+Stepped tones check a measurement, and lines of text show it while it runs. For identification one
+run is repeated at half the level and at the whole one. A simulated plate deviates from its rig's
+file.
 """
 
 import time

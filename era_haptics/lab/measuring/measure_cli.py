@@ -1,9 +1,4 @@
-"""`era measure`: frequency responses of a plate through a sound card.
-
-`era measure --impedance`: what an exciter is, by its impedance and its weight.
-
-`era outputs`: which output of a sound card drives which actuator of a rig.
-"""
+"""`era measure` and `era outputs`: a plate, an exciter and the wiring of a sound card, measured."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,13 +1,10 @@
-"""Which output of a sound card drives which actuator: one output after the other plays.
+"""Which output of a sound card drives which actuator: one output plays after the other.
 
-A person feels or sees a soft tone. An accelerometer that is put beside each
-actuator in turn tells it by itself, also of a plate that is hardly known: an actuator moves its own
-place more than others do, and by the velocity there it gives power to the plate. Responses at all
-places are compared with those of the rig's model, each frequency by its own size. The delay of the
-sound card is unknown: that by which all outputs together fit best is taken, and polarities are
-those relative to the majority.
-
-`era outputs`: ask a person or an accelerometer, report the channels, and write them.
+A person feels or sees a soft tone. Or an accelerometer is put beside each actuator in turn, which
+works for a plate that is hardly known, too: an actuator moves its own place more than others do,
+and by the velocity there it gives power to the plate. Responses at all places are compared with
+those of the rig's model, each frequency normalised. The unknown delay of the sound card is taken as
+the one by which all outputs together fit best; polarities are relative to the majority.
 """
 
 import math

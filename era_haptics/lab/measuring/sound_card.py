@@ -1,20 +1,13 @@
-"""Periodic multisines on all outputs at once, told apart by the turns of their phases.
+"""A rig at a sound card: how it is wired, multisines, and runs that play and record at once.
 
-In run e the phase of source i is turned by 2 pi e i / S, S the number of sources and of runs: at
-every line the S runs are orthogonal (the matrix of the discrete Fourier transform), so that the
-response to each source follows from all runs, with the full amplitude of all sources.
+A sound card plays one array from memory and records into another by a callback in C: Python is not
+in the path of the sound, and lost blocks are counted.
 
-Lines are odd multiples of the lowest: a square law shows in the empty even ones. Amplitudes fall
-with frequency, since accelerations grow.
-
-A sound card that plays from memory and records into it at the same time, by a callback in C.
-
-Python is not in the path of the sound: one array is played, another is filled, and what is lost
-meanwhile is counted.
-
-How a rig is wired to a sound card, and what its limits allow of that.
-
-A run through a sound card: what is played, and what is kept of it once the plate has settled.
+Multisines play on all outputs at once. In run e the phase of source i is turned by 2 pi e i / S, S
+the number of sources and of runs: at every line the S runs are orthogonal (the matrix of the
+discrete Fourier transform), so that the response to each source follows from all runs, with the
+full amplitude of all sources. Lines are odd multiples of the lowest: a square law shows in the
+empty even ones. Amplitudes fall with frequency, since accelerations grow.
 """
 
 import ctypes

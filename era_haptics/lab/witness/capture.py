@@ -1,17 +1,14 @@
-"""Captures, the bytes of wires as text, and violations of rules with the frames around them.
+"""Captures of wires, the witness's configuration, its violations, and messages as it decodes them.
 
-A line of a capture is a piece:
+A capture is text, a line for each piece of bytes:
 
     TIME WIRE > HEX        toward the amplifier
     TIME WIRE < HEX        toward the host
 
-TIME in seconds of any one clock; # begins a comment.
-
-Configuration of the witness: wires, amplifiers, limits of channels and time limits.
-
-It is given independently of the controller's configuration.
-
-Messages as they are decoded and sent, alike for every kind of wire; those of a serial line.
+TIME is in seconds of any one clock; # begins a comment. The configuration (wires, amplifiers,
+limits of channels, time limits) is independent of the controller's. Messages are alike for every
+kind of wire; the decoder of serial lines is here, the others are in
+`era_haptics.lab.witness.decoders`.
 """
 
 import math

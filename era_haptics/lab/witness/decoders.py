@@ -1,11 +1,11 @@
-"""Messages on a CAN bus, in the text of an adapter: socketcand over TCP, slcan on a serial port.
+"""Decoders of the witness for CAN adapters and Modbus.
 
-Of NMT, boot-up and what resets a node are decoded; heartbeats, emergencies and SDO, which other
-masters read, concern no rule. Other text is ignored.
+CAN messages are read from the text of an adapter: socketcand over TCP, slcan on a serial port. Of
+other frames NMT, boot-up and what resets a node are decoded; heartbeats, emergencies and SDO, which
+other masters read, concern no rule. Other text is ignored.
 
-Messages on Modbus, over TCP and RTU: each is written, then its reply is read.
-
-ADUs are found as docs/reference/modbus.md has it, and read by pymodbus.
+On Modbus, over TCP or RTU, a message is written, then its reply is read. ADUs are delimited as in
+docs/reference/modbus.md, and read by pymodbus.
 """
 
 import re

@@ -1,15 +1,9 @@
-"""An amplifier as it must be (`drivers.judge`) by what passes on a wire, where replies get lost.
+"""Rules for what a host sends: allowed requests, tokens, limits, heartbeats and stops.
 
-A request without a reply may have been carried out: the next status says so.
-
-The host's communication with one amplifier, as far as rules need to remember it.
-
-Deadlines: what must have happened by a time is due later by the delays of the witness itself. Rules
-for one set that a host sends: token and limits.
-
-Rules for what a host sends: allowed requests, limits, heartbeats and stops.
-
-Each frame is checked as it passes, and what must follow by its deadline.
+Each frame is checked as it passes; what must follow has a deadline, which the delays of the witness
+itself defer. The amplifier is modelled from what passes on its wire
+(`era_haptics.lab.expected_amplifier`), where replies may be lost: a request without a reply may
+have been carried out, which the next status shows.
 """
 
 import math

@@ -1,6 +1,7 @@
-"""One watched wire: matches replies with requests, and passes both to host and amplifier rules.
+"""The witness: bytes of every wire in, violations out, without a clock and I/O.
 
-The witness: bytes of every wire in, violations out. No clock, no I/O.
+A watched wire relates replies to requests, and passes both to the rules for hosts and the model of
+the amplifier.
 """
 
 import math

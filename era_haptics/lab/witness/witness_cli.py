@@ -1,8 +1,6 @@
-"""A relay in a real wire, which forwards bytes and passes a copy to a witness.
+"""`era witness`: check the traffic of amplifiers, from a capture or live by a relay in the wire.
 
-Bytes are forwarded before they are checked, to add as little latency as possible.
-
-`era witness`: check the traffic of amplifiers, live or from a capture.
+A relay forwards bytes before they are checked, to add as little latency as possible.
 """
 
 import asyncio
@@ -35,8 +33,10 @@ from sim.transport.far_end import make_terminal
 
 _KINDS: dict[str, WireKind] = {
     **dict.fromkeys(("serial", "serial+tcp"), "serial"),
-    **{"modbus+tcp": "modbus-tcp", "modbus+rtu": "modbus-rtu"},
-    **{"can+socketcand": "socketcand", "can+slcan": "slcan"},
+    "modbus+tcp": "modbus-tcp",
+    "modbus+rtu": "modbus-rtu",
+    "can+socketcand": "socketcand",
+    "can+slcan": "slcan",
 }
 """Kinds of wire by scheme."""
 

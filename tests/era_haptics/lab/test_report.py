@@ -98,8 +98,15 @@ def test_versions_list_packages_of_plug_ins(
 def test_versions_list_what_requirements_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """The valid requirements of PEP 508's own list, whatever follows the name."""
     lines = [
-        *("A", "A.B-C_D", "aa", "name", "name<=1", "name>=3,<2", "name@http://foo.com"),
-        *("name [fred,bar] @ http://foo.com ; python_version=='2.7'", "name;os_name=='a'"),
+        "A",
+        "A.B-C_D",
+        "aa",
+        "name",
+        "name<=1",
+        "name>=3,<2",
+        "name@http://foo.com",
+        "name [fred,bar] @ http://foo.com ; python_version=='2.7'",
+        "name;os_name=='a'",
         "numpy >=2 ; extra == 'x'",
     ]
     monkeypatch.setattr("era_haptics.lab.report.requires", lambda _: lines)

@@ -385,9 +385,16 @@ async def test_socketcand_session(can_adapters_bus: CanBus, talk: Talk) -> None:
 @pytest.mark.parametrize(
     "nonsense",
     [
-        *("< send 123 3 1 2 >", "< send 800 0 >", "< send 00000123 0 >", "< send x 1 1 >"),
-        *("< send 123 9 1 2 3 4 5 6 7 8 9 >", "<>", ">"),
-        *("a" * 2000, "< send 123 1 100 >", "\x00\xff< send"),
+        "< send 123 3 1 2 >",
+        "< send 800 0 >",
+        "< send 00000123 0 >",
+        "< send x 1 1 >",
+        "< send 123 9 1 2 3 4 5 6 7 8 9 >",
+        "<>",
+        ">",
+        "a" * 2000,
+        "< send 123 1 100 >",
+        "\x00\xff< send",
     ],
 )
 async def test_socketcand_ignores_malformed_frames(

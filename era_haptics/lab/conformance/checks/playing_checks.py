@@ -229,7 +229,9 @@ def kept_phase(subject: Subject) -> Rows:
     tones = [
         subject.tone(0, fraction, phase, keep=True, frequency=frequency)
         for fraction, phase, frequency in (
-            *((0.5, 0, 0), (1, 180, 0), (1, 90, 0)),
+            (0.5, 0, 0),
+            (1, 180, 0),
+            (1, 90, 0),
             (1, 180, subject.other),
         )
     ]
@@ -527,17 +529,36 @@ async def clock_rate(subject: Subject) -> None:
 
     fast, slow = (send("Ping", rate=each) for each in (_HIGHEST, _LOWEST))
     changing_nothing: Rows = (
-        *(send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"), send("Silence", ramp=0)),
-        *(send("Arm", watchdog=subject.can["watchdog_max"], shift=1), timed),
+        send("Ping", session=77, rate=_LOWEST, code="WRONG_SESSION"),
+        send("Silence", ramp=0),
+        send("Arm", watchdog=subject.can["watchdog_max"], shift=1),
+        timed,
     )
     falls_silent = send("Disarm", ramp=subject.ramp), slow, subject.settle
     trips = subject.starve, subject.shortest_watchdog / 1000, subject.settle, slow
     await subject.run(
         [
-            *(subject.arm, fast, *changing_nothing, partial(read, lasting + duration), slow, read),
-            *(fast, send("Stop", ramp=0), slow, read, subject.clear),
-            *(subject.arm, subject.one(), fast, *falls_silent, slow, read),
-            *(partial(subject.arm, 0.0), fast, *trips, read),
+            subject.arm,
+            fast,
+            *changing_nothing,
+            partial(read, lasting + duration),
+            slow,
+            read,
+            fast,
+            send("Stop", ramp=0),
+            slow,
+            read,
+            subject.clear,
+            subject.arm,
+            subject.one(),
+            fast,
+            *falls_silent,
+            slow,
+            read,
+            partial(subject.arm, 0.0),
+            fast,
+            *trips,
+            read,
         ]
     )
 

@@ -62,8 +62,12 @@ from registry import threads
 _UNKNOWN = (20, 24, 29, 63)  # numbers of no message, below those of vendors
 _TRIES, _AT_ONCE = 20, 4
 _FEATURE_OF = {
-    **{"GetMeasured": "electrical", "SetAddress": "address"},
-    **{"GetSensors": "sensors", "Measure": "sensors", "GetReading": "sensors", "Mark": "mark"},
+    "GetMeasured": "electrical",
+    "SetAddress": "address",
+    "GetSensors": "sensors",
+    "Measure": "sensors",
+    "GetReading": "sensors",
+    "Mark": "mark",
 }
 
 
@@ -187,7 +191,8 @@ async def hello_for_ever(subject: Subject) -> None:
         expect_equal(answer.code, "UNSUPPORTED_VERSION", f"refusal of version {version}")
     ping = MESSAGES["Ping"].number
     for number, words, code in (
-        *((ping, [1, 0], "BAD_LENGTH"), (ping, [1], "BAD_LENGTH")),
+        (ping, [1, 0], "BAD_LENGTH"),
+        (ping, [1], "BAD_LENGTH"),
         (_UNKNOWN[0], [1, 0], "UNKNOWN_TYPE"),
     ):
         answer = await client.exchange(number, words, behind=b"\0")
@@ -197,9 +202,25 @@ async def hello_for_ever(subject: Subject) -> None:
 def _shortest(name: str, **others: Any) -> list[int]:
     """Return the words of a request that is right but for the state, or has other values."""
     values = {
-        **{"session": 1, "watchdog": 250, "ramp": 5, "token": 1, "index": 0, "parts": 1},
-        **{"now": 0, "stream": [], "latch": 0, "layer": 0, "address": 9, "serial_number": "?"},
-        **{"first": 0, "reading": 1, "window": 1000, "tones": 1, "shift": 0, "rate": 0, "at": 0},
+        "session": 1,
+        "watchdog": 250,
+        "ramp": 5,
+        "token": 1,
+        "index": 0,
+        "parts": 1,
+        "now": 0,
+        "stream": [],
+        "latch": 0,
+        "layer": 0,
+        "address": 9,
+        "serial_number": "?",
+        "first": 0,
+        "reading": 1,
+        "window": 1000,
+        "tones": 1,
+        "shift": 0,
+        "rate": 0,
+        "at": 0,
         "frequencies": [QUANTITIES["frequency"].to_wire(100.0)],
         **others,
     }
@@ -240,18 +261,30 @@ async def events(subject: Subject) -> None:
     await unasked()
     await subject.run(
         [
-            *(subject.settle, subject.clear),
-            *(subject.arm, subject.one(), send("Disarm", ramp=50), subject.settle),
-            *(send("Stop", ramp=0), send("Stop", ramp=0), subject.clear, 0.02),
+            subject.settle,
+            subject.clear,
+            subject.arm,
+            subject.one(),
+            send("Disarm", ramp=50),
+            subject.settle,
+            send("Stop", ramp=0),
+            send("Stop", ramp=0),
+            subject.clear,
+            0.02,
         ]
     )
     last = subject.latch  # of the second Stop, which changes no state
     second, first = last - 1, last - 2
     required = [
-        *(("OPERATION_ENABLED", 0, first - 1), ("FAULT_REACTION_ACTIVE", 1, first)),
-        *(("FAULT", 1, first), ("SWITCH_ON_DISABLED", 0, first), ("OPERATION_ENABLED", 0, first)),
-        *(("SWITCHED_ON", 0, first), ("SWITCH_ON_DISABLED", 0, first)),
-        *(("QUICK_STOP_ACTIVE", 0, second), ("SWITCH_ON_DISABLED", 0, last)),
+        ("OPERATION_ENABLED", 0, first - 1),
+        ("FAULT_REACTION_ACTIVE", 1, first),
+        ("FAULT", 1, first),
+        ("SWITCH_ON_DISABLED", 0, first),
+        ("OPERATION_ENABLED", 0, first),
+        ("SWITCHED_ON", 0, first),
+        ("SWITCH_ON_DISABLED", 0, first),
+        ("QUICK_STOP_ACTIVE", 0, second),
+        ("SWITCH_ON_DISABLED", 0, last),
     ]
     found = [each for each in client.order if each.type & _TYPE == EVENT]
     reports = [EVENT_RECORD.unpack(each.words, is_strict=False) for each in found]
@@ -278,8 +311,11 @@ async def broadcasts(subject: Subject) -> None:
     async def ignore_all(**others: object) -> None:
         """Send all that is for one alone, and what is flawed, to all: nothing comes of it."""
         values = {
-            **{"session": subject.session, "latch": subject.latch, "address": client.free},
-            **{"watchdog": subject.can["watchdog_max"], "serial_number": serial},
+            "session": subject.session,
+            "latch": subject.latch,
+            "address": client.free,
+            "watchdog": subject.can["watchdog_max"],
+            "serial_number": serial,
             **subject.parts(subject.one(level=0.75), token=subject.token + 2)[0],
             **others,
         }
@@ -353,8 +389,10 @@ async def addresses(subject: Subject) -> None:
         [
             *(send("SetAddress", **each, code="BAD_VALUE") for each in named),
             *(send("SetAddress", raw=each, code="BAD_VALUE") for each in beyond),
-            *(subject.arm, send("SetAddress", **right, code="WRONG_STATE")),
-            *(send("Disarm", ramp=0), subject.settle),
+            subject.arm,
+            send("SetAddress", **right, code="WRONG_STATE"),
+            send("Disarm", ramp=0),
+            subject.settle,
         ]
     )
     try:
@@ -482,7 +520,8 @@ async def network_management(subject: Subject) -> None:
         expect_equal(shown, interval, f"interval of the heartbeat [ms] after {command}")
 
     for case in (
-        *(("pre_operational", None, for_all), ("stop", for_all, None)),
+        ("pre_operational", None, for_all),
+        ("stop", for_all, None),
         ("reset_communication", None, None),
     ):
         stopped = partial(stopped_by, *case)
@@ -594,7 +633,8 @@ async def objects(subject: Subject) -> None:
         (0x1018, 0, 1, 4),
         *((0x1018, number, 4, None) for number in (1, 2, 3)),
         (0x1018, 4, 4, serial_number),
-        *((0x2000, 0, 1, len(TEXTS) + 1), (0x2000, 5, 2, subject.identity["versions"])),
+        (0x2000, 0, 1, len(TEXTS) + 1),
+        (0x2000, 5, 2, subject.identity["versions"]),
         (0x2001, 0, 1, len(caps)),
         *((0x2001, number, 2, word) for number, word in enumerate(caps, 1)),
         (0x2002, 0, 1, len(status)),
@@ -613,8 +653,12 @@ async def objects(subject: Subject) -> None:
     for index, subindex, code in missing:
         await read_object(client, index, subindex, code=code)
     for index, subindex, size, code in (
-        *((0x1000, 0, 4, _READ_ONLY), (0x2000, 5, 2, _READ_ONLY), (0x2002, 1, 2, _READ_ONLY)),
-        *((0x1003, 0, 2, _NO_OBJECT), (_HEARTBEAT, 1, 2, _NO_SUBINDEX)),
-        *((_HEARTBEAT, 0, 1, _WRONG_LENGTH), (_HEARTBEAT, 0, 4, _WRONG_LENGTH)),
+        (0x1000, 0, 4, _READ_ONLY),
+        (0x2000, 5, 2, _READ_ONLY),
+        (0x2002, 1, 2, _READ_ONLY),
+        (0x1003, 0, 2, _NO_OBJECT),
+        (_HEARTBEAT, 1, 2, _NO_SUBINDEX),
+        (_HEARTBEAT, 0, 1, _WRONG_LENGTH),
+        (_HEARTBEAT, 0, 4, _WRONG_LENGTH),
     ):
         await write_object(client, index, b"\1\0\0\0"[:size], subindex, code=code)

@@ -182,7 +182,9 @@ def _flawed_sets(subject: Subject) -> Iterator[Send]:
         beyond = pack_layers([good, layer(0, replace(tone, channel=channels))])
         yield _part(beyond, "BAD_CHANNEL", channels)
     for layer_set in (
-        *(layer(1, tone), layer(0, tone, renew=True), layer(0, after=True)),
+        layer(1, tone),
+        layer(0, tone, renew=True),
+        layer(0, after=True),
         layer(0, renew=True, after=True),
         *([layer(layers, tone)] if layers < 16 else []),
     ):
@@ -343,11 +345,19 @@ def parts_of_sets(subject: Subject) -> Rows:
     others = play(subject.one(), *(layer(each) for each in subject.layers[1:]), token=3)
     at_once, back = _cut(subject, *made, token=6), send("Commit", token=6)
     return [
-        *(subject.arm, subject.one(), *in_turn(2, now=0), others, 0.05, *in_turn(4, now=1)),
+        subject.arm,
+        subject.one(),
+        *in_turn(2, now=0),
+        others,
+        0.05,
+        *in_turn(4, now=1),
         # Back to back, and what says `now` is the last part alone.
-        *(play(subject.one(), token=5), partial(subject.send_all, at_once), back),
+        play(subject.one(), token=5),
+        partial(subject.send_all, at_once),
+        back,
         *(_with(each, token=7, now=1) for each in at_once[:-1]),
-        *(_with(at_once[-1], token=7), _with(at_once[-1], token=7, now=1)),
+        _with(at_once[-1], token=7),
+        _with(at_once[-1], token=7, now=1),
     ]
 
 
@@ -366,23 +376,34 @@ def parts_that_are_dropped(subject: Subject) -> Rows:
     head = MESSAGES["Set"].request.pack({"session": subject.next_session, **second.values})
     nameless = [0, *head[1:]], [head[0], 0, *head[2:]]
     refused: list[tuple[Values, str]] = [
-        *(({"index": count}, "BAD_VALUE"), ({"index": count, "token": 10}, "BAD_VALUE")),
-        *(({"index": 255, "token": 10}, "BAD_VALUE"), ({"parts": 1, "index": 0}, "BAD_VALUE")),
+        ({"index": count}, "BAD_VALUE"),
+        ({"index": count, "token": 10}, "BAD_VALUE"),
+        ({"index": 255, "token": 10}, "BAD_VALUE"),
+        ({"parts": 1, "index": 0}, "BAD_VALUE"),
         ({"index": 0, "parts": 0, "token": 10}, "BAD_VALUE"),
-        *(({"token": 8}, _OLD), ({"token": 4}, _OLD), ({"token": 10}, "")),
+        ({"token": 8}, _OLD),
+        ({"token": 4}, _OLD),
+        ({"token": 10}, ""),
         ({"token": 4, "index": count}, _OLD),
     ]
     return [
-        *(subject.arm, play(subject.one(), token=5), last, first),
+        subject.arm,
+        play(subject.one(), token=5),
+        last,
+        first,
         *(_with(second, **each) for each in dropped),
         *(partial(subject.client.part, MESSAGES["Set"].number, each) for each in nameless),
         *(_with(last, code=code, **each) for each, code in refused),
         _with(last, token=5),
         last,
         *others,
-        *(second, last),
+        second,
+        last,
         *(_with(second, **each) for each in dropped),
-        *(send("Commit", token=9), send("Disarm", ramp=0), subject.settle, first),
+        send("Commit", token=9),
+        send("Disarm", ramp=0),
+        subject.settle,
+        first,
         _with(last, code="WRONG_STATE"),
     ]
 
@@ -394,11 +415,18 @@ def parts_again(subject: Subject) -> Rows:
     first, *others, last = _cut(subject, *long_set(subject), token=2)
     nonsense = [0xFFFF] * 3
     return [
-        *(subject.arm, subject.one(), _with(first, stream=nonsense)),
+        subject.arm,
+        subject.one(),
+        _with(first, stream=nonsense),
         *others,
-        *(first, last),
-        *(_with(first, stream=nonsense), _with(last, stream=nonsense), last),
-        *(send("Commit", token=2), _with(last, stream=nonsense, now=1), _with(last, index=0)),
+        first,
+        last,
+        _with(first, stream=nonsense),
+        _with(last, stream=nonsense),
+        last,
+        send("Commit", token=2),
+        _with(last, stream=nonsense, now=1),
+        _with(last, index=0),
     ]
 
 
@@ -412,20 +440,28 @@ def refused_parts(subject: Subject) -> Rows:
     first, *others, last = _cut(subject, half, flawed, token=2)
     flawed_one = partial(replace, codes=("BAD_CHANNEL",), channels=(0,))
     return [
-        *(subject.arm, quarter, first),
+        subject.arm,
+        quarter,
+        first,
         *others,
-        *(flawed_one(last), last),
-        *(
-            stage(half, token=3),
-            flawed_one(play(flawed, token=4)),
-            flawed_one(stage(flawed, token=4)),
-        ),
+        flawed_one(last),
+        last,
+        stage(half, token=3),
+        flawed_one(play(flawed, token=4)),
+        flawed_one(stage(flawed, token=4)),
         # A last part of a newer set that is not whole changes nothing; one that is kept does.
-        *(good[-1], send("Commit", token=3), stage(quarter, token=4)),
+        good[-1],
+        send("Commit", token=3),
+        stage(quarter, token=4),
         *good[:-1],
-        *(_with(stage(quarter, token=4), code=_OLD), send("Commit", token=4, code=_OLD)),
-        *(flawed_one(stage(flawed, token=6)), good[-1], send("Commit", token=5)),
-        *(stage(half, token=6), play(quarter, token=7), send("Commit", token=6, code=_OLD)),
+        _with(stage(quarter, token=4), code=_OLD),
+        send("Commit", token=4, code=_OLD),
+        flawed_one(stage(flawed, token=6)),
+        good[-1],
+        send("Commit", token=5),
+        stage(half, token=6),
+        play(quarter, token=7),
+        send("Commit", token=6, code=_OLD),
     ]
 
 
@@ -440,10 +476,17 @@ def empty_sets(subject: Subject) -> Rows:
     count = 127 if subject.client.transactions == 1 else 9
     many = [_with(first, token=5, index=at, parts=count, stream=[]) for at in range(count)]
     return [
-        *(subject.arm, one, empty_set, send("Commit", token=2)),
-        *(_with(empty_set, token=3, now=1), 0.1),
-        *(empty[0], _with(first, index=1, parts=4, stream=pack_layers([half])), empty[1]),
-        *(_with(last, index=3, parts=4, stream=[], now=1), partial(subject.send_all, many)),
+        subject.arm,
+        one,
+        empty_set,
+        send("Commit", token=2),
+        _with(empty_set, token=3, now=1),
+        0.1,
+        empty[0],
+        _with(first, index=1, parts=4, stream=pack_layers([half])),
+        empty[1],
+        _with(last, index=3, parts=4, stream=[], now=1),
+        partial(subject.send_all, many),
     ]
 
 
@@ -475,13 +518,24 @@ def sets_expire(subject: Subject) -> Rows:
         await subject.pause(max(1.03 * STAGED_LIFE - lived, 0.0))
 
     return [
-        *(subject.arm, subject.one(), partial(start, first), part),
+        subject.arm,
+        subject.one(),
+        partial(start, first),
+        part,
         *others,
         # One that is confirmed once more lives no longer.
-        *(last, part, last, outlive, send("Commit", token=3, code=_OLD), last),
+        last,
+        part,
+        last,
+        outlive,
+        send("Commit", token=3, code=_OLD),
+        last,
         partial(start, others[0]),
         *others[1:],
-        *(0.55 * STAGED_LIFE, first, outlive, last),
+        0.55 * STAGED_LIFE,
+        first,
+        outlive,
+        last,
     ]
 
 
@@ -509,7 +563,8 @@ def stage_and_commit(subject: Subject) -> Rows:
         subject.follow,
         *again,
         *again,
-        *(stage(subject.one(level=0.75), token=3), send("Commit", token=2)),
+        stage(subject.one(level=0.75), token=3),
+        send("Commit", token=2),
         send("Commit", token=3),
         play(subject.one(), token=2, code=_OLD),
     ]
@@ -546,17 +601,23 @@ def newer_sets_replace(subject: Subject) -> Rows:
     half, quarter = subject.one(level=0.5), subject.one(level=0.25)
     dropped = partial(send, "Commit", code=_OLD)
     return [
-        *(subject.arm, stage(quarter), stage(half), dropped(token=1)),
-        *(stage(subject.one(), token=1, code=_OLD), send("Commit", token=2)),
-        *(stage(subject.one()), half, dropped(token=3)),
-        *(stage(subject.one()), send("Silence", ramp=0), dropped(token=5)),
-        *(
-            stage(subject.one()),
-            send("Disarm", ramp=0),
-            subject.settle,
-            subject.arm,
-            dropped(token=6),
-        ),
+        subject.arm,
+        stage(quarter),
+        stage(half),
+        dropped(token=1),
+        stage(subject.one(), token=1, code=_OLD),
+        send("Commit", token=2),
+        stage(subject.one()),
+        half,
+        dropped(token=3),
+        stage(subject.one()),
+        send("Silence", ramp=0),
+        dropped(token=5),
+        stage(subject.one()),
+        send("Disarm", ramp=0),
+        subject.settle,
+        subject.arm,
+        dropped(token=6),
     ]
 
 

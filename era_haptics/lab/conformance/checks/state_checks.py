@@ -55,8 +55,12 @@ def _latched(subject: Subject) -> list[Row]:
 def arming(subject: Subject) -> Rows:
     """It is silent once armed, with high voltage on, and forgets what was played and staged."""
     return [
-        *(subject.arm, play(subject.one(), token=40_000), stage(subject.one(), token=40_001)),
-        *(send("Disarm", ramp=0), subject.settle, subject.arm),
+        subject.arm,
+        play(subject.one(), token=40_000),
+        stage(subject.one(), token=40_001),
+        send("Disarm", ramp=0),
+        subject.settle,
+        subject.arm,
         send("Commit", token=40_001, code="BAD_TOKEN"),
         play(subject.one(), token=39_999),  # older than 40 000, but the first of this session
     ]
@@ -84,8 +88,12 @@ def arms_again(subject: Subject) -> Rows:
     """It takes the same Arm again as a restart of the watchdog with its time, and plays on."""
     low, high = subject.shortest_watchdog, subject.can["watchdog_max"]
     return [
-        *(partial(subject.arm, high / 1000), subject.one(), stage(subject.one(level=0.5))),
-        *(send("Arm", watchdog=low), send("Arm", watchdog=high), send("Commit", token=2)),
+        partial(subject.arm, high / 1000),
+        subject.one(),
+        stage(subject.one(level=0.5)),
+        send("Arm", watchdog=low),
+        send("Arm", watchdog=high),
+        send("Commit", token=2),
     ]
 
 
@@ -119,11 +127,15 @@ def sessions(subject: Subject) -> Rows:
         stage(subject.one()),
         *others,
         send("Ping", session=0, code="BAD_VALUE"),
-        *(send("Disarm", ramp=0), subject.settle, play(quarter, session=0x1235, code=_WRONG)),
+        send("Disarm", ramp=0),
+        subject.settle,
+        play(quarter, session=0x1235, code=_WRONG),
         send("Arm", watchdog=maximum, session=own, code="WRONG_SESSION"),
         partial(_arm_as, subject, own ^ 0x100),
         play(quarter, session=own, code="WRONG_SESSION"),
-        *(send("Stop", ramp=0), subject.settle, subject.clear),
+        send("Stop", ramp=0),
+        subject.settle,
+        subject.clear,
         send("Arm", watchdog=maximum, code="WRONG_SESSION"),
         partial(_arm_as, subject, own - 7),
     ]
@@ -147,8 +159,14 @@ def arming_ends_fades(subject: Subject) -> Rows:
 def stop(subject: Subject) -> Rows:
     """It stops at once, latched and numbered, plays no more, and arms only once it is cleared."""
     return [
-        *(subject.arm, subject.whole(), stage(subject.one(level=0.5)), send("Stop", ramp=0), 0.02),
-        *(*_latched(subject), send("Commit", token=2, code=_WRONG), 0.1),
+        subject.arm,
+        subject.whole(),
+        stage(subject.one(level=0.5)),
+        send("Stop", ramp=0),
+        0.02,
+        *_latched(subject),
+        send("Commit", token=2, code=_WRONG),
+        0.1,
     ]
 
 
@@ -162,11 +180,9 @@ def stop_ramps(subject: Subject) -> Rows:
     )
     first, *_ = subject.parts(subject.one(), token=2, now=0, count=3)
     return [
-        *(
-            (whole, send("Set", **first), stop),
-            (whole, disarm),
-            (whole, slowest_stop, amid, disarm),
-        ),
+        (whole, send("Set", **first), stop),
+        (whole, disarm),
+        (whole, slowest_stop, amid, disarm),
         (whole, slowest_disarm, *fading, subject.clear, amid, stop),
     ]
 
@@ -200,10 +216,16 @@ def stops_are_numbered(subject: Subject) -> Rows:
     latch = token_after(token_after(token_after(subject.latch)))
     others = (latch - 1) % 0x10000, (latch + 1) % 0x10000, latch ^ 0x100
     return [
-        *(send("Stop", ramp=0), send("Stop", ramp=0), send("Stop", ramp=0)),
+        send("Stop", ramp=0),
+        send("Stop", ramp=0),
+        send("Stop", ramp=0),
         *(send("Clear", latch=other, code="WRONG_LATCH") for other in others),
-        *(subject.clear, subject.clear, subject.arm, subject.clear),
-        *(subject.one(), subject.clear),
+        subject.clear,
+        subject.clear,
+        subject.arm,
+        subject.clear,
+        subject.one(),
+        subject.clear,
     ]
 
 
@@ -227,9 +249,16 @@ def silence(subject: Subject) -> Rows:
     )
     first, *_, last = subject.parts(subject.one(), token=4, now=0, count=3)
     return [
-        *(subject.arm, several, stage(subject.one()), send("Silence", ramp=subject.ramp)),
-        *(subject.follow, send("Commit", token=2, code="BAD_TOKEN"), subject.one()),
-        *(send("Set", **first), send("Silence", ramp=0), send("Set", **last)),
+        subject.arm,
+        several,
+        stage(subject.one()),
+        send("Silence", ramp=subject.ramp),
+        subject.follow,
+        send("Commit", token=2, code="BAD_TOKEN"),
+        subject.one(),
+        send("Set", **first),
+        send("Silence", ramp=0),
+        send("Set", **last),
         send("Silence", ramp=subject.can["ramp_max"] + 1, code="BAD_VALUE"),
     ]
 
@@ -253,9 +282,12 @@ async def _trips_for_good(subject: Subject, time: int) -> None:
     await _trips(subject, time / 1000, subject.whole(), stage(subject.one(level=0.5)))
     await subject.run(
         [
-            *(*_latched(subject), 0.05, send("Stop", ramp=0)),
+            *_latched(subject),
+            0.05,
+            send("Stop", ramp=0),
             send("Clear", latch=(subject.latch + 7) % 0x10000, code="WRONG_LATCH"),
-            *(subject.clear, send("Arm", watchdog=time, code="WRONG_SESSION")),
+            subject.clear,
+            send("Arm", watchdog=time, code="WRONG_SESSION"),
         ]
     )
 
@@ -288,10 +320,16 @@ def what_feeds(subject: Subject) -> Rows:
     """It is fed by Arm, Ping, Set, Commit and Silence of its session, and counts the time left."""
     first, *_, last = subject.parts(*long_set(subject), token=3, now=0, count=3)
     feeds = (
-        *(subject.ping, subject.one(), stage(subject.one(level=0.5))),
-        *(send("Commit", token=2), send("Commit", token=2), stage(subject.one(), token=2)),
-        *(send("Set", **first), send("Set", **last)),  # another part is missing
-        *(send("Silence", ramp=0), send("Arm", watchdog=subject.can["watchdog_max"])),
+        subject.ping,
+        subject.one(),
+        stage(subject.one(level=0.5)),
+        send("Commit", token=2),
+        send("Commit", token=2),
+        stage(subject.one(), token=2),
+        send("Set", **first),
+        send("Set", **last),  # another part is missing
+        send("Silence", ramp=0),
+        send("Arm", watchdog=subject.can["watchdog_max"]),
     )
     apart = max(0.02 - subject.exchange_time, 0.0)  # s; until it shows that it was fed
     return [partial(subject.arm, 0.5), *(row for feed in feeds for row in (apart, feed))]
@@ -307,7 +345,9 @@ async def what_does_not_feed(subject: Subject) -> None:
     flaws = "BAD_VALUE", "BAD_CHANNEL", "BAD_LENGTH"
     idle: Rows = [
         *(send(name) for name in ("GetStatus", "GetCaps", "GetFaults")),
-        *(send("GetAchieved", layer=0), send("Clear", latch=0), subject.client.hello),
+        send("GetAchieved", layer=0),
+        send("Clear", latch=0),
+        subject.client.hello,
         *(send(name) for feature, name in _READINGS.items() if subject.has(feature)),
         send("Ping", session=77, code="WRONG_SESSION"),
         play(subject.one(), token=7, session=77, code="WRONG_SESSION"),
@@ -340,8 +380,11 @@ async def trips_amid_other_requests(subject: Subject) -> None:
     """It trips at its time amid requests that do not feed it."""
     await subject.run([partial(subject.arm, 0.0), subject.one(), subject.starve])
     others: Rows = (
-        *(send("GetFaults"), send("GetAchieved", layer=0), send("Clear", latch=0)),
-        *(send("Ping", session=77, code="WRONG_SESSION"), partial(subject.client.exchange, 63, ())),
+        send("GetFaults"),
+        send("GetAchieved", layer=0),
+        send("Clear", latch=0),
+        send("Ping", session=77, code="WRONG_SESSION"),
+        partial(subject.client.exchange, 63, ()),
     )
     last = subject.shown.fed[0] + 0.7 * subject.shown.watchdog - subject.exchange_time
     for row in cycle(others):

@@ -304,8 +304,16 @@ async def test_machine_that_was_late_once_has_a_verdict_on_voices(
 
 SLOW = {
     "serial": [
-        *("lengths", "trips_amid_other_requests", "parts_of_sets", "sets_expire", "valid_for"),
-        *("renew", "after", "endings_amid", "doubled_frames", "tolerated_frames"),
+        "lengths",
+        "trips_amid_other_requests",
+        "parts_of_sets",
+        "sets_expire",
+        "valid_for",
+        "renew",
+        "after",
+        "endings_amid",
+        "doubled_frames",
+        "tolerated_frames",
     ],
     "tcp": ["pieces", "lengths", "watchdog_ranges", "arms_again", "watchdog_unread", "renew"],
     "can": ["watchdog_ranges", "network_management"],
@@ -503,12 +511,29 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     shown = report.to_json()
     assert (shown["overall"], shown["failed"], shown["level"]) == ("incomplete", 0, 0.0)
     assert list(shown) == [
-        *("url", "overall", "level", "passed", "failed", "skipped", "not_run", "seconds"),
+        "url",
+        "overall",
+        "level",
+        "passed",
+        "failed",
+        "skipped",
+        "not_run",
+        "seconds",
         "checks",
     ]
     assert list(shown["checks"][0]) == [
-        *("number", "name", "requirement", "place", "result", "reason", "seen", "expected"),
-        *("seconds", "attempts", "sent", "came"),
+        "number",
+        "name",
+        "requirement",
+        "place",
+        "result",
+        "reason",
+        "seen",
+        "expected",
+        "seconds",
+        "attempts",
+        "sent",
+        "came",
     ]
     assert shown["not_run"] == sum(check.drives for _, check in of_kind("serial"))
 
@@ -556,8 +581,16 @@ RISE = LayerSet(0, 100, 0, (Command(0, 2200, 5000, 0),))
 
 
 OFF = {
-    **{"state": 1, "fault": 0, "flags": 0, "latch": 7, "temperature": 250, "token": 0},
-    **{"watchdog_left": 0, "levels": [0] * 4, "tokens": [0] * 8, "clock": 0},
+    "state": 1,
+    "fault": 0,
+    "flags": 0,
+    "latch": 7,
+    "temperature": 250,
+    "token": 0,
+    "watchdog_left": 0,
+    "levels": [0] * 4,
+    "tokens": [0] * 8,
+    "clock": 0,
 }
 ARMED = {**OFF, "state": 4, "flags": 1}
 

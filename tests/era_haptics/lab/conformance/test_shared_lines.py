@@ -48,8 +48,16 @@ def neighbours_of(kind: str) -> dict[int, Neighbour]:
 
 
 REACHING_OTHERS = [
-    *("damaged_frames", "doubled_frames", "broadcasts", "present_areas", "events", "addresses"),
-    *("network_management", "exceptions", "limited", "discarded_frames"),
+    "damaged_frames",
+    "doubled_frames",
+    "broadcasts",
+    "present_areas",
+    "events",
+    "addresses",
+    "network_management",
+    "exceptions",
+    "limited",
+    "discarded_frames",
 ]
 """Checks that send what others hear, or listen to what all may say; and one that is skipped."""
 

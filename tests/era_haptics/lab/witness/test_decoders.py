@@ -238,7 +238,9 @@ TALKS: dict[str, tuple[str, tuple[Heard, ...]]] = {
         (
             (">", can(TONES[0]), "", {}),
             (
-                *(">", can("201 05 00 0C 02 07 00 00 00"), "damaged"),
+                ">",
+                can("201 05 00 0C 02 07 00 00 00"),
+                "damaged",
                 {"text": "message 4 without all frames"},
             ),
         ),

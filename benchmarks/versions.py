@@ -169,9 +169,9 @@ def _score(
             of=rig,
             contact_count=1 + quiet,
         )
-        felt = felt_on(table, question, excitation, plates)
-        assert felt.contrast is not None
-        contrast, level = decibels(felt.contrast), decibels(felt.level)
+        felt_level, felt_contrast = felt_on(table, question, excitation, plates)
+        assert felt_contrast is not None
+        contrast, level = decibels(felt_contrast), decibels(felt_level)
     return float(np.percentile(contrast, 10)), float(np.percentile(level, 10))
 
 

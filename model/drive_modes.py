@@ -1,49 +1,38 @@
-"""Drive modes: which frequencies, amplitudes and phases the ERAs may have.
+"""Drive modes: which frequencies, amplitudes and phases the ERAs may have, and the best of them.
 
-`switched` drives one or two ERAs at full stroke, each at a frequency of its own; `phased` all ERAs
-at one frequency with any weights (`model.drive_modes`).
+- `switched`: one or two ERAs at full stroke, each at a frequency of its own.
+- `phased`: all ERAs at one frequency, with any amplitudes and phases.
 
-Symbols here and in `model.table`: f frequencies, p points under the fingers, q quiet fingertips, r
+Symbols, here and in `model.table`: f frequencies, p points under fingers, q quiet fingertips, r
 reduced modal coordinates; h field of an ERA at a point, R Hermitian form of the expected power at
 the quiet fingertips, c right-hand side from the targets, w complex weights of the ERAs. In
 `model.transients`, q are the modal coordinates and z those of the eigenvectors in time.
 
-Input of the drive modes: what the ERAs' weights do at the fingertips, over the ensemble.
+A drive is a complex weight of each ERA at each frequency. Its score is the amplitude at the target
+over the root of the expected power at the loudest quiet fingertip, over all plates within the rig's
+uncertainty (`model.ensemble.touched_plate`). The optimum for the nominal plate relies on
+cancellation and is 10 dB worse on a real one. Tones of different frequencies are felt together as
+the root of the sum of their squares over the detection thresholds, so the powers of a score are in
+units of their frequencies' thresholds.
 
-A drive is a complex weight for each ERA at each frequency. It is ranked by its robust score: the
-amplitude at the target, over the root of the expected power at the loudest quiet fingertip, over
-all plates within the rig's uncertainty (`model.ensemble.touched_plate`). The optimum for the
-nominal plate relies on cancellation and is 10 dB worse on a real one.
-
-Tones of different frequencies are felt together as the root of the sum of their squares over the
-detection thresholds, and so are a score's powers: each in units of its threshold.
-
-The drive mode `phased`: all ERAs at one frequency, with any amplitudes and phases.
-
-Robust weights reach the targets with little at the quiet fingers; a spring or damper at an ERA adds
-a force where the drive acts anyway: without errors the best contrast does not depend on it.
-
-At each frequency the expected power at the quiet fingertips, a weighted mean over them, is the
-quadratic form w^H R w of the weights w, and the weights that reach the targets with the least of it
-solve R w = c, where c sums conj(h_t) of the targets, each times a factor. Where the maximum
+`phased`. At each frequency the expected power at the quiet fingertips, a weighted mean over them,
+is the quadratic form w^H R w. The weights that reach the targets with the least of it solve
+R w = c, where c is the sum of conj(h_t) over the targets, each times a factor. Since the maximum
 over the quiet fingertips counts, their weights mu_q are multiplied by the root of their expected
-power and the system is solved again (Lawson's algorithm for minimax approximation; three steps, of
-which the best is kept, since the minimax of expected powers is not the best percentile). A mean is
-at most the maximum, so that for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
-Of several it estimates it: phases and factors in c are the best of those tried.
+power and the system is solved again: Lawson's algorithm for minimax approximation, in three steps,
+of which the best is kept, since the minimax of expected powers is not the best percentile. A mean
+is at most the maximum, so for one target |c^H w| / sqrt(w^H R w) bounds the score at a frequency.
+For several targets it is an estimate: phases and factors in c are the best of those tried. Without
+errors a spring or damper at an ERA does not change the best contrast: it adds a force where the
+drive acts anyway. `model/compiled/search.h` is the same in C.
 
-`model/compiled/search.h` is the same in C.
-
-The drive mode `switched`: one or two ERAs at full stroke, each at a frequency of its own.
-
-The paper's idea: switching frequencies and activation sets moves the nulls. Four ERAs and 27
-frequencies make 4 * 27 + 6 * 27² = 4482 patterns, sixteen and 47 a quarter of a million.
-
-Powers of tones of different frequencies, each over the squared threshold of its frequency, add to
-what is felt, at the target and at every quiet fingertip; at one frequency the fields add. So all
-patterns of two ERAs are the sums of a column and a row, but for their diagonal. The maximum over
-the quiet fingertips is at least any weighted mean, and the mean of a sum is the sum of the means:
-one number for each pattern, which leaves few to be looked at closely.
+`switched`. Switching frequencies and activation sets moves the nulls (the paper's idea). Four ERAs
+and 27 frequencies make 4 * 27 + 6 * 27² = 4482 patterns, sixteen and 47 a quarter of a million.
+Powers of different frequencies, each over its squared threshold, add at the target and at every
+quiet fingertip; at one frequency the fields add. So all patterns of two ERAs are the sums of a
+column and a row, except for their diagonal. The maximum over the quiet fingertips is at least any
+weighted mean, and the mean of a sum is the sum of the means: one number per pattern bounds its
+score, and few patterns are computed exactly.
 """
 
 from dataclasses import dataclass, replace
@@ -56,66 +45,72 @@ from model.arrays import Complex64Array, Float32Array, IntArray, best_along, bes
 from model.errors import InputError, shown
 
 MAX_PHASE_STEP = 10.0
-"""Largest phase step [degrees] for `phased`: its rms error of 3 degrees is within the allowance."""
+"""Largest phase step [degrees] for `phased`; its rms error is 3 degrees, within the allowance."""
 
 DRIVE_MODES = ("switched", "phased")
-"""Drive modes, from the least freedom to the most."""
+"""The drive modes, from the least freedom to the most."""
 
 UNRESTRICTED = "phased"
-"""The mode of any weights."""
+"""The drive mode with arbitrary weights."""
 
 
 def checked_mode(name: str, what: str = "drive mode") -> str:
-    """Return the name of a drive mode; raises InputError for any other; what: its name there."""
+    """Return the name of a drive mode; raises InputError for any other.
+
+    what: its name in the message.
+    """
     if name not in DRIVE_MODES:
         raise InputError(f"{what} must be one of {', '.join(DRIVE_MODES)}, got {shown(name)}")
     return name
 
 
 def playable_drive_modes(*, level_step: float, phase_step: float) -> tuple[str, ...]:
-    """Return the modes that an amplifier with such steps of level and phase [degrees] can play.
+    """Return the drive modes that an amplifier with steps of level and phase [degrees] can play.
 
-    A level step of 1 is on or off.
+    A level step of 1 means on or off.
     """
     return DRIVE_MODES if level_step < 1 and phase_step <= MAX_PHASE_STEP else DRIVE_MODES[:1]
 
 
 Drive: TypeAlias = list[tuple[int, Complex64Array]]
-"""Tones: a frequency, by index, and the weights (eras,) at it, in full strokes."""
+"""Tones: the index of a frequency, and the weights (eras,) at it in full strokes."""
 
 LEVEL_MARGIN = 1.0
-"""Standard deviations of a target's amplitude that a drive must have in reserve.
+"""Reserve that a drive must have at its targets, in standard deviations of their amplitude.
 
-About what nine of ten plates need; the answer's own draws decide.
+About what nine of ten plates need; the draws of an answer decide.
 """
 
-_LEAST = np.float32(1e-20)
+_TINY, _LEAST_POWER, _LEAST_AMPLITUDE = 1e-7, np.float32(1e-30), np.float32(1e-20)
 
 
 @dataclass(frozen=True, eq=False)
 class Forms:
-    """Amplitudes at the targets, and expected power at targets and quiet fingertips.
-
-    - targets: (t, f, eras) field of each ERA alone at full stroke [m/s²], mean over the fingertip
-    - target_power: (t, f, eras, eras) expected power there, w^H R w of weights w
-    - quiet: (f, q, eras, eras) the same at each quiet fingertip, or without any one form for the
-      rest of the plate
-    - threshold: (f,) [m/s²]; wanted: amplitude to threshold for every target
-    - few, fine: (f, q, p, eras) fields of each ERA at few points of each quiet fingertip, by whose
-      mean the expected power counts the nominal plate, each times the root of its weight; and
-      at many points, of which the loudest counts. None where the mean is good enough
-    - driven: (eras,) which ERAs may have weights, None for all; see `among`
-    """
+    """Amplitudes at the targets, and expected power at targets and quiet fingertips."""
 
     targets: Complex64Array
+    """Field (t, f, eras) of each ERA alone at full stroke [m/s²], mean over a target."""
     target_power: Complex64Array
+    """Form (t, f, eras, eras) of the expected power there: w^H R w of weights w."""
     quiet: Complex64Array
+    """The same (f, q, eras, eras) at each quiet fingertip.
+
+    Without quiet fingertips there is one form, for the rest of the plate.
+    """
     threshold: Float32Array
+    """Detection threshold (f,) [m/s²]."""
     wanted: float
+    """Wanted amplitude to threshold at every target."""
     level_margin: float = LEVEL_MARGIN
     few: Complex64Array | None = None
+    """Field (f, q, p, eras) at few points of quiet fingertips, times the root of their weights.
+
+    `quiet` counts the nominal plate by their mean. None, as `fine`, if the mean is good enough.
+    """
     fine: Complex64Array | None = None
+    """Field (f, q, p, eras) at many points of quiet fingertips, of which the loudest counts."""
     driven: NDArray[np.bool_] | None = None
+    """Mask (eras,) of the ERAs that may have weights, None for all; see `among`."""
 
     @property
     def era_count(self) -> int:
@@ -124,22 +119,20 @@ class Forms:
 
     def at(self, frequencies: IntArray) -> "Forms":
         """Select some of the frequencies, by index (n,)."""
-        return Forms(
-            self.targets.take(frequencies, axis=1),
-            self.target_power.take(frequencies, axis=1),
-            self.quiet.take(frequencies, axis=0),
-            self.threshold.take(frequencies),
-            self.wanted,
-            self.level_margin,
-            None if self.few is None else self.few.take(frequencies, axis=0),
-            None if self.fine is None else self.fine.take(frequencies, axis=0),
-            self.driven,
+        return replace(
+            self,
+            targets=self.targets.take(frequencies, axis=1),
+            target_power=self.target_power.take(frequencies, axis=1),
+            quiet=self.quiet.take(frequencies, axis=0),
+            threshold=self.threshold.take(frequencies),
+            few=None if self.few is None else self.few.take(frequencies, axis=0),
+            fine=None if self.fine is None else self.fine.take(frequencies, axis=0),
         )
 
     def among(self, is_driven: NDArray[np.bool_]) -> "Forms":
-        """The forms for weights of some ERAs (eras,), all others 0: these do and cost nothing.
+        """Return the forms for weights of some ERAs (eras,); the others have no effect.
 
-        Each keeps its own power, so that a form can be inverted.
+        The others keep their own power, so that the forms can be inverted.
         """
         if is_driven.all():
             return self
@@ -159,7 +152,7 @@ class Forms:
         return np.asarray(np.minimum.reduce(self._amplitudes(weights), axis=-2))
 
     def reached(self, weights: Complex64Array) -> tuple[Float32Array, NDArray[np.bool_]]:
-        """Amplitude as `amplitude`, and whether all targets have the wanted level, (..., f)."""
+        """Return `amplitude`, and whether all targets have the wanted level, both (..., f)."""
         amplitudes = self._amplitudes(weights)
         least = self._least_amplitudes(weights, amplitudes)
         reaches = np.logical_and.reduce(least >= self.wanted * self.threshold, axis=-2)
@@ -171,7 +164,7 @@ class Forms:
         least = np.minimum.reduce(self._least_amplitudes(weights, amplitudes), axis=0)
         amplitude = np.minimum.reduce(amplitudes, axis=0)
         return np.asarray(
-            self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude + _LEAST)
+            self.wanted * self.threshold / np.maximum(least, 0.1 * amplitude + _LEAST_AMPLITUDE)
         )
 
     def quiet_power(self, weights: Complex64Array) -> Float32Array:
@@ -189,7 +182,7 @@ class Forms:
         return np.asarray(np.abs(fields))
 
     def _least_amplitudes(self, weights: Complex64Array, amplitudes: Float32Array) -> Float32Array:
-        """Amplitudes (..., t, f) less the margin."""
+        """Amplitudes (..., t, f) minus the margin."""
         if not self.level_margin:
             return amplitudes
         variance = expected_power(self.target_power, weights) - amplitudes * amplitudes
@@ -211,13 +204,13 @@ def expected_power(forms: Complex64Array, weights: Complex64Array) -> Float32Arr
 
 
 LAWSON_STEPS = 3
-"""Iterations; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
+"""Iterations of Lawson's algorithm; twelve lose 0.1 to 0.3 dB of the tenth percentile."""
 
 TARGET_STARTS, ALIGNMENTS, REALIGNMENTS = 8, 16, 5
-"""Targets whose own optimum gives phases to start from; iterations from each that align phases with
-those reached, and from the factors of the step before.
+"""Number of targets whose own optimum gives initial phases; iterations from each, and from the
+factors of the previous step, that align phases with those reached.
 
-Of 20 targets, 4 starts of 8 iterations lose 0.3 dB more in the median.
+For 20 targets, 4 starts of 8 iterations lose 0.3 dB more in the median.
 """
 
 LIMITED_STEPS = 30
@@ -225,28 +218,27 @@ LIMITED_STEPS = 30
 drives are known to 5 %."""
 
 MAX_GROWTH, MAX_MULTIPLIER = 100.0, 1e12
-"""Factor on a multiplier in one iteration, and in all."""
+"""Largest factor on a multiplier in one iteration, and in all."""
 
 NEARLY_HIGHEST = 0.99
-"""Of the highest level there is, what is searched where the level cannot be reached."""
+"""Share of the highest level that is searched for if the wanted one cannot be reached."""
 
 LEVEL_RESERVE = 1.02
-"""Level aimed at, since the iterations come near to full stroke from above."""
+"""Factor on the level that is aimed at, since iterations approach full stroke from above."""
 
 
 @dataclass(frozen=True)
 class LawsonMethod:
-    """Weights that are tried at each frequency.
-
-    steps: of Lawson's algorithm; is_limited: whether each is brought to the level within full
-    stroke, by multipliers; variance: of each ERA's contribution beyond that of the forms; gain: by
-    which weights are raised up to full stroke, 0 for none.
-    """
+    """How weights are computed at each frequency."""
 
     steps: int
+    """Steps of Lawson's algorithm."""
     is_limited: bool = False
+    """Whether weights are brought to the level within full stroke, by multipliers."""
     variance: float = 0.0
+    """Variance of each ERA's contribution, in addition to that of the forms."""
     gain: float = 0.0
+    """Gain on the weights, limited to full stroke; 0 for none."""
 
 
 ONE_FINGER, SEVERAL = LawsonMethod(1), LawsonMethod(1 + LAWSON_STEPS)
@@ -256,35 +248,35 @@ WITHIN_STROKE = (
     LawsonMethod(1, variance=1.0, gain=3.0),
     LawsonMethod(1, variance=1e6, gain=1e6),
 )
-"""Tried in turn where the first weights miss the level: such within full stroke, and then such for
-which the quiet points count less against each ERA's own power."""
+"""Methods that are tried in turn if the first weights miss the level.
 
-_TINY, _COHERENT_LEAST, _LEAST_FIELD = 1e-7, np.float32(1e-30), np.float32(1e-20)
+The first one stays within full stroke; for the others the quiet points count less against each
+ERA's own power.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class CoherentResult:
-    """The best weights (f, eras) at each frequency, and their robust score (f,).
-
-    The score is 0 where none were found that reach the level. bound (f,): of the score for one
-    target, for several an estimate that other phases may exceed; missed (f,): the best score of
-    weights that miss the level.
-    """
+    """The best weights at each frequency."""
 
     score: Float32Array
+    """Score (f,), 0 where no weights were found that reach the level."""
     weights: Complex64Array
+    """Weights (f, eras)."""
     bound: Float32Array
+    """Bound (f,) of the score; for several targets an estimate that other phases may exceed."""
     missed: Float32Array
+    """The best score (f,) of weights that miss the level."""
 
     @property
     def level_limited(self) -> IntArray:
-        """Frequencies without weights that reach the level, but of a better score than the best."""
+        """Indices of frequencies that miss the level, with a better score than the best one."""
         is_missed = (self.score == 0) & (self.missed > self.score.max(initial=0))
         return np.asarray(is_missed.nonzero()[0])
 
 
 def search(forms: Forms) -> CoherentResult:
-    """Find the best weights at each frequency, brought within full stroke where they must."""
+    """Find the best weights at each frequency, brought within full stroke where necessary."""
     found = search_all(forms)
     for method in WITHIN_STROKE:
         open_ = found.level_limited
@@ -297,9 +289,9 @@ def search(forms: Forms) -> CoherentResult:
 
 
 def search_to_level(forms: Forms) -> tuple[CoherentResult, Forms]:
-    """Search for weights of a level, without its margin where they must, or else near the highest.
+    """Search for weights of a level; if none are found without its margin, else near the highest.
 
-    Also return the forms with the level that was sought.
+    Also return the forms with the level that was searched for.
     """
     found = search(forms)
     for is_highest in (False, True):
@@ -317,7 +309,7 @@ def search_all(forms: Forms) -> CoherentResult:
 
 
 def max_sensation(forms: Forms) -> float:
-    """Return the highest amplitude to threshold found at the weakest target."""
+    """Return the highest amplitude to threshold that weights give the weakest target."""
     any_level = replace(forms, wanted=0.0, level_margin=0.0)
     peak = forms.amplitude(tried(any_level, WITHIN_STROKE[-1]).weights)
     return float((peak / forms.threshold).max())
@@ -355,13 +347,13 @@ def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
         power = np.abs(weights) ** 2
         if step == 0:
             own = np.maximum.reduce(forms.quiet_power(weights), axis=1)
-            multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _COHERENT_LEAST))[:, None]
+            multipliers = (own / np.maximum(np.add.reduce(power, axis=1), _LEAST_POWER))[:, None]
             limit = np.float32(MAX_MULTIPLIER) * multipliers
-        # Beyond any level that can be reached they would grow without end.
+        # If the level cannot be reached, they would grow without end.
         multipliers = np.minimum(multipliers * np.minimum(power, MAX_GROWTH), limit)
     every = np.array(every_weights)
     peak, reaches = forms.reached(every)
-    each = peak / np.sqrt(np.maximum(powers, _COHERENT_LEAST) + _TINY * (peak * peak))
+    each = peak / np.sqrt(np.maximum(powers, _LEAST_POWER) + _TINY * (peak * peak))
     score = np.where(reaches, each, 0)
     best = (best_along(score, axis=0), np.arange(f))
     best_weights = np.where(score[best][:, None] > 0, every[best], 0).astype(np.complex64)
@@ -370,17 +362,17 @@ def tried(forms: Forms, method: LawsonMethod) -> CoherentResult:
 
 
 def _moved(shares: Float32Array, expected: Float32Array) -> Float32Array:
-    """Shares of the quiet fingertips (f, q) after a step of Lawson's, by their expected powers.
+    """Return the shares (f, q) of quiet fingertips after a Lawson step, by their expected powers.
 
-    As they were at frequencies where no ERA is driven.
+    Unchanged at frequencies where no ERA is driven.
     """
     moved = shares * np.sqrt(np.maximum(expected, 0))
     total = np.add.reduce(moved, axis=-1, keepdims=True)
-    return np.where(total > _COHERENT_LEAST, moved / np.maximum(total, _COHERENT_LEAST), shares)
+    return np.where(total > _LEAST_POWER, moved / np.maximum(total, _LEAST_POWER), shares)
 
 
 def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
-    """R (n, eras, eras) for weights (n, q) of the quiet fingertips."""
+    """Return R (n, eras, eras) for weights (n, q) of the quiet fingertips."""
     n, q, eras, _ = forms.quiet.shape
     parts = forms.quiet.reshape(n, q, -1).view(np.float32)
     return (shares[:, None] @ parts)[:, 0].view(np.complex64).reshape(n, eras, eras)
@@ -389,13 +381,13 @@ def _weighted(forms: Forms, shares: Float32Array) -> Complex64Array:
 def _optimise_targets(
     R: Complex64Array, targets: Complex64Array, before: Complex64Array | None, gain: float
 ) -> tuple[Complex64Array, Float32Array, Complex64Array]:
-    """Weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
+    """Find weights (n, eras), largest magnitude 1, for targets (t, n, eras), and their bound (n,).
 
-    Also their factors (n, t). Weights are R^-1 times a sum of the targets' conjugates, each times a
-    factor, so that what targets get follows from factors by the targets' Gram matrix, t by t. Each
-    iteration sets the factors' phases to those reached, and raises that of a weaker target. before:
-    factors to start from, None for the phases that the optimum for one target gives all others.
-    With a gain above 1 the level itself counts, of weights raised by it up to full stroke.
+    Also returns their factors (n, t). Weights are R^-1 times the sum of the targets' conjugates,
+    each times a factor, so the targets' amplitudes follow from the factors by a t by t Gram matrix.
+    Each iteration sets the factors' phases to those reached and raises the factors of weaker
+    targets. before: initial factors, None for the phases that the optimum for one target gives to
+    all others. With a gain above 1 the level itself counts, of weights raised up to full stroke.
     """
     t, n, _ = targets.shape
     fields = targets.swapaxes(0, 1)
@@ -414,8 +406,8 @@ def _optimise_targets(
             cost = np.float32(1)
         else:
             reached = np.matvec(gram, factors)
-            cost = np.maximum(np.vecdot(factors, reached).real, _COHERENT_LEAST)
-        size = np.maximum(np.abs(reached), _LEAST_FIELD)
+            cost = np.maximum(np.vecdot(factors, reached).real, _LEAST_POWER)
+        size = np.maximum(np.abs(reached), _LEAST_AMPLITUDE)
         tried.append(factors)
         values.append(np.minimum.reduce(size, axis=-1) / np.sqrt(cost))
         factors = _largest_one(np.abs(factors) / size * _phases(reached))
@@ -428,7 +420,7 @@ def _optimise_targets(
 def _largest_one(values: Complex64Array) -> Complex64Array:
     """Values scaled so that the largest magnitude along the last axis is 1."""
     size = np.maximum.reduce(np.abs(values), axis=-1, keepdims=True)
-    return np.asarray(values / np.maximum(size, _COHERENT_LEAST), dtype=np.complex64)
+    return np.asarray(values / np.maximum(size, _LEAST_POWER), dtype=np.complex64)
 
 
 def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
@@ -438,20 +430,18 @@ def _saturated(weights: Complex64Array, gain: float) -> Complex64Array:
 
 def _phases(fields: Complex64Array) -> Complex64Array:
     """Phase factors of fields."""
-    return np.asarray(fields / np.maximum(np.abs(fields), _LEAST_FIELD))
+    return np.asarray(fields / np.maximum(np.abs(fields), _LEAST_AMPLITUDE))
 
 
 ALTERNATIVES = 4
-"""Patterns that are kept, the best first, for drawn plates to choose among."""
+"""Number of patterns that are kept, the best first, to be judged on drawn plates."""
 
 BATCH = 512
-"""Patterns that are looked at closely at first, those of the highest bounds."""
-
-_SWITCHED_LEAST = np.float32(1e-30)
+"""Number of patterns that are computed exactly at first, those of the highest bounds."""
 
 
 def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
-    """Find the patterns of the best robust scores that reach the level, best first.
+    """Find the switched patterns of the best scores that reach the level, best first.
 
     Empty if none does. Exact: patterns are excluded by bounds only.
     """
@@ -460,17 +450,17 @@ def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
     every = np.concatenate([power_forms(forms.targets), expected]) / above
     powers = _with_silence(every.astype(np.float32))
     alone = np.diagonal(powers[:, 1:], axis1=2, axis2=3)
-    loudest = (alone[2 * t :] / np.maximum(alone[:t].mean(axis=0), _SWITCHED_LEAST)).argmax(axis=0)
+    loudest = (alone[2 * t :] / np.maximum(alone[:t].mean(axis=0), _LEAST_POWER)).argmax(axis=0)
     share = np.bincount(loudest.ravel(), minlength=len(powers) - 2 * t) / loudest.size
     heard = np.tensordot(share.astype(np.float32), powers[2 * t :], axes=1)
     target, quiet = _sums_of_pairs(np.stack([powers[:t].mean(axis=0), heard]))
-    bounds = target / np.maximum(quiet, _SWITCHED_LEAST)
+    bounds = target / np.maximum(quiet, _LEAST_POWER)
     one, other = np.triu_indices(forms.era_count, 1)
     bounds[one + 1 < other, :, 0] = bounds[:-1, 0] = -1  # an ERA alone counts once
     count, bound = BATCH, bounds.ravel()
     while True:
         order = np.argpartition(-bound, min(count, len(bound) - 1))
-        some = np.sort(order[:count])  # a partition's own order is another one elsewhere
+        some = np.sort(order[:count])  # a partition's order differs between processors
         pair, first, second = np.unravel_index(some, bounds.shape)
         tones = np.array([[first, one[pair]], [second, other[pair]]])
         score = np.where(bound[some] < 0, 0, _scores(forms, powers, *tones))
@@ -486,7 +476,7 @@ def find_switched(forms: Forms) -> list[tuple[float, Drive]]:
 
 
 def _scores(forms: Forms, powers: Float32Array, one: IntArray, other: IntArray) -> Float32Array:
-    """Power ratios (m,) of patterns of two tones (2, m) of powers `_with_silence`.
+    """Return power ratios (m,) of patterns of two tones (2, m), of powers `_with_silence`.
 
     0 where the level is not reached.
     """
@@ -494,33 +484,36 @@ def _scores(forms: Forms, powers: Float32Array, one: IntArray, other: IntArray) 
     sums = powers[:, i, a, a] + powers[:, j, b, b] + (i == j) * 2 * powers[:, i, a, b]
     at, deviation = sums[:t], np.sqrt(np.maximum(sums[t : 2 * t] - sums[:t], 0))
     reaches = np.sqrt(at) - np.float32(forms.level_margin) * deviation >= forms.wanted
-    ratio = at.min(axis=0) / np.maximum(sums[2 * t :].max(axis=0), _SWITCHED_LEAST)
+    ratio = at.min(axis=0) / np.maximum(sums[2 * t :].max(axis=0), _LEAST_POWER)
     return np.asarray(np.where(reaches.all(axis=0), ratio, 0))
 
 
 def max_sensation_switched(forms: Forms) -> float:
-    """Return the highest amplitude to threshold at the weakest target, the same pattern for all."""
+    """Return the highest amplitude to threshold of switched patterns at the weakest target."""
     return float(highest_levels((forms.targets / forms.threshold[:, None])[None])[0])
 
 
 def highest_levels(fields: Complex64Array) -> Float32Array:
-    """Highest amplitudes (m,) that a pattern gives the weakest of t targets, (m, t, f, eras)."""
+    """Return the highest amplitudes (m,) that a pattern gives the weakest of t targets.
+
+    fields (m, t, f, eras).
+    """
     found = [_sums_of_pairs(_with_silence(power_forms(each))).min(axis=0).max() for each in fields]
     return np.sqrt(np.array(found, dtype=np.float32))
 
 
 def power_forms(fields: Complex64Array) -> Float32Array:
-    """Real parts of forms (c, f, eras, eras) of the squared magnitude of fields (c, f, eras)."""
+    """Return real parts of the forms (c, f, eras, eras) of squared fields (c, f, eras)."""
     return np.asarray((fields.conj()[..., None] * fields[..., None, :]).real)
 
 
 def _with_silence(powers: Float32Array) -> Float32Array:
-    """Forms (c, 1 + f, eras, eras): at the first frequency nothing plays."""
+    """Prepend a frequency at which nothing plays to forms, (c, 1 + f, eras, eras)."""
     return np.pad(powers, [(0, 0), (1, 0), (0, 0), (0, 0)])
 
 
 def _sums_of_pairs(powers: Float32Array) -> Float32Array:
-    """Powers of all patterns of two ERAs, for every two (c, pairs, 1 + f, 1 + f).
+    """Return the powers (c, pairs, 1 + f, 1 + f) of all patterns of two ERAs.
 
     By the frequency of each ERA; powers `_with_silence`.
     """
@@ -533,7 +526,7 @@ def _sums_of_pairs(powers: Float32Array) -> Float32Array:
 
 
 def _drive(tones: list[list[int]], eras: int) -> Drive:
-    """ERAs at full stroke; of each the frequency, counted from 1, and its number."""
+    """Make a drive of ERAs at full stroke, from pairs of frequency, counted from 1, and ERA."""
     found: dict[int, Complex64Array] = {}
     for row, era in sorted(tones):
         if row:

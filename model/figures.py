@@ -1,16 +1,12 @@
-"""Pictures of the plate as matplotlib figures.
+"""Pictures as matplotlib figures.
 
-Fields over the plate with marks for ERAs and nulls.
-
-What was measured, beside the rig before and after a calibration and beside promises.
-
-Templates: the board in real size with the places of what is glued to it, to print and stick on.
-
-Lengths are millimetres. A template of the underside is mirrored left to right, its letters are not.
-
-Where each of several contents is felt, as a table predicts it: each has a colour of its own.
-
-Pictures of a table: weak cells, levels, contrast, and a pattern with its fingertips.
+- Maps of the plate's acceleration, with marks for ERAs and nulls.
+- Measurements beside a calibration, and beside promises.
+- Templates: a board in real size with the places of what is glued to it, to print and stick on.
+  Lengths are millimetres. A template of the underside is mirrored left to right, its letters are
+  not.
+- Contents: where each of several is felt, as a table predicts it, in a colour of its own.
+- Tables: weak cells, levels, contrast, and an answer with its fingertips.
 """
 
 import math
@@ -18,7 +14,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, product
-from math import ceil, prod
 from pathlib import Path
 from typing import Any
 
@@ -52,62 +47,16 @@ from model.study.promise_at_sensors import MeasuredVerification
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, G, PlateMap
 
-__all__ = [
-    "A4",
-    "ACTIVE_COLOR",
-    "BORDER",
-    "BRIGHTEST_DB_SL",
-    "COLORS",
-    "CROSS",
-    "FELT_COLOR",
-    "GRAIN",
-    "LETTER",
-    "LINE",
-    "MM_PER_INCH",
-    "NOT_PRINTED",
-    "POINT",
-    "POINTS_ALONG",
-    "QUIET_COLOR",
-    "RESTING_COLOR",
-    "RULER",
-    "STRIP",
-    "Box",
-    "MapPanel",
-    "Template",
-    "answer_figure",
-    "calibration_figure",
-    "contents_figure",
-    "contrast_figure",
-    "contrast_map_figure",
-    "draw_eras",
-    "draw_fingertip",
-    "draw_level_scale",
-    "draw_levels",
-    "label_plate",
-    "layer_figure",
-    "levels_figure",
-    "map_figure",
-    "maps_figure",
-    "promise_figure",
-    "raster",
-    "save_figure",
-    "table_figures",
-    "weak_cells_figure",
-    "write_template",
-]
-
 COLORS = "viridis"
 ACTIVE_COLOR = "#d62728"
 RESTING_COLOR = "#2ca02c"
 
 POINTS_ALONG = 97
+"""Points of a raster along the longer side: on the paper's plate 60 per shortest wave."""
 
 
 def raster(plate: Plate) -> tuple[int, int]:
-    """Numbers of evenly spaced points along x and y for drawing a field.
-
-    POINTS_ALONG the longer side: on the paper's plate 60 per shortest wave of its figures.
-    """
+    """Return the numbers of evenly spaced points along x and y for drawing a field."""
     step = max(plate.length, plate.width) / (POINTS_ALONG - 1)
     return max(2, round(plate.length / step) + 1), max(2, round(plate.width / step) + 1)
 
@@ -124,7 +73,7 @@ def draw_eras(
 
 @dataclass(frozen=True)
 class MapPanel:
-    """One map of a figure with its title and the names of driven ERAs."""
+    """A map of a figure, with its title and the names of driven ERAs."""
 
     title: str
     plate_map: PlateMap
@@ -133,7 +82,7 @@ class MapPanel:
 
 
 def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None = None) -> Figure:
-    """Maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs and nulls marked."""
+    """Draw maps side by side on one colour scale in g (1 g = 9.8 m/s²), with ERAs and nulls."""
     rows = -(-len(panels) // columns)
     width = 7.0 if columns == 1 else 3.6 * columns + 1
     ratio = panels[0].plate_map.y[-1] / panels[0].plate_map.x[-1]
@@ -158,7 +107,7 @@ def maps_figure(panels: Sequence[MapPanel], *, columns: int, caption: str | None
 
 
 def map_figure(rig: Rig, plate_map: PlateMap, *, active: Collection[str], title: str) -> Figure:
-    """One map with its ERAs, nulls as red crosses and a colour bar in g."""
+    """Draw one map with its ERAs, nulls as red crosses and a colour bar in g."""
     return maps_figure([MapPanel(title, plate_map, rig.eras, active)], columns=1)
 
 
@@ -171,7 +120,7 @@ def label_plate(axes: Axes) -> None:
 
 _DPI = 150
 _UNDATED = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""Metadata with which the same figure is the same bytes."""
+"""Metadata with which equal figures are equal bytes."""
 
 
 def save_figure(figure: Figure, path: Path, *, inches: tuple[float, float] | None = None) -> None:
@@ -228,7 +177,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
 
 
 def promise_figure(found: MeasuredVerification) -> Figure:
-    """Draw measured over promised felt contrast; what is below the line breaks its promise."""
+    """Draw measured over promised felt contrast; points below the line break their promise."""
     promised = np.array([each.promise.contrast_db for each in found.measured])
     measured = np.array([each.contrast_db for each in found.measured])
     quiet = np.array([len(each.promise.sensors) - 1 for each in found.measured])
@@ -258,7 +207,7 @@ def promise_figure(found: MeasuredVerification) -> Figure:
 MM_PER_INCH = 25.4
 POINT = MM_PER_INCH / 72
 BORDER, STRIP = 12.0, 22.0
-"""Paper around the board [mm], and below it, with a ruler."""
+"""Width of the paper around the board [mm], and of the strip below it, with a ruler."""
 RULER = 100  # mm
 A4 = (210.0, 297.0), (297.0, 210.0)  # mm; upright and across
 NOT_PRINTED = 8.0  # mm; edges of a page that printers leave white
@@ -272,14 +221,13 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Template:
-    """A board to be drawn in real size.
-
-    sensors: places [m] by name; is_below: as seen from below, where actuators are glued.
-    """
+    """A board to be drawn in real size."""
 
     rig: Rig
     sensors: Mapping[str, tuple[float, float]]
+    """Places of the sensors [m] by name."""
     is_below: bool = True
+    """Whether it is seen from below, where actuators are glued."""
 
     @property
     def board(self) -> tuple[float, float]:
@@ -294,26 +242,26 @@ class Template:
 
     @property
     def grain(self) -> tuple[float, float] | None:
-        """Its direction, of a board that has one."""
+        """Direction of the grain, None for a board without."""
         if self.rig.plate.material.orthotropy is None:
             return None
         return (0.0, 1.0) if self.rig.grain == "width" else (1.0, 0.0)
 
     @property
     def title(self) -> str:
-        """What is seen."""
+        """Description of the view."""
         length, width = self.board
         side = "below, for the underside" if self.is_below else "above, for the touched side"
         return f"{length:g} x {width:g} mm, seen from {side}; places x, y in mm"
 
     def label(self, name: str, at: tuple[float, float]) -> list[str]:
-        """Lines beside a place: its name, of an actuator its output, and where it is."""
+        """Return the lines beside a place: name, output of an actuator, and coordinates."""
         channel = self.rig.wiring.get(name)
         output = f", output {channel.number + 1}" if channel else ""
         return [f"{name}{output}", f"{at[0]:.1f}, {at[1]:.1f}"]
 
     def places(self) -> Iterator[tuple[str, tuple[float, float], float, str]]:
-        """Yield name, place and radius [mm], and the style of the circle, of all that is glued."""
+        """Yield name, place and radius [mm], and style of the circle, for all that is glued on."""
         for era in self.rig.eras:
             yield era.name, (1000 * era.x, 1000 * era.y), 1000 * era.foot, "solid"
         data: Mapping[str, Any] = self.rig.document.data if self.rig.document else {}
@@ -338,7 +286,7 @@ def write_template(path: Path, template: Template) -> int:
         save_figure(_page(template, template.paper, name="", edge=0.0), path)
         return 1
     pages = [*_pages(template)]
-    # The same bytes for the same rig.
+    # Without a date, so that equal rigs make equal bytes.
     with whole_or_nothing(path) as stream, PdfPages(stream, metadata={"CreationDate": None}) as pdf:
         for page in pages:
             pdf.savefig(page)
@@ -346,17 +294,20 @@ def write_template(path: Path, template: Template) -> int:
 
 
 def _pages(template: Template) -> Iterator[Figure]:
-    """Yield A4 pages of the way round that takes fewer of them, from the top left on."""
+    """Yield A4 pages, upright or across, whichever takes fewer, from the top left on."""
     low, high, bottom, top = template.paper
     sizes = [(width - 2 * NOT_PRINTED, height - NOT_PRINTED - STRIP) for width, height in A4]
     counts = [
-        (ceil((high - low) / width), ceil((top - bottom) / height)) for width, height in sizes
+        (math.ceil((high - low) / width), math.ceil((top - bottom) / height))
+        for width, height in sizes
     ]
-    pages, (across, down) = min(zip(counts, sizes, strict=True), key=lambda each: prod(each[0]))
+    pages, (across, down) = min(
+        zip(counts, sizes, strict=True), key=lambda each: math.prod(each[0])
+    )
     columns, rows = pages
     for row, column in product(range(rows), range(columns)):
         upper = top - row * down
-        # Columns are counted as they lie, whichever way x runs.
+        # Columns are counted from the left of the paper, whatever the direction of x.
         left = high - (column + 1) * across if template.is_below else low + column * across
         name = f"; row {row + 1} of {rows}, column {column + 1} of {columns}: join at the frame"
         box = left, left + across, upper - down, upper
@@ -384,7 +335,7 @@ def _page(template: Template, box: Box, *, name: str, edge: float) -> Figure:
 
 
 def _draw(axes: Axes, template: Template, box: Box) -> None:
-    """Draw what of the board lies in a box, which fills the axes."""
+    """Draw the part of the board in a box, which fills the axes."""
     low, high, bottom, top = box
     length, width = template.board
     axes.set(xlim=(high, low) if template.is_below else (low, high), ylim=(bottom, top))
@@ -444,11 +395,11 @@ def _beside(
     return (free or ways)[0], away
 
 
-CONTENTS_PICTURE_COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")
-"""Of contents, in order."""
+CONTENT_COLORS = ("#35e07a", "#4f9dff", "#ffa62b", "#ff5fa2")
+"""Colours of contents, in order."""
 
 BRIGHTEST_DB_SL = 30.0
-"""Level from which a colour is at its brightest; the threshold of feeling is black."""
+"""Level from which a colour is at its brightest; the detection threshold is black."""
 
 _GREY = 0.62
 _RADIUS = 100 * FINGERTIP_RADIUS  # cm
@@ -457,9 +408,9 @@ _RADIUS = 100 * FINGERTIP_RADIUS  # cm
 def contents_figure(
     table: LocalizationTable, contents: Sequence[Layer], fingers: Sequence[Sensation]
 ) -> Figure:
-    """Draw a panel with all contents, and one for each, as the table predicts them.
+    """Draw a panel with all contents and one for each, as the table predicts them.
 
-    Beside every finger its verdict, and level and contrast as they are given.
+    Beside every finger are its verdict, level and contrast.
     """
     count = len(contents)
     levels = np.array([_levels(table, each) for each in contents])
@@ -469,7 +420,7 @@ def contents_figure(
     panels = figure.subplot_mosaic(
         [["all", f"{number}"] for number in range(count)], width_ratios=[count, 1]
     )
-    _contents_picture_draw(panels["all"], table, levels, CONTENTS_PICTURE_COLORS, fingers)
+    _draw_contents(panels["all"], table, levels, CONTENT_COLORS, fingers)
     panels["all"].set_title(
         "Coloured where a finger feels its own content, grey where contents mix", fontsize=13
     )
@@ -477,11 +428,11 @@ def contents_figure(
         _label_finger(panels["all"], finger, contents)
     for number, layer in enumerate(contents):
         axes = panels[f"{number}"]
-        _contents_picture_draw(
+        _draw_contents(
             axes,
             table,
             levels[[number]],
-            [CONTENTS_PICTURE_COLORS[number % len(CONTENTS_PICTURE_COLORS)]],
+            [CONTENT_COLORS[number % len(CONTENT_COLORS)]],
             fingers,
         )
         axes.set_title(f"{_frequency(layer)} alone", fontsize=11)
@@ -490,12 +441,12 @@ def contents_figure(
 
 
 def _frequency(layer: Layer) -> str:
-    """The frequency of a content, which has one where there are several."""
+    """Return the frequency of a content in words."""
     return "several frequencies" if layer.frequency is None else f"{layer.frequency:g} Hz"
 
 
 def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
-    """Level [dB SL] of a content over the raster of the plate."""
+    """Return the level [dB SL] of a content over the raster of the plate."""
     plate = table.plate
     nx, ny = raster(plate)
     points = lattice(np.linspace(0, plate.length, nx), np.linspace(0, plate.width, ny))
@@ -503,14 +454,14 @@ def _levels(table: LocalizationTable, content: Layer) -> FloatArray:
     return sensation_level(*amplitudes, table.threshold).reshape(ny, nx)
 
 
-def _contents_picture_draw(
+def _draw_contents(
     axes: Axes,
     table: LocalizationTable,
     levels: FloatArray,
     colors: Sequence[str],
     fingers: Sequence[Sensation],
 ) -> None:
-    """Draw fingers, and the loudest content in its colour, paler the less it is above others."""
+    """Draw fingers, and the loudest content in its colour, which fades to grey near others."""
     plate = table.plate
     powers = 10 ** (levels / 10)
     own = powers.max(axis=0)
@@ -562,22 +513,18 @@ def _label_finger(axes: Axes, finger: Sensation, contents: Sequence[Layer]) -> N
 
 
 def _color_of(finger: Sensation) -> str:
-    """Of its content, white without one."""
-    return (
-        "white"
-        if finger.layer is None
-        else CONTENTS_PICTURE_COLORS[finger.layer % len(CONTENTS_PICTURE_COLORS)]
-    )
+    """Return the colour of a finger's content, white without one."""
+    return "white" if finger.layer is None else CONTENT_COLORS[finger.layer % len(CONTENT_COLORS)]
 
 
 _CONTRAST = "promised felt contrast / dB"
 
-# Fingers of the example, in shares of the plate.
+# Fingers of the example answer, in shares of the plate.
 _EXAMPLE = ((0.3, 0.35), (0.8, 0.6), (0.45, 0.85))
 
 
 def table_figures(table: LocalizationTable, overview: Overview) -> Iterator[tuple[str, Figure]]:
-    """Draw all pictures, with names."""
+    """Yield all pictures of a table with their names."""
     yield "weak_cells", weak_cells_figure(table, overview.cells)
     yield "levels", levels_figure(table)
     yield "contrast", contrast_figure(table, overview)
@@ -727,9 +674,9 @@ def _in_words(table: LocalizationTable, layer: Layer) -> str:
     return "\n".join("; ".join(tones[start : start + 2]) for start in range(0, 12, 2)).strip()
 
 
-_COLORS = "magma"
+_LEVEL_COLORS = "magma"
 _SCALE = Normalize(-10.0, 30.0)
-"""From barely perceptible to more than strong [dB SL]."""
+"""Levels [dB SL] from barely perceptible to more than strong."""
 
 FELT_COLOR, QUIET_COLOR = "#6dff9c", "#9fdcff"
 
@@ -741,7 +688,7 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
     x, y = (np.linspace(0, side, _SIDE) for side in (table.plate.length, table.plate.width))
     amplitudes = table.amplitudes(excitation, lattice(x, y))
     level = sensation_level(*amplitudes, table.threshold).reshape(_SIDE, _SIDE)
-    axes.pcolormesh(100 * x, 100 * y, level, cmap=_COLORS, shading="gouraud", norm=_SCALE)
+    axes.pcolormesh(100 * x, 100 * y, level, cmap=_LEVEL_COLORS, shading="gouraud", norm=_SCALE)
     axes.set_aspect("equal")
     draw_eras(axes, table.eras, active=excitation.keys())
     frequencies = {tone.frequency for tone in excitation.values()}
@@ -769,7 +716,7 @@ def draw_levels(axes: Axes, table: LocalizationTable, excitation: Excitation) ->
 def draw_level_scale(figure: Figure, axes: Iterable[Axes], *, shrink: float) -> None:
     """Draw the colour scale of `draw_levels` beside axes, shrunk to a share of their height."""
     figure.colorbar(
-        ScalarMappable(_SCALE, _COLORS),
+        ScalarMappable(_SCALE, _LEVEL_COLORS),
         ax=list(axes),
         label="level above detection threshold / dB SL",
         extend="both",

@@ -1,23 +1,18 @@
-"""A finger on the plate: contact area, load, detection thresholds and contrast.
+"""A finger on the plate: contact area, detection thresholds, levels above them, and contrast.
 
-A fingertip on the plate: a disc, sampled at points with weights.
+A fingertip is a disc, sampled at points with weights for the mean of a field. The cubature has
+rings about the centre, at Gauss-Lobatto points of the radius squared, with evenly spaced points
+(product rules: Stroud, Approximate Calculation of Multiple Integrals, 1971, section 2.6). The
+outermost ring is the rim, so the largest value over the points is close to that over the disc.
+Where an edge of the plate cuts the disc, the mean is over the part that remains.
 
-The points and weights are a cubature over a disc, for the mean of a field: rings about the centre,
-along the radius Gauss-Lobatto points of the radius squared, so that the outermost ring is the rim
-and the largest value over the points is close to that over the disc; evenly spaced around (product
-rules: Stroud, Approximate Calculation of Multiple Integrals, 1971, section 2.6). Where an edge of
-the plate cuts the disc, the mean is that over what remains of it.
+A set of detection thresholds is a file in model/data/thresholds with its sources; its name is the
+file's. Measured thresholds differ by tens of decibels between ways to touch
+(docs/concepts/people.md).
 
-Grid of target cells over the plate.
-
-Detection thresholds at the fingertip, levels above them in dB SL, and contrast.
-
-A set of thresholds is a file in model/data/thresholds, with its sources; its name is the file's.
-What is measured differs by tens of decibels between ways to touch (docs/concepts/people.md).
-
-Felt is the part of a vibration that skin can feel: Pacinian corpuscles answer to about 1 kHz. What
-is above it in an onset is the ringing of a fingertip's contact mass on the plate beneath it and of
-modes far beyond the drive, of which models with different numbers of modes say different things.
+Skin feels vibration up to about 1 kHz, by Pacinian corpuscles. Above that an onset has the ringing
+of the fingertip's contact mass on the plate and of modes far beyond the drive, on which models with
+different numbers of modes disagree; `felt_part` removes it.
 """
 
 import csv
@@ -34,11 +29,10 @@ from model.errors import InputError, is_whole
 from model.structure.plate import Plate
 
 MAX_CONTACTS = 20
-"""Two people with ten fingers each, or four with five; more are a forearm or a spill."""
+"""Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
 
 MAX_CONTENTS = 6
-"""Contents at the same time; more have no contrast left on any plate."""
-
+"""Most contents at the same time; with more, no plate has any contrast left."""
 
 GAUSS_LEGENDRE = np.column_stack(np.polynomial.legendre.leggauss(8))
 """Points and weights (8, 2) over -1..1."""
@@ -46,19 +40,18 @@ GAUSS_LEGENDRE = np.column_stack(np.polynomial.legendre.leggauss(8))
 
 @dataclass(frozen=True, eq=False)
 class DiscRule:
-    """Points (p, 2) of the unit disc with weights (..., p), which sum to 1 over the points.
-
-    Exact for the mean over the disc of polynomials up to a degree.
-    """
+    """A cubature over the unit disc, exact for means of polynomials up to a degree."""
 
     points: FloatArray
+    """Points (p, 2)."""
     weights: FloatArray
+    """Weights (..., p), whose sum over the points is 1."""
 
     def cut(self, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (k, p, 2) and weights (..., k, p) for the disc's parts in rectangles.
+        """Return points (k, p, 2) and weights (..., k, p) for the disc's parts in k rectangles.
 
-        low, high (k, 2): the rectangles' corners, in radii from the disc's centre, which they
-        contain. Points outside move to the nearest place inside and weigh nothing; the weights of
+        low, high (k, 2): corners of the rectangles, in radii from the disc's centre, which they
+        contain. Points outside move to the nearest place inside and get weight 0; the weights of
         the others make the mean of linear functions exact.
         """
         weights = self.weights[..., None, :].repeat(len(low), axis=-2)
@@ -72,29 +65,29 @@ class DiscRule:
         return inside, weights
 
     def _refit(self, is_kept: NDArray[np.bool_], low: FloatArray, high: FloatArray) -> FloatArray:
-        """Weights (..., k, p): those kept, times the linear function that makes linear means exact.
+        """Return weights (..., k, p), times the linear function that makes linear means exact.
 
-        The few that would become negative are zero; the mean is exact but for that.
+        The few that would become negative are set to 0, which leaves a small error.
         """
         weights = self.weights[..., None, :] * is_kept
         weights /= weights.sum(axis=-1, keepdims=True)
         linear = np.column_stack([np.ones(len(self.points)), self.points])
         gram = (weights[..., None, :] * linear.T) @ linear
         means = np.concatenate([np.ones((len(low), 1)), _centroids(low, high)], axis=1)
-        # Definite also where the points kept lie on a line, in parts narrower than a fingertip.
+        # Definite even if the remaining points lie on a line, in parts narrower than a fingertip.
         tilt = np.linalg.solve(gram + 1e-9 * np.eye(3), means[:, :, None])[..., 0]
         fitted = np.maximum(weights * (tilt @ linear.T), 0)
         return np.asarray(fitted / fitted.sum(axis=-1, keepdims=True))
 
 
 def _rings(*rings: tuple[float, int, float]) -> DiscRule:
-    """A rule of rings: radius, number of points, and weight of all of them together."""
+    """Make a rule of rings: radius, number of points, and their total weight."""
     points, weights = [], []
     for radius, count, weight in rings:
         angles = 2 * np.pi * np.arange(count) / count
         points.append(radius * np.column_stack([np.cos(angles), np.sin(angles)]))
         weights.append(np.full(count, weight / count))
-    # Rounded, for points that shall lie on the axes.
+    # Rounded, so that points lie exactly on the axes.
     return DiscRule(np.concatenate(points).round(15), np.concatenate(weights))
 
 
@@ -108,11 +101,11 @@ FIVE_AND_FINE = DiscRule(
     np.concatenate([FIVE_POINTS.points, FINE_POINTS.points]),
     np.stack([np.pad(FIVE_POINTS.weights, (0, 21)), np.pad(FINE_POINTS.weights, (5, 0))]),
 )
-"""Both, the five points first: weights (2, 26) for the mean by either."""
+"""Both rules, the five points first, with weights (2, 26) for the mean by each."""
 
 
 def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Centroids (k, 2) of the unit disc's parts in rectangles that hold its centre.
+    """Return the centroids (k, 2) of the unit disc's parts in rectangles that contain its centre.
 
     Integrals over y are exact; over x by Gauss-Legendre points of the angle asin(x), piecewise
     between the corners where rim and rectangle meet.
@@ -133,15 +126,18 @@ def _centroids(low: FloatArray, high: FloatArray) -> FloatArray:
     return np.asarray(np.column_stack([along_x, along_y]) / area[:, None])
 
 
-# A contact of 5 mm radius, the mean of index fingers on touch screens, and the 8 mm by which a
-# finger may move before its pattern changes (docs/concepts/people.md).
 FINGERTIP_RADIUS = 0.013
+"""Radius [m] over which a fingertip counts.
+
+A contact of 5 mm radius, the mean of index fingers on touch screens, and the 8 mm by which a finger
+may move before its pattern changes (docs/concepts/people.md).
+"""
 
 
 def fingertips_on(
     centres: FloatArray, *, length: float, width: float, rule: DiscRule = FINE_POINTS
 ) -> tuple[FloatArray, FloatArray]:
-    """Points [m] (k, p, 2) under fingertips centred at (k, 2) [m] on a plate, weights (..., k, p).
+    """Return points (k, p, 2) [m] under fingertips centred at (k, 2) [m], and weights (..., k, p).
 
     The weighted sum over a fingertip's points is the mean over its disc, or over the part of it
     that is on the plate. All points are on the plate and under the fingertip.
@@ -153,12 +149,12 @@ def fingertips_on(
 
 
 def fingertip_points(x: float, y: float, plate: Plate) -> FloatArray:
-    """Points [m] (p, 2) under a fingertip centred at x, y [m] on the plate."""
+    """Return points (p, 2) [m] under a fingertip centred at x, y [m] on the plate."""
     return np.asarray(_one(x, y, plate)[0][0])
 
 
 def fingertip_weights(x: float, y: float, plate: Plate) -> FloatArray:
-    """Weights (p,) of `fingertip_points` in the mean over the fingertip."""
+    """Return the weights (p,) of `fingertip_points` in the mean over the fingertip."""
     return np.asarray(_one(x, y, plate)[1][0])
 
 
@@ -168,7 +164,7 @@ def _one(x: float, y: float, plate: Plate) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Grid:
-    """Target cells: nx by ny equal rectangles over the plate, numbered along x first."""
+    """A grid of target cells: nx by ny equal rectangles over the plate, numbered along x first."""
 
     nx: int
     ny: int
@@ -189,7 +185,7 @@ class Grid:
         return self.nx * self.ny
 
     def centres(self, plate: Plate) -> FloatArray:
-        """Centres of the cells [m], (cell_count, 2)."""
+        """Return the centres (cell_count, 2) of the cells [m]."""
         x = (np.arange(self.nx) + 0.5) * plate.length / self.nx
         return lattice(x, (np.arange(self.ny) + 0.5) * plate.width / self.ny)
 
@@ -197,7 +193,10 @@ class Grid:
 DEFAULT_THRESHOLD = "vibrotactile-probe"
 
 FELT_DB_SL = 12.0
+"""Level at which a vibration is clearly felt."""
+
 STRONG_DB_SL = 20.0
+"""Level at which a vibration is strong."""
 
 _FOLDER = resources.files("model").joinpath("data/thresholds")
 
@@ -217,7 +216,7 @@ def _rows(threshold: str) -> list[dict[str, str]]:
 
 @cache
 def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
-    """Frequencies [Hz] and peak accelerations [m/s²] of a set, as tabulated."""
+    """Return the tabulated frequencies [Hz] and peak accelerations [m/s²] of a set."""
     rows = _rows(threshold)
     frequency = np.array([float(row["frequency_hz"]) for row in rows])
     return frequency, np.array([float(row["threshold_m_s2_peak"]) for row in rows])
@@ -225,13 +224,13 @@ def _tabulated(threshold: str) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def highest_measured(threshold: str = DEFAULT_THRESHOLD) -> float:
-    """Frequency [Hz] above which a set of thresholds is extrapolated."""
+    """Return the frequency [Hz] above which a set of thresholds is extrapolated."""
     known = (row for row in _rows(threshold) if row["basis"] != "extrapolated")
     return max(float(row["frequency_hz"]) for row in known)
 
 
 def highest_known(threshold: str = DEFAULT_THRESHOLD) -> float:
-    """Frequency [Hz] to which a set of thresholds has data."""
+    """Return the frequency [Hz] up to which a set of thresholds has data."""
     return float(_tabulated(threshold)[0][-1])
 
 
@@ -249,7 +248,7 @@ def check_has_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
 
 
 def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOLD) -> FloatArray:
-    """Peak acceleration [m/s²] that a fingertip just detects at frequencies [Hz].
+    """Return the peak acceleration [m/s²] that a fingertip just detects at frequencies [Hz].
 
     threshold: name of the set. Interpolated in the logarithm of both. Raises InputError for
     frequencies without data.
@@ -262,9 +261,10 @@ def detection_threshold(frequency: FloatArray, threshold: str = DEFAULT_THRESHOL
 def sensitivities(
     frequencies: FloatArray, sets: Sequence[str], threshold: str = DEFAULT_THRESHOLD
 ) -> FloatArray:
-    """How much higher an amplitude is to the thresholds of sets (s,) than to those of one, (s, f).
+    """Return the ratios (s, f) of a set's thresholds to those of s other sets.
 
-    frequencies (f,) [Hz]. Raises InputError for frequencies at which any has no data.
+    By these factors an amplitude is higher above the others' thresholds. frequencies (f,) [Hz].
+    Raises InputError for frequencies at which any set has no data.
     """
     own = detection_threshold(frequencies, threshold)
     return np.array([own / detection_threshold(frequencies, each) for each in sets])
@@ -273,7 +273,7 @@ def sensitivities(
 def sensation_level(
     frequencies: FloatArray, amplitudes: FloatArray, threshold: str = DEFAULT_THRESHOLD
 ) -> FloatArray:
-    """Level above threshold [dB SL] of tones felt together: 20 log10 sqrt(sum (a_f / T(f))²).
+    """Return the level [dB SL] of tones felt together: 20 log10 sqrt(sum (a_f / T(f))²).
 
     frequencies (f,) [Hz], amplitudes (f, ...) [m/s²]; -inf where nothing moves. Raises InputError
     for frequencies without data.
@@ -284,26 +284,26 @@ def sensation_level(
 
 
 def decibels(ratio: FloatArray | float) -> FloatArray:
-    """20 log10 of an amplitude ratio, of the same shape; -inf for zero."""
+    """Return 20 log10 of amplitude ratios, of the same shape; -inf for zero."""
     with np.errstate(divide="ignore"):
         return np.asarray(20 * np.log10(ratio))
 
 
-# The background of a lone finger begins at this distance [m], about two fingertips.
 NEAR_RADIUS = 0.05
+"""Distance [m] at which the background of a finger begins, about two fingertips."""
 
 
 def is_beyond(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
-    """Return which points [m] (p, 2) are farther than NEAR_RADIUS from every target [m], (p,)."""
+    """Return which points (p, 2) [m] are farther than NEAR_RADIUS from every target [m], (p,)."""
     apart = np.linalg.norm(points[:, None] - np.array(targets), axis=-1)
     beyond: NDArray[np.bool_] = (apart > NEAR_RADIUS).all(axis=1)
     return beyond
 
 
 def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
-    """Return which points [m] (p, 2) are background to targets [m], (p,): those beyond, or all.
+    """Return which points (p, 2) [m] are background to targets [m], (p,).
 
-    All where the plate is so small that no point is beyond.
+    Those beyond NEAR_RADIUS, or all if the plate is so small that there are none.
     """
     beyond = is_beyond(points, targets)
     return beyond if beyond.any() else ~beyond
@@ -312,10 +312,10 @@ def is_background(points: FloatArray, targets: Sequence[tuple[float, float]]) ->
 def contrast_db(
     targets: Sequence[FloatArray], quiet: FloatArray, weights: Sequence[FloatArray]
 ) -> FloatArray:
-    """Contrast [dB] of peak amplitudes: the weakest target to the loudest quiet point.
+    """Return the contrast (...) [dB] of peak amplitudes: weakest target to loudest quiet point.
 
-    A target counts by the mean over its points, by weights (p,) each. targets (..., p) each, quiet
-    (..., q) -> (...).
+    targets: amplitudes (..., p) of each, which counts by the mean with its weights (p,); quiet:
+    amplitudes (..., q) at quiet points.
     """
     means = [target @ weight for target, weight in zip(targets, weights, strict=True)]
     return decibels(np.minimum.reduce(means) / quiet.max(axis=-1))
@@ -327,7 +327,7 @@ def mean_level_db_sl(
     weights: FloatArray,
     threshold: str = DEFAULT_THRESHOLD,
 ) -> float:
-    """Level [dB SL] over a fingertip: mean over its points of amplitude to threshold.
+    """Return the level [dB SL] over a fingertip: mean over its points of amplitude to threshold.
 
     frequencies (f,) [Hz], amplitudes (f, p) [m/s²], weights (p,) of the points; threshold: name of
     the set. Raises InputError for frequencies without data.
@@ -339,9 +339,9 @@ def mean_level_db_sl(
 def over_threshold(
     samples: FloatArray, sample_rate: float, threshold: str = DEFAULT_THRESHOLD
 ) -> FloatArray:
-    """What is felt of samples (n, p) [m/s²] at a rate [Hz], each frequency over its threshold.
+    """Divide each frequency of samples (n, p) [m/s²] at a rate [Hz] by its threshold.
 
-    Beyond the data of a set its last threshold is taken.
+    Only of their felt part. Beyond the data of a set its last threshold is taken.
     """
     count, known = len(samples), _tabulated(threshold)[0]
     frequencies = np.clip(np.fft.rfftfreq(2 * count, 1 / sample_rate), known[0], known[-1])
@@ -356,9 +356,10 @@ _HALF_LENGTH = 0.002  # s; of the filter: 0.5 % up to 850 Hz, 40 dB from 1.65 kH
 
 
 def felt_part(samples: FloatArray, sample_rate: float) -> FloatArray:
-    """The part of samples (n, p) at a rate [Hz] that is up to 1 kHz, without delay, (n, p).
+    """Low-pass samples (n, p) at a rate [Hz] to what skin can feel, up to 1 kHz, without delay.
 
-    Before and after the samples is silence. Sampled too slowly to hold more, they stay as they are.
+    Before and after the samples is silence. Samples at too low a rate for more are returned as
+    they are.
     """
     if sample_rate <= 2 * _CUTOFF or not samples.size:
         return samples
@@ -370,7 +371,7 @@ def felt_part(samples: FloatArray, sample_rate: float) -> FloatArray:
 
 @cache
 def _kernel(sample_rate: float) -> FloatArray:
-    """A windowed sinc whose sum is 1."""
+    """Return a windowed sinc whose sum is 1."""
     count = round(_HALF_LENGTH * sample_rate)
     number = np.arange(-count, count + 1)
     window = np.hanning(len(number) + 2)[1:-1]

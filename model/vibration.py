@@ -1,21 +1,15 @@
-"""Steady vibration: what drives the plate, and how strongly it then moves where.
+"""Steady vibration of a rig's plate: excitations, maps, natural modes and discretisation errors.
 
-Physical excitation of the plate, a tone per active ERA; its peak acceleration and nulls.
+An excitation is a tone for each active ERA. ERAs at the same frequency add as complex numbers;
+between different frequencies magnitudes add (paper Eq. 28). Magnitudes added within a frequency
+would wipe out the nodal lines.
 
-ERAs at the same frequency add as complex numbers; only magnitudes of different frequencies add
-(paper Eq. 28). Magnitudes added within a frequency would wipe out the nodal lines.
-
-A map of the plate: peak acceleration on a regular raster, for any drive.
-
-Natural modes of a plate on any mesh, for any support.
-
-Discretisation error of natural frequencies and response, against a finer mesh.
-
-Without a converged response the error is estimated: of polynomials over the plate it is the sum of
-two changes of the response: by two further degrees, and where the compliance under forces that
-polynomials do not resolve is higher by 20 % and, under points, by a decade of the logarithm
-(`model.spectral.modes`). Of finite elements it is the change to polynomials over the
-plate, which are solved in a tenth of the time of elements as accurate or less (`reference_mesh`).
+Discretisation errors are changes against a finer mesh (`study_convergence`). Where there is none,
+they are estimated (`estimate_error`). For polynomials over the plate the estimate is the sum of two
+changes of the response: by two further degrees, and by a compliance under forces that polynomials
+do not resolve which is higher by 20 % and, under points, by a decade of the logarithm
+(`model.spectral.modes`). For finite elements it is the change to polynomials, which are solved in
+at most a tenth of the time of elements as accurate (`reference_mesh`).
 """
 
 import cmath
@@ -63,22 +57,22 @@ class Tone:
 
 
 Excitation: TypeAlias = Mapping[str, Tone]
-"""A tone per active ERA, by the ERA's name; an ERA that is not named is still."""
-
+"""A tone for each active ERA, by name; the base of any other ERA is at rest."""
 
 G = 9.8
 """Standard gravity as the paper rounds it [m/s²]; used only where accelerations are shown in g."""
 
 NULL_SHARE = 0.1
-"""A null is below this share of the map's maximum."""
+"""Share of a map's maximum below which there may be a null."""
 
 
 def base_amplitudes(
     excitation: Excitation, eras: Sequence[Source], *others: Excitation
 ) -> tuple[FloatArray, ComplexArray]:
-    """Distinct frequencies (f,) [Hz], and phasors of each ERA's base at them, (f, eras) [m].
+    """Return distinct frequencies (f,) [Hz] and the phasor of each ERA's base there, (f, eras) [m].
 
-    others: that play at the same time. Raises InputError where no ERA is driven, or an unknown one.
+    others: excitations that play at the same time. Raises InputError if no ERA is driven, or an
+    unknown one.
     """
     tones = [each for one in (excitation, *others) for each in one.items()]
     if not tones:
@@ -89,7 +83,7 @@ def base_amplitudes(
     for name, tone in tones:
         if name not in names:
             raise InputError(f"the rig has no ERA {name!r}; it has {', '.join(names)}")
-        phasor = cmath.rect(tone.amplitude, tone.phase)  # without a call for each
+        phasor = cmath.rect(tone.amplitude, tone.phase)  # faster than the property
         amplitudes[frequencies.index(tone.frequency), names.index(name)] += phasor
     return np.array(frequencies), amplitudes
 
@@ -100,10 +94,10 @@ def tone_fields(
     response: Callable[[FloatArray], ComplexArray],
     *others: Excitation,
 ) -> tuple[FloatArray, ComplexArray]:
-    """Complex acceleration [m/s²] at each distinct frequency: frequencies (f,) [Hz], field (f, p).
+    """Return distinct frequencies (f,) [Hz] and the complex acceleration at each, (f, p) [m/s²].
 
-    response: frequencies (f,) -> acceleration of each ERA at full stroke (f, eras, p); others:
-    excitations that play at the same time.
+    response: takes frequencies (f,), returns the acceleration (f, eras, p) by each ERA at full
+    stroke; others: excitations that play at the same time.
     """
     frequencies, amplitudes = base_amplitudes(excitation, eras, *others)
     weights = amplitudes / np.array([era.full_level for era in eras])
@@ -111,12 +105,12 @@ def tone_fields(
 
 
 def peak_acceleration(amplitudes: FloatArray) -> FloatArray:
-    """Peak acceleration over time (p,) [m/s²] from amplitudes per frequency (f, p): their sum."""
+    """Return the peak acceleration over time (p,), the sum of amplitudes per frequency (f, p)."""
     return np.asarray(amplitudes.sum(axis=0))
 
 
 def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
-    """Positions [m] (n, 2) of the nulls of a map (len(y), len(x)): low local minima.
+    """Return the positions (n, 2) [m] of nulls in a map (len(y), len(x)): low local minima.
 
     A curve of nulls shows as the lowest points along it.
     """
@@ -128,29 +122,30 @@ def find_nulls(x: FloatArray, y: FloatArray, peak: FloatArray) -> FloatArray:
 
 
 MAX_POINTS = 1_000_000
-"""More would be finer than any screen, at some hundred bytes of memory each."""
+"""Most points of a map: more are finer than any screen, and take some hundred bytes each."""
 
-_AT_ONCE = 10_000  # points that are solved together, at some kilobytes each
+_BATCH = 10_000  # points that are solved together, at some kilobytes each
 
 
 @dataclass(frozen=True)
 class PlateMap:
-    """Peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]: peak (ny, nx), and its nulls.
-
-    nulls: positions [m] (n, 2); frequencies (f,) [Hz] and field (f, ny, nx): the complex
-    acceleration [m/s²] at each, of which the peak is the sum of magnitudes. Phases are those of
-    exp(+i omega t), as a tone's.
-    """
+    """Acceleration on a regular raster over the plate."""
 
     x: FloatArray
+    """Raster (nx,) along the length [m]."""
     y: FloatArray
+    """Raster (ny,) along the width [m]."""
     peak: FloatArray
+    """Peak acceleration (ny, nx) [m/s²], the sum of magnitudes of `field`."""
     nulls: FloatArray
+    """Positions (n, 2) of nulls [m]."""
     frequencies: FloatArray
+    """Frequencies (f,) [Hz]."""
     field: ComplexArray
+    """Complex acceleration (f, ny, nx) at each frequency [m/s²], for exp(+i omega t)."""
 
     def to_frame(self) -> Any:
-        """Points and peak acceleration as a pandas DataFrame, a row a point; needs pandas."""
+        """Return points and peak acceleration as a pandas DataFrame, a row per point."""
         x, y = np.meshgrid(self.x, self.y)
         return as_frame({"x_m": x.ravel(), "y_m": y.ravel(), "peak_m_s2": self.peak.ravel()})
 
@@ -167,10 +162,10 @@ def plate_map(
     raster: tuple[int, int] | None = None,
     free: FreePlate | None = None,
 ) -> PlateMap:
-    """Solve the rig's plate for excitations at once; the raster defaults to that of the mesh.
+    """Solve the rig's plate for excitations that play together, on the mesh's raster by default.
 
-    free: the same plate where it has been solved before. Raises InputError for a raster below 2x2
-    or of millions of points, or a frequency that the mesh cannot carry.
+    free: the same plate, if it has been solved before. Raises InputError for a raster below 2x2 or
+    of millions of points, and for a frequency that the mesh cannot resolve.
     """
     mesh = rig.mesh
     columns, rows = raster or mesh.raster
@@ -187,7 +182,7 @@ def plate_map(
     def respond(driven: FloatArray) -> ComplexArray:
         highest = max(rig.limits.frequency_max, float(driven.max()))
         solved = free or solve_free_plate(rig.plate, mesh, frequency_max=highest)
-        parts = np.array_split(points, 1 + len(points) // _AT_ONCE)
+        parts = np.array_split(points, 1 + len(points) // _BATCH)
         found = [solved.acceleration(rig.eras, driven, part, loads=rig.masses) for part in parts]
         return np.concatenate(found, axis=2)
 
@@ -199,31 +194,22 @@ def plate_map(
 
 @dataclass(frozen=True, eq=False)
 class NaturalModes:
-    """Undamped modes: frequencies (n,) [Hz], ascending, and shapes by `at`.
-
-    basis: functions at points (p, m), of which the modes are columns of coordinates (m, n); mesh:
-    that they were solved on.
-    """
+    """Undamped natural modes of a plate."""
 
     frequencies: FloatArray
+    """Natural frequencies (n,) [Hz], ascending."""
     basis: Callable[[FloatArray], Any]
+    """Returns m functions at points (p, m)."""
     coordinates: FloatArray
+    """Each mode's coordinates (m, n) in these functions."""
     mesh: PlateMesh
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points (p, 2) [m], (p, n) [1/sqrt(kg)]."""
+        """Return the mode shapes (p, n) [1/sqrt(kg)] at points (p, 2) [m]."""
         return np.asarray(self.basis(points) @ self.coordinates)
 
-    def only(self, chosen: slice) -> "NaturalModes":
-        """Some of them."""
-        return replace(
-            self,
-            frequencies=self.frequencies[chosen],
-            coordinates=self.coordinates[:, chosen],
-        )
 
-
-_BEYOND = 4.0  # times what a mesh resolves: coarse ones are compared with others, too
+_BEYOND = 4.0  # factor on what a mesh resolves, since coarse ones are compared with others
 
 
 def natural_modes(
@@ -234,12 +220,11 @@ def natural_modes(
     mesh: PlateMesh | None = None,
     free: FreePlate | None = None,
 ) -> NaturalModes:
-    """Solve for the lowest modes of a rig, on a mesh, by default its own.
+    """Solve for the lowest modes of a rig on a mesh, by default its own.
 
-    support: free (elastic modes only), eras or simply-supported, for which polynomials over the
-    plate give way to finite elements; free: its plate where it has been solved on the mesh. Raises
-    InputError for a count below 1 or above what the mesh has, and for a simply supported plate of
-    layers.
+    support: free (elastic modes only), eras, or simply-supported, which is solved by finite
+    elements; free: the rig's plate, if it has been solved on the mesh. Raises InputError for a
+    count below 1 or above what the mesh has, and for a simply supported plate of layers.
     """
     if count < 1:
         raise InputError(f"modes must be 1 or more, got {count}")
@@ -250,7 +235,7 @@ def natural_modes(
     if support == "eras":
         attached += rig.eras
     gap = rig.plate.air_gap
-    # Air sealed in resists motion up and down; it only flows to and fro under tilts.
+    # Air that is sealed in resists motion up and down; under tilts it only flows to and fro.
     rigid = RIGID_BODY_MODES - (gap is not None and gap.closed) if support == "free" else 0
     highest = rig.limits.frequency_max
     while True:
@@ -265,11 +250,16 @@ def natural_modes(
                 "or a finer mesh"
             )
         highest, free = 1.5 * highest, None
-    return modes.only(slice(rigid, rigid + count))
+    chosen_modes = slice(rigid, rigid + count)
+    return replace(
+        modes,
+        frequencies=modes.frequencies[chosen_modes],
+        coordinates=modes.coordinates[:, chosen_modes],
+    )
 
 
 def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalModes:
-    """All modes of the undamped plate with attachments, of the truncated ones some mixtures."""
+    """Solve all modes of the undamped plate with attachments; the highest ones are mixtures."""
     places = footprints_of(attached)
     reduced = reduce_free_plate(free, places)
     _, (M, _, K) = on_springs(reduced, [each.in_time for each in attached], reduced.at(places))
@@ -279,7 +269,7 @@ def _modes_with(free: FreePlate, attached: list[Source | PointLoad]) -> NaturalM
 
 
 def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
-    """Modes of finite elements, whose shapes are those of the nodes."""
+    """Solve modes of finite elements, whose shapes are given at the nodes."""
     if rig.plate.is_layered:
         raise InputError(
             "support must be free or eras for a plate of layers or with an air gap, got "
@@ -293,12 +283,13 @@ def _simply_supported(rig: Rig, count: int, mesh: PlateMesh) -> NaturalModes:
 
 
 MAP_FREQUENCIES = (110.0, 250.0)
-"""Where the founding paper shows maps [Hz]."""
+"""Frequencies of the founding paper's maps [Hz]."""
 
 MODE_COUNT = 12
+"""Number of modes that are compared."""
 
 MOVED = 0.1e-3
-"""How far an ERA may be from where it should be [m]; few are mounted better."""
+"""Distance [m] of an ERA from its nominal place; few are mounted better."""
 
 FOOT = 5e-3
 """Radius of a foot [m] that a point stands for."""
@@ -318,40 +309,36 @@ _RASTER = (49, 37)
 
 @dataclass(frozen=True)
 class MeshError:
-    """Discretisation error of a mesh, relative to the reference.
-
-    frequency: of the natural frequencies that are compared, signed, (n,); response: of the
-    acceleration field at each frequency, relative L2 over the plate, the worst driven ERA, (f,);
-    estimate: of that error, without the reference, of polynomials only.
-    """
+    """Discretisation error of a mesh, relative to the reference."""
 
     mesh: PlateMesh
     frequency: FloatArray
+    """Signed error of the natural frequencies that are compared (n,)."""
     response: FloatArray
+    """Error of the acceleration field at each frequency (f,): relative L2, worst driven ERA."""
     estimate: FloatArray | None
+    """Estimate of that error without the reference, for polynomials only."""
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """Errors of several meshes against a reference mesh, response at f frequencies.
-
-    natural_frequencies: the lowest on the ERAs [Hz] without unsupported motion, (n,). For
-    comparison, by how much the response changes, as `MeshError.response`, where every ERA stands
-    MOVED nearer to the middle, and where it stands on a disc FOOT wider in radius.
-    """
+    """Errors of several meshes against a reference mesh, response at f frequencies."""
 
     reference: PlateMesh
     natural_frequencies: FloatArray
+    """The lowest natural frequencies (n,) on the ERAs [Hz], without unsupported motion."""
     errors: tuple[MeshError, ...]
     by_place: FloatArray
+    """For comparison, change of the response (f,) if every ERA is MOVED nearer to the middle."""
     by_foot: FloatArray
+    """For comparison, change of the response (f,) if every ERA's foot is wider by FOOT."""
 
 
 def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
     """List four MITC4 meshes, `mesh: auto`, one of Q5 with strips, and the rig's own.
 
-    For a plate of layers or with air behind it, which are solved in polynomials only, three degrees
-    in place of meshes of elements.
+    For a plate of layers or with air behind it, which is solved in polynomials only, there are
+    three degrees in place of meshes of elements.
     """
     plate, high = rig.plate, rig.limits.frequency_max
     stiffness = rig.largest_stiffness
@@ -368,7 +355,7 @@ def meshes_to_compare(rig: Rig) -> tuple[PlateMesh, ...]:
 
 
 def default_frequencies(rig: Rig) -> FloatArray:
-    """Those of the paper's maps [Hz] as far as they are within the rig's limit, else the limit."""
+    """Return the frequencies of the paper's maps [Hz] within the rig's limit, else the limit."""
     high = rig.limits.frequency_max
     within = [frequency for frequency in MAP_FREQUENCIES if frequency <= high]
     return np.array(within or [high])
@@ -381,10 +368,11 @@ def study_convergence(
     frequencies: Sequence[float] | FloatArray,
     progress: Progress = unseen,
 ) -> Convergence:
-    """Solve a rig on each mesh and on the reference.
+    """Solve a rig on several meshes and compare them with a reference.
 
-    frequencies (f,) [Hz] up to the rig's limit. Raises InputError for those that a mesh cannot
-    resolve. progress is called with the number of solved meshes, the reference first, and of all.
+    frequencies (f,) [Hz] up to the rig's limit; progress: called with the number of solved meshes,
+    the reference first, and their total. Raises InputError for frequencies that a mesh cannot
+    resolve.
     """
     high = rig.limits.frequency_max
     checked, sides = np.asarray(frequencies, dtype=float), (rig.plate.length, rig.plate.width)
@@ -416,12 +404,18 @@ def study_convergence(
     accurate = rig.mesh if rig.plate.is_layered else Mesh.accurate(rig.plate, frequency_max=high)
     plain = _solved(rig, accurate)
     before = response(plain, rig.eras)
-    by_place, by_foot = (
-        _relative_error(response(plain, eras), before).max(axis=1)
-        for eras in (
-            [_nearer_the_middle(era, rig.plate) for era in rig.eras],
-            [replace(era, foot=era.foot + FOOT) for era in rig.eras],
+    length, width = sides
+    nearer = [
+        replace(
+            era,
+            x=era.x + MOVED * float(np.sign(length / 2 - era.x)),
+            y=era.y + MOVED * float(np.sign(width / 2 - era.y)),
         )
+        for era in rig.eras
+    ]
+    wider = [replace(era, foot=era.foot + FOOT) for era in rig.eras]
+    by_place, by_foot = (
+        _relative_error(response(plain, eras), before).max(axis=1) for eras in (nearer, wider)
     )
     return Convergence(
         reference.mesh,
@@ -433,22 +427,13 @@ def study_convergence(
 
 
 def _relative_error(found: ComplexArray, exact: ComplexArray) -> FloatArray:
-    """Of fields over points (f, eras, points), relative L2, (f, eras)."""
+    """Return the relative L2 error (f, eras) of fields (f, eras, points)."""
     size = np.linalg.norm(exact, axis=2)
     return np.asarray(np.linalg.norm(found - exact, axis=2) / size)
 
 
-def _nearer_the_middle(era: Actuator, plate: Plate) -> Actuator:
-    """An ERA moved by MOVED along both sides."""
-    x, y = (
-        at + MOVED * np.sign(side / 2 - at)
-        for at, side in ((era.x, plate.length), (era.y, plate.width))
-    )
-    return replace(era, x=float(x), y=float(y))
-
-
 def _reference(rig: Rig) -> PlateMesh:
-    """The mesh that others are compared with: of elements, or of polynomials for layers."""
+    """Return the mesh that others are compared with: elements, or polynomials for layers."""
     high = rig.limits.frequency_max
     if not rig.plate.is_layered:
         return reference_mesh(rig.plate, frequency_max=high)
@@ -465,12 +450,12 @@ def _solved(rig: Rig, mesh: PlateMesh) -> FreePlate:
     return solve_free_plate(rig.plate, mesh, frequency_max=rig.limits.frequency_max)
 
 
-_MAX_FIELDS = 1_000_000  # values at once, of 16 bytes each
+_MAX_VALUES = 1_000_000  # of fields at once, 16 bytes each
 _ACCURACY = 0.005  # of polynomials before their two further degrees
 
 
 def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
-    """Half as many elements again along both sides as an accurate mesh, in strips half as wide."""
+    """Return an accurate mesh with 1.5 times as many elements per side, strips half as wide."""
     accurate = Mesh.accurate(plate, frequency_max=frequency_max)
     nx, ny = (math.ceil(1.5 * count) for count in (accurate.nx, accurate.ny))
     return replace(accurate, nx=nx, ny=ny, strip=accurate.strip / 2)
@@ -479,10 +464,10 @@ def reference_mesh(plate: Plate, *, frequency_max: float) -> Mesh:
 def finer_mesh(
     plate: Plate, mesh: PlateMesh, *, frequency_max: float, stiffness: float = 0.0
 ) -> PlateMesh:
-    """The mesh whose response a mesh is compared with, accurate up to a frequency [Hz].
+    """Return the mesh for the comparison of a mesh's response, accurate up to a frequency [Hz].
 
-    Two further degrees of polynomials; for elements those of polynomials, or elements where there
-    would be too many. stiffness [N/m]: of the stiffest ERA.
+    For polynomials it has two further degrees; for elements it is one of polynomials, or of
+    elements if there were too many of these. stiffness [N/m]: of the stiffest ERA.
     """
     if isinstance(mesh, SpectralMesh):
         return mesh.finer()
@@ -503,17 +488,16 @@ def estimate_error(
     *,
     loads: Sequence[PointLoad] = (),
 ) -> FloatArray:
-    """Estimated error of the acceleration over points (p, 2) [m], relative L2, (f, eras).
+    """Estimate the error of the acceleration over points (p, 2) [m], relative L2, (f, eras).
 
     finer: of `finer_mesh`; frequencies (f,) [Hz]. Each ERA is driven alone.
     """
-
     plates = [solve_free_plate(free.plate, finer, frequency_max=free.frequency_max), free]
     if isinstance(free.modes, SpectralModes):
         plates.append(replace(free, modes=free.modes.softer()))
     squares = np.zeros((len(plates), len(frequencies), len(eras)))
     # A few points at a time: whole fields of sixteen ERAs take a gigabyte.
-    parts = math.ceil(len(frequencies) * len(eras) * len(points) / _MAX_FIELDS)
+    parts = math.ceil(len(frequencies) * len(eras) * len(points) / _MAX_VALUES)
     for few in np.array_split(points, parts):
         exact, own, *others = (
             of.acceleration(eras, frequencies, few, loads=loads) for of in plates

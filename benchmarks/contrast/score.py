@@ -131,11 +131,11 @@ def on_held_out(
         of=table,
         contact_count=len(contacts.contacts),
     )
-    felt = felt_on(table, contacts.placement, excitation, plates)
-    assert felt.contrast is not None
+    level, contrast = felt_on(table, contacts.placement, excitation, plates)
+    assert contrast is not None
     return (
-        float(np.percentile(decibels(felt.contrast), 10)),
-        float(np.percentile(decibels(felt.level), 10)),
+        float(np.percentile(decibels(contrast), 10)),
+        float(np.percentile(decibels(level), 10)),
     )
 
 

@@ -1,11 +1,9 @@
-"""The library of kernels for this processor: of a wheel, or compiled at first use.
+"""The kernels in C: their structures, and the library for this processor.
 
-Structures and arrays as the kernels in C take them, whose headers say what is in them.
-
-Libraries compiled by the machine's compiler at first use, kept in the user's cache folder.
-
-They run within this process. So one is loaded only if no other user could have written it, and if
-it is whole: the SHA-256 of its content is in a file beside it.
+`kernels` loads the library from the wheel, or compiles it at first use by the machine's compiler
+and keeps it in the user's cache folder. It runs within this process, so it is loaded only if no
+other user could have written it and if it is complete: the SHA-256 of its content is in a file
+beside it. The structures are those of the kernels' headers, which describe their fields.
 """
 
 import ctypes
@@ -38,11 +36,11 @@ from model.errors import InputError
 FOUND, NO_MEMORY = 0, -1
 
 _TYPES = {"i": np.int32, "f": np.float32, "c": np.complex64}
-"""Of values that are integers, real and complex."""
+"""Types of arrays for kernels, by numpy's kind: integers, real and complex numbers."""
 
 
 def _fields(**names: str) -> list[tuple[str, Any]]:
-    """Names of fields by the first letter of their kind: integers, floats, doubles, pointers."""
+    """Make fields from names by kind: i: integers, f: floats, d: doubles, p: pointers."""
     kinds = {"i": c_int, "f": c_float, "d": c_double, "p": c_void_p}
     return [(name, kinds[kind[0]]) for kind, all_ in names.items() for name in all_.split()]
 
@@ -53,22 +51,22 @@ class Structure(ctypes.Structure):
     arrays: list[NDArray[Any]]
 
     def point(self, **given: NDArray[Any] | None) -> None:
-        """Point to arrays as kernels read them; to none where there is none."""
+        """Set pointers to arrays, which are converted for kernels; None leaves a null pointer."""
         self.arrays = [*getattr(self, "arrays", [])]
         for name, array in given.items():
             if array is not None:
-                kept: NDArray[Any] = np.ascontiguousarray(array, dtype=_TYPES[array.dtype.kind])
+                kept = as_given(array)
                 self.arrays.append(kept)
                 setattr(self, name, kept.ctypes.data)
 
 
 def as_given(values: NDArray[Any]) -> NDArray[Any]:
-    """Values as a kernel reads them: single precision, or integers of 32 bits, one by one."""
+    """Convert values for kernels: contiguous, in single precision or integers of 32 bits."""
     return np.ascontiguousarray(values, dtype=_TYPES[values.dtype.kind])
 
 
 class TouchedPlates(Structure):
-    """`plates`: the plate on its ERAs, with fingers on it."""
+    """The plate on its ERAs with fingers on it: `plates` in C."""
 
     _fields_ = [
         *_fields(i="n b k r t off rows lanes kept", f="load_std"),
@@ -78,7 +76,7 @@ class TouchedPlates(Structure):
 
 
 class PointGroups(Structure):
-    """`grouped`: groups of points whose expected powers are wanted."""
+    """Groups of points whose expected powers are wanted: `grouped` in C."""
 
     _fields_ = [
         *_fields(i="groups p fine others", f="gain_variance ridge"),
@@ -87,7 +85,7 @@ class PointGroups(Structure):
 
 
 class PlateDraws(Structure):
-    """`draws`: plates within the uncertainty."""
+    """Plates within the uncertainty: `draws` in C."""
 
     _fields_ = _fields(
         i="count bases nodes width first_base first_node amplifiers",
@@ -96,19 +94,19 @@ class PlateDraws(Structure):
 
 
 class Sensors(Structure):
-    """`sensors`: points of all fingers."""
+    """Points of all fingers: `sensors` in C."""
 
     _fields_ = _fields(i="points", p="rows weights error threshold")
 
 
 class WeightSearch(Structure):
-    """`method`: weights that are tried at each frequency."""
+    """How weights are computed at each frequency: `method` in C."""
 
     _fields_ = _fields(i="steps limited", f="variance gain reserve growth most")
 
 
 class Rules(Structure):
-    """`rules`: how tones are chosen."""
+    """How tones are chosen: `rules` in C."""
 
     _fields_ = [
         *_fields(i="kept missing max_by_point pruning_step"),
@@ -124,7 +122,7 @@ class Rules(Structure):
 
 
 class GivenRaster(Structure):
-    """`raster`: shapes of the plate, and how they are read under a fingertip."""
+    """Shapes of the plate, and how they are read under a fingertip: `raster` in C."""
 
     _fields_ = _fields(
         i="nx ny side_x side_y r few fine",
@@ -134,7 +132,7 @@ class GivenRaster(Structure):
 
 
 class GivenQuestion(Structure):
-    """`question`: fingers, and what each is to feel; what is found first is not named."""
+    """Fingers, and what each is to feel: `question` in C, without its trailing results."""
 
     _fields_ = [
         *_fields(i="contents bands fingers quiet_count candidates combinations", f="apart"),
@@ -143,13 +141,13 @@ class GivenQuestion(Structure):
 
 
 class FoundTones(Structure):
-    """`answered`: tones, and what is felt of them."""
+    """Tones, and what is felt of them: `answered` in C."""
 
     _fields_ = _fields(i="is_apart", p="rows figures")
 
 
 class Shaping(Structure):
-    """`shaping`: how knots are found."""
+    """How knots are computed: `shaping` in C."""
 
     _fields_ = _fields(
         i="samples steps knots ending_knots iterations", f="ridge penalty relaxation", p="rise"
@@ -157,7 +155,7 @@ class Shaping(Structure):
 
 
 class ShapedTone(Structure):
-    """`shaped_tone`: a tone whose onset or ending is shaped."""
+    """A tone whose onset or ending is shaped: `shaped_tone` in C."""
 
     _fields_ = [
         *_fields(i="eras targets rows combinations", f="gain_variance weight"),
@@ -173,7 +171,10 @@ _TIMEOUT = 120.0  # s
 def compile_library(
     path: Path, sources: Iterable[Path], *, flags: Sequence[str], what: str
 ) -> None:
-    """Compile C sources to a shared library; what: its name in messages. Raises InputError."""
+    """Compile C sources to a shared library; raises InputError.
+
+    what: its name in messages.
+    """
     compiler = os.environ.get("CC") or next(filter(shutil.which, _COMPILERS), None)
     if compiler is None or not shutil.which(compiler.split()[0]):
         raise InputError(
@@ -181,12 +182,14 @@ def compile_library(
             f"({compiler or ', '.join(_COMPILERS)}); install one (Debian: apt install gcc "
             "libc6-dev; macOS: xcode-select --install)"
         )
-    # Of its own, since threads and processes may compile the same at once.
+    # In a folder of its own, since threads and processes may compile the same library at once.
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
         made = Path(folder) / path.name
         _compile(made, compiler.split(), sources, flags=flags, what=what)
-        with made.open("r+b") as file:  # Windows writes what is open for writing alone to the disk
-            os.fsync(file.fileno())  # a name must not outlive a power failure without its content
+        with made.open("r+b") as file:  # Windows flushes only files that are open for writing
+            os.fsync(
+                file.fileno()
+            )  # after a power failure the name must not be without its content
         made.replace(path)
 
 
@@ -236,10 +239,10 @@ def kept_library(
     flags: Sequence[str],
     what: str,
 ) -> ctypes.CDLL:
-    """Load the library of C sources, compiled where the cache holds none that is safe and whole.
+    """Load the library of C sources; compile it if the cache has none that is safe and complete.
 
-    Where the cache cannot be used it is compiled to a folder of its own, for this process only.
-    what: its name in messages. Raises InputError.
+    If the cache cannot be used, it is compiled to a temporary folder, for this process only. what:
+    its name in messages. Raises InputError.
     """
     sources = list(sources)
     file = f"{name}-{_libc()}-{_digest([*sources, *headers], flags)}.so"
@@ -264,10 +267,10 @@ def kept_library(
 
 
 def check_own(path: Path, *, sticky: bool = False) -> None:
-    """Raise PermissionError if another user but root could have written a file or folder.
+    """Raise PermissionError if a user other than this one and root could write a file or folder.
 
-    sticky: whether others may write to a folder with the sticky bit, where they cannot rename what
-    is not theirs.
+    sticky: whether others may write to a folder with the sticky bit, where they cannot rename the
+    files of others.
     """
     if not hasattr(os, "geteuid"):  # Windows: its cache folders are the user's own
         return
@@ -283,14 +286,14 @@ def check_own(path: Path, *, sticky: bool = False) -> None:
 
 
 def _own_folder(folder: Path) -> Path:
-    """Make a folder, checked with its parents and all links on its way; returns it without these.
+    """Make a folder and check it with its parents and all links on the way; return it resolved.
 
-    Who owns a link, or writes where it is, could lead to a library that the user only keeps.
+    The owner of a link, or of the folder that it is in, could point it to another library.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     check_own(folder)
     ways = [folder.absolute()]
-    for way in ways:  # and where each link leads to
+    for way in ways:  # grows by the targets of links
         for each in (way, *way.parents):
             check_own(each, sticky=True)
             if each.is_symlink():
@@ -299,7 +302,7 @@ def _own_folder(folder: Path) -> Path:
 
 
 def _load(path: Path) -> ctypes.CDLL:
-    """Load a library; raises OSError where it is not safe, not whole or not there."""
+    """Load a library; raises OSError if it is not safe, not complete or does not exist."""
     checksum = _checksum_file(path)
     for each in (path, checksum):
         check_own(each)
@@ -335,12 +338,12 @@ def _checksum_file(path: Path) -> Path:
 
 
 def _libc() -> str:
-    """The C library and its version, where it has one: `glibc2.36`."""
+    """Return the C library and its version, if known: `glibc2.36`."""
     return "".join(platform.libc_ver()) or str(sysconfig.get_config_var("HOST_GNU_TYPE"))
 
 
 def _digest(files: Iterable[Path], flags: Sequence[str]) -> str:
-    """Sixteen digits that change with the files, the flags, CC and the architecture."""
+    """Return sixteen digits that depend on the files, the flags, CC and the architecture."""
     made_of = hashlib.sha256(repr((*flags, os.environ.get("CC"), sys.platform)).encode())
     made_of.update(platform.machine().encode())
     for path in sorted(files):
@@ -357,18 +360,17 @@ _WHAT = "the library of kernels"
 
 @dataclass(frozen=True)
 class Version:
-    """Kernels for processors with some features, by numpy's names, each with a compiler's flag.
-
-    lanes: cases at once, as many as fill one register of the processor; more are many times slower.
-    """
+    """A version of the kernels for processors with some features."""
 
     name: str
     lanes: int
+    """Cases at once: as many as fill a register of the processor; more are many times slower."""
     features: Mapping[str, str]
+    """Compiler flag of each feature, by numpy's name of it."""
 
     @property
     def file(self) -> str:
-        """Name of the library in a wheel of one platform."""
+        """Name of the library in a wheel."""
         return f"kernels-{self.name}.so"
 
     @property
@@ -384,26 +386,26 @@ _OF_X86 = (Version("avx512", 16, _AVX512), Version("avx2", 8, _AVX2), _PLAIN)
 
 
 def versions() -> tuple[Version, ...]:
-    """Those for processors of this architecture, the fastest first.
+    """Return the versions for this architecture, the fastest first.
 
-    On Windows without AVX: gcc does not align its registers on the stack there (GCC bug 54412).
+    Without AVX on Windows, where gcc does not align its registers on the stack (GCC bug 54412).
     """
     is_x86 = platform.machine().lower() in ("x86_64", "amd64")
     return _OF_X86 if is_x86 and os.name == "posix" else (_PLAIN,)
 
 
 def processor_features() -> AbstractSet[str]:
-    """What numpy knows of this processor; none where it does not say."""
+    """Return the features of this processor by numpy's names; empty if numpy does not tell."""
     try:
         known = import_module("numpy._core._multiarray_umath").__cpu_features__
-    except (ImportError, AttributeError):  # of no public interface
+    except (ImportError, AttributeError):  # not a public interface
         return frozenset()
     return {name for name, has in known.items() if has}
 
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """The library, and the cases that its kernels take at once."""
+    """The library, and the number of cases that its kernels take at once."""
 
     library: ctypes.CDLL
     lanes: int
@@ -411,12 +413,15 @@ class Kernels:
 
 @cache
 def kernels() -> Kernels | None:
-    """Those for this processor; None where there is no compiler, and numpy has to do."""
+    """Load the kernels for this processor; None without a compiler, where numpy is used instead."""
     has = processor_features()
     version = next(each for each in versions() if each.features.keys() <= has)
     own = _HERE / version.file
     try:
-        library = ctypes.CDLL(str(own)) if own.exists() else _compiled(version)
+        if own.exists():
+            return Kernels(ctypes.CDLL(str(own)), version.lanes)
+        name = f"kernels-{version.name}"
+        library = kept_library(name, _SOURCES, _HEADERS, flags=version.flags, what=_WHAT)
         return Kernels(library, version.lanes)
     except (InputError, OSError) as error:
         _logger.warning("%s: %s", WITHOUT_KERNELS, error)
@@ -424,34 +429,30 @@ def kernels() -> Kernels | None:
 
 
 WITHOUT_KERNELS = "answers take 6 to 19 times as long without kernels in C"
-"""Of steady ones, from twenty fingers that share to one, beside 0 to 6 quiet ones on four and on
-twelve ERAs, by both in turn (python -m benchmarks.contents --sharing); clicks take 1.3 times."""
+"""Measured for steady vibrations of one finger to twenty that share, beside 0 to 6 quiet ones.
+
+On four and on twelve ERAs (python -m benchmarks.contents --sharing); clicks take 1.3 times as long.
+"""
 
 
 def why_slow() -> str | None:
-    """How much slower this machine is for want of a compiler, in words; None where it is not."""
+    """Return in words how much slower this machine is without a compiler, None if it has one."""
     return None if kernels() else f"{WITHOUT_KERNELS}; install a C compiler, such as gcc or clang"
 
 
 def run(kernel: Callable[..., int], *given: Any) -> int:
-    """Run a kernel on structures and other arguments; its status. Raises MemoryError."""
-    arguments = []
-    for each in given:
-        arguments.append(ctypes.byref(each) if isinstance(each, ctypes.Structure) else each)
-    status = kernel(*arguments)
+    """Run a kernel on structures and other arguments and return its status; raises MemoryError."""
+    status = kernel(
+        *[ctypes.byref(each) if isinstance(each, ctypes.Structure) else each for each in given]
+    )
     if status == NO_MEMORY:
         raise MemoryError("kernels could not get the memory that an answer takes")
     return status
 
 
 def compile_kernels(folder: Path) -> list[Path]:
-    """Compile all versions for this architecture to files in a folder. Raises InputError."""
+    """Compile all versions for this architecture to files in a folder; raises InputError."""
     paths = [folder / version.file for version in versions()]
     for path, version in zip(paths, versions(), strict=True):
         compile_library(path, _SOURCES, flags=version.flags, what=_WHAT)
     return paths
-
-
-def _compiled(version: Version) -> ctypes.CDLL:
-    name = f"kernels-{version.name}"
-    return kept_library(name, _SOURCES, _HEADERS, flags=version.flags, what=_WHAT)

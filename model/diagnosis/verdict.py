@@ -556,7 +556,7 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
             answer = query(table, placed)
             none = Uncertainty.none()
             exact = draw_plates(rng, none, of=there, count=1, contact_count=fingers)
-            felt = felt_on(there, placed, answer.layers[0].excitation, exact).contrast
+            _, felt = felt_on(there, placed, answer.layers[0].excitation, exact)
             promised = answer.fingers[0].promised_contrast_db
             assert felt is not None  # noqa: S101  there are quiet fingers
             assert promised is not None  # noqa: S101

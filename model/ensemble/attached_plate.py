@@ -1,38 +1,36 @@
-"""The reduced plate at its drive frequencies, with what is fixed to it and what may be wrong.
+"""The plate with its attachments, at drive frequencies and possible thicknesses, without fingers.
 
-Plates of several thicknesses have their ERAs and masses eliminated, once for each table.
+`AttachedPlate` has the reduced plate, its ERAs and masses, and their uncertainty. `PlateOnEras` has
+these eliminated, for each thickness and once for a table.
 
 Free plate in reduced coordinates: A(x, y) = phi_x diag(g) phi_y^T with g = 1 / (s lambda - w²),
-s lambda = (1 + i eta) lambda + i loss. A plate thicker by a factor has modal masses larger by it
-and frequencies higher by it (as in `model.reduction.free_plate`); another modulus moves frequencies
-alone. Of one h times as thick, whose frequencies are q times as high
+s lambda = (1 + i eta) lambda + i loss. A plate that is thicker by a factor has modal masses larger
+by this factor and frequencies higher by it (as in `model.reduction.free_plate`); another modulus
+changes the frequencies alone. With h times the thickness, and frequencies q times as high,
 
     g = 1 / (h (q² s lambda - w²)),    dg / d ln loss = -i h q² Im(s lambda) g².
 
-Plates are drawn along one axis, of q; h is what is likely of a plate of that q.
+Plates are drawn along one axis, that of q; h is the expected value for a plate with that q.
 
-Elimination. Attachments b, the ERAs first, of dynamic stiffness Z:
+With dynamic stiffness Z of the attachments b, ERAs first, elimination gives
 
-    K = (1 + Z A)^-1,  T = -w² K^T phi g,  Y = -(Z + Z A Z) / w⁴
+    K = (1 + Z A)^-1,  T = -w² K^T phi g,  Y = -(Z + Z A Z) / w⁴.
 
 T is the acceleration of the reduced coordinates by a force at each attachment of the plate on its
 ERAs, whose receptance between places x and y is phi_x g phi_y^T + (T phi_x)^T Y T phi_y: the
-attachments never appear again.
+attachments do not appear again.
 
-Thicknesses are solved exactly: where modes are close they move several past a tone. Within their
-uncertainty the other parameters change the response nearly in proportion.
+Thicknesses are solved exactly: modes that are close may move past a tone. Within their uncertainty
+the other parameters change the response nearly in proportion.
 
-Places of sources that are off: what counts as errors of their stiffnesses, and what of fields.
-
-A source acts with its force F on a plate that moves by w, F = F_0 - Z w at drives of all sources,
-at other shapes, phi + d, and is moved otherwise: a force F d - phi Z d w, a couple and a force at
-its own place.
-
-Of an ERA, which is stiff, both count as an error of its stiffness that changes the fields of all as
-much. An exciter is a force of its own drive, and such an error would be one of its gain: at fingers
-where its field vanishes there would be none, where a couple has a field of another shape. What of
-the couple's field is that of the force counts as an error of stiffness, the rest as one of its
-field, of each finger.
+Sources may also be misplaced. A source acts with its force F on a plate that moves by w,
+F = F_0 - Z w when all sources are driven. At shapes phi + d it adds a force F d - phi Z d w: a
+couple, and a force at its own place. Of an ERA, which is stiff, both count as an error of its
+stiffness that changes the fields of all sources by as much. An exciter is a force of its own drive;
+there such an error would be one of its gain, which changes nothing at fingers where the field
+vanishes, though the field of a couple has another shape. The part of the couple's field along that
+of the force therefore counts as an error of stiffness, and the rest as an error of the source's
+field, at each finger.
 """
 
 import math
@@ -63,71 +61,41 @@ from model.structure.modal_elasticity import (
 from model.structure.plate import Plate
 
 LEAST_THICKNESS = 0.1
-"""Of plates that deviate, relative to the modelled one."""
+"""Least thickness of plates that deviate, relative to the modelled one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Mounts:
-    """b fixed attachments of a plate, n ERAs first and then masses, at frequencies (f,).
+class AttachedPlate:
+    """The plate with b fixed attachments, n ERAs first and then masses, at f frequencies.
 
-    - minus_omega2: (f,) [rad²/s²]
-    - stiffness: (f, b) dynamic stiffness of the attachments [N/m]
-    - forces: (f, n) of each ERA at full stroke [N]; strokes: (f, n) of its base [m], by which
-      errors of its spring and damper act
-    - by_stiffness: (f, s) change of the dynamic stiffness of the attachments up to the last foot
-      that deviates by one standard deviation of their stiffness, 0 of what is no foot [N/m]
-    - by_damping: (f, n) of the ERAs' by one of their damping [N/m]
+    Arrays for answers are in single precision: accelerations are within 1e-5 of their largest.
     """
 
     minus_omega2: Float32Array
+    """-w² (f,) [rad²/s²]."""
     stiffness: Complex64Array
+    """Dynamic stiffness (f, b) of the attachments [N/m]."""
     forces: Complex64Array
+    """Force (f, n) of each ERA at full stroke [N]."""
     strokes: Complex64Array
+    """Stroke (f, n) of each ERA's base [m], through which errors of its spring and damper act."""
     by_stiffness: Complex64Array
+    """Change (f, s) of `stiffness` by one standard deviation of the attachments' own [N/m].
+
+    Of the attachments up to the last foot that deviates; 0 for masses that are no feet.
+    """
     by_damping: Complex64Array
-
-
-def mounts_of(
-    eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
-) -> Mounts:
-    """ERAs and masses at w (f,) [rad/s], wherever they are.
-
-    Errors of stiffnesses by half the difference of one standard deviation to both sides: an
-    exciter's suspension is resonant. Feet deviate by `supports`.
-    """
-    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
-    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
-    feet = feet_of(masses) if uncertainty.supports else ()
-    by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
-    for number in feet:
-        by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
-    by_stiffness = np.hstack([(stiffer - softer) / 2, by_foot])
-    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
-    by_damping = math.log(uncertainty.damping) * np.array(damped).T
-    strokes = np.array([era.base(w) for era in eras]).T
-    each = attached_stiffness(w, eras, masses), drive_forces(w, eras), strokes
-    single = (part.astype(np.complex64) for part in (*each, by_stiffness, by_damping))
-    return Mounts(-(w**2).astype(np.float32), *single)
-
-
-@dataclass(frozen=True, eq=False)
-class AttachedPlate(Mounts):
-    """The plate with its attachments.
-
-    What answers read is in single precision: accelerations are within 1e-5 of their largest.
-
-    - modal: (f, r) s lambda of the coordinates [rad²/s²], with all that they lose
-    - shapes: (b, r) of the attachments
-    - omega: (f,) [rad/s]
-    - fingertip: of the rig, None for weightless ones
-    - uncertainty: of the rig's parameters
-    """
-
+    """Change (f, n) of the ERAs' dynamic stiffness by one standard deviation of damping [N/m]."""
     modal: ComplexArray
+    """s lambda (f, r) of the reduced coordinates [rad²/s²], with all losses."""
     shapes: Float32Array
+    """Mode shapes (b, r) at the attachments."""
     omega: FloatArray
+    """w (f,) [rad/s]."""
     fingertip: Fingertip | None
+    """The rig's fingertip, None for weightless ones."""
     uncertainty: Uncertainty
+    """Uncertainty of the rig's parameters."""
 
     @property
     def era_count(self) -> int:
@@ -137,10 +105,10 @@ class AttachedPlate(Mounts):
     def of_thicknesses(
         self, deviations: FloatArray, row: int
     ) -> tuple[Complex64Array, Complex64Array]:
-        """g of plates of known thicknesses at a frequency by its row, (d, r) [s²/kg].
+        """Return g of plates of several thicknesses at a row of the frequencies, (d, r) [s²/kg].
 
-        And its change by one standard deviation of the loss factor. deviations (d,): of the
-        frequencies, in standard deviations.
+        Also its change by one standard deviation of the loss factor. deviations (d,): of the
+        plates' frequencies, in standard deviations.
         """
         known = self.uncertainty
         share = (known.thickness / known.frequency) ** 2 if known.frequency > 0 else 1.0
@@ -154,9 +122,9 @@ class AttachedPlate(Mounts):
         return receptance.astype(np.complex64), by_loss.astype(np.complex64)
 
     def finger_stiffness(self, count: int, loads: Sequence[float] = ()) -> Complex64Array:
-        """Dynamic stiffness of a number of fingers [N/m], (f, count), of 0 for weightless ones.
+        """Dynamic stiffness of a number of fingers (f, count) [N/m], 0 for weightless ones.
 
-        loads (count,): of each relative to the rig's fingertip, empty for 1.
+        loads (count,): relative to the rig's fingertip, empty for 1 each.
         """
         found = np.repeat(self._finger[:, None], count, axis=1)
         if self.fingertip is not None:
@@ -166,7 +134,7 @@ class AttachedPlate(Mounts):
         return found.astype(np.complex64)
 
     def driven_less(self, shares: FloatArray) -> "AttachedPlate":
-        """The same at shares (f,) of full level."""
+        """Return the plate with ERAs at shares (f,) of full level."""
         if (shares == 1).all():
             return self
         by = shares[:, None].astype(np.float32)
@@ -174,7 +142,7 @@ class AttachedPlate(Mounts):
 
     @property
     def frequencies(self) -> FloatArray:
-        """Its frequencies [Hz], (f,)."""
+        """Frequencies (f,) [Hz]."""
         return self.omega / (2 * math.pi)
 
     @cached_property
@@ -199,15 +167,30 @@ def attach(
 ) -> AttachedPlate:
     """Attach ERAs and masses to a reduced free plate.
 
-    omega (r,) [rad/s], losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
-    frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
-    that is not known by one thickness, and does not scale with it.
+    omega (r,) [rad/s] and losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
+    frequencies (f,) [Hz]; dispersion: how omega² changes with them. Errors of an ERA's stiffness
+    are half the difference between one standard deviation up and down, since the suspension of an
+    exciter is resonant; feet deviate by `supports`. Raises InputError for a plate that does not
+    scale with one thickness.
     """
     check_scales(plate, 1 + uncertainty.thickness)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
+    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
+    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
+    feet = feet_of(masses) if uncertainty.supports else ()
+    by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
+    for number in feet:
+        by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
+    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
+    single = np.complex64
     return AttachedPlate(
-        **vars(mounts_of(eras, masses, w, uncertainty)),
+        minus_omega2=-(w**2).astype(np.float32),
+        stiffness=attached_stiffness(w, eras, masses).astype(single),
+        forces=drive_forces(w, eras).astype(single),
+        strokes=np.array([era.base(w) for era in eras]).T.astype(single),
+        by_stiffness=np.hstack([(stiffer - softer) / 2, by_foot]).astype(single),
+        by_damping=(math.log(uncertainty.damping) * np.array(damped).T).astype(single),
         modal=elasticity.stiffness(w),
         shapes=shapes.astype(np.float32),
         omega=w,
@@ -217,7 +200,7 @@ def attach(
 
 
 def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPlate:
-    """A plate at twice the frequencies, whose sources are driven by the gains of once these."""
+    """Return a plate at twice the frequencies, its sources driven by their gains at once these."""
     gains, own = (
         np.array([each.gain(factor * twice.frequencies) for each in sources]).T
         for factor in (0.5, 1.0)
@@ -226,16 +209,15 @@ def at_harmonics(twice: AttachedPlate, sources: Sequence[Source]) -> AttachedPla
     return replace(twice, forces=twice.forces * share, strokes=twice.strokes * share)
 
 
-MODELLED = 0
-THICKER, THINNER = 1, 2
-"""Thicknesses by a standard deviation from the nominal one, by index."""
+MODELLED, THICKER, THINNER = 0, 1, 2
+"""Indices of the nominal thickness, and of those by a standard deviation from it."""
 
 
 @lru_cache(maxsize=8)
 def thickness_nodes(count: int) -> FloatArray:
-    """Deviations that stand for all, in standard deviations, ascending: (count,).
+    """Return deviations (count,) that represent a normal distribution, ascending.
 
-    Means of strata of equal probability of the normal distribution, scaled to variance 1.
+    In standard deviations: means of strata of equal probability, scaled to variance 1.
     """
     normal = NormalDist()
     bounds = [normal.inv_cdf(each / count) for each in range(1, count)]
@@ -249,29 +231,27 @@ def thickness_nodes(count: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PlateOnEras:
-    """The plate on its b attachments, without fingers, at f frequencies and t thicknesses.
-
-    - plate: at the frequencies
-    - first: index of the first thickness of as many `thickness_nodes`, by their number
-    - receptance: (f, t, r) g of the free plate; by_loss: (f, t, r) its change by one standard
-      deviation of the loss factor
-    - by_force: (f, t, b, r) T [m/s²/N]; coupling: (f, t, b, b) Y
-    - moved: (f, t, b, n) displacement of the attachments by each ERA at full stroke [m]
-    """
+    """The plate on its b attachments, without fingers, at f frequencies and t thicknesses."""
 
     plate: AttachedPlate
     first: dict[int, int]
+    """Index of the first of the `thickness_nodes`, by their number."""
     receptance: Complex64Array
+    """g (f, t, r) of the free plate [s²/kg]."""
     by_loss: Complex64Array
+    """Its change (f, t, r) by one standard deviation of the loss factor."""
     by_force: Complex64Array
+    """T (f, t, b, r) [m/s²/N]."""
     coupling: Complex64Array
+    """Y (f, t, b, b)."""
     moved: Complex64Array
+    """Displacement (f, t, b, n) of the attachments by each ERA at full stroke [m]."""
 
     @classmethod
     def of(cls, plate: AttachedPlate, *node_counts: int) -> "PlateOnEras":
-        """Eliminate the attachments of a plate of so many `thickness_nodes`, several counts.
+        """Eliminate the attachments of a plate, for several numbers of `thickness_nodes`.
 
-        Where its thickness is certain there is the nominal one alone.
+        If its thickness is certain, there is only the nominal one.
         """
         deviations, first = [np.zeros(1)], {}
         if plate.uncertainty.frequency > 0:
@@ -293,7 +273,7 @@ class PlateOnEras:
 
     @property
     def fields(self) -> Complex64Array:
-        """Accelerations of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
+        """Acceleration of the reduced coordinates by each ERA at full stroke, (f, n, r)."""
         plate = self.plate
         return self.by_force[:, MODELLED, : plate.era_count] * plate.forces[:, :, None]
 
@@ -301,7 +281,7 @@ class PlateOnEras:
 def _eliminated(
     plate: AttachedPlate, row: int, receptance: Complex64Array
 ) -> tuple[Complex64Array, ...]:
-    """T, Y and motion at a row of the frequencies for plates of receptances g (t, r), (t, ...)."""
+    """Return T, Y and motion (t, ...) of plates of receptances g (t, r) at a row."""
     Z, w2, n = plate.stiffness[row], plate.minus_omega2[row], plate.era_count
     modal = plate.shapes * receptance[:, None]
     A = modal @ plate.shapes.T
@@ -316,12 +296,12 @@ def _eliminated(
 def with_places(
     on: PlateOnEras, shifts: FloatArray, gram: Float32Array, by_field: Sequence[bool]
 ) -> tuple[PlateOnEras, FloatArray]:
-    """Let the sources' places be off: the plate with larger errors of their stiffnesses.
+    """Include errors of the sources' places in a plate, as larger errors of their stiffness.
 
-    And mean square of the error of each source's field beside these [(m/s²)²], (f, n), at full
-    stroke. shifts (n, 2, r): change of the shapes at the sources, by one standard deviation along x
-    and y; gram (r, r): mean of the shapes' products where fingers rest; by_field (n,): whether
-    couples count as errors of fields. Of the modelled plate without fingers.
+    Also return the mean square (f, n) of the error of each source's field that remains beside these
+    [(m/s²)²], at full stroke, on the modelled plate without fingers. shifts (n, 2, r): change of
+    the shapes at the sources by one standard deviation along x and y; gram (r, r): mean product of
+    the shapes where fingers rest; by_field (n,): whether couples count as errors of the field.
     """
     plate, n = on.plate, on.plate.era_count
     deformed = np.eye(n) * plate.strokes[:, None] - on.moved[:, MODELLED, :n]
@@ -340,10 +320,10 @@ def with_places(
 def _by_places(
     on: PlateOnEras, row: int, shifts: FloatArray, gram: Float32Array, by_field: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Size of the change of all fields together that counts as one of stiffness, (n,) [m/s²].
+    """Return how much places that are off change all fields together, as stiffness does, (n,).
 
-    Of accelerations of the coordinates, as each source is off, at a row of the frequencies. And
-    mean square of what is left of each field, (n,).
+    In accelerations of the reduced coordinates [m/s²], at a row of the frequencies; and the mean
+    square (n,) of the error of each field that remains.
     """
     plate, n, w2 = on.plate, on.plate.era_count, on.plate.minus_omega2[row]
     g, T, Z = on.receptance[row, MODELLED], on.by_force[row, MODELLED], plate.stiffness[row]

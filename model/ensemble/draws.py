@@ -1,13 +1,13 @@
 """Fixed draws of plates within the uncertainty: exact in the thickness, else to first order.
 
-Drawn once for each number of ERAs and fingers: standard normal numbers whose mean and variance are
-made exact, so that a few draws give the percentiles of many. Those by which candidates are judged
-differ from those of the promise, which would else be flattered. Nine of ten give what is promised.
+Plates are drawn once for each number of ERAs and fingers, by standard normal numbers whose mean and
+variance are made exact, so that a few draws give the percentiles of many. Candidates are judged by
+other draws than the promise, which would otherwise be too favourable. Nine of ten plates keep what
+is promised.
 
-What the clocks of several amplifiers on one plate cost: a delay of each, common to its ERAs.
-
-An ERA of an amplifier whose clock is late by d moves as exp(-2 pi i f d) of what it should. One
-amplifier alone has none that counts: a phase of all ERAs together is not felt.
+`ClockErrors` are delays of amplifiers, each common to the ERAs of one. An ERA of an amplifier whose
+clock is late by d moves as exp(-2 pi i f d) of its commanded motion. With one amplifier delays do
+not count: a common phase of all ERAs is not felt.
 """
 
 import math
@@ -24,44 +24,49 @@ from model.rig.rig import Channel
 
 @dataclass(frozen=True)
 class Drawing:
-    """How many plates are drawn, of how many thicknesses.
-
-    bases: thicknesses at which the changes by all else that is uncertain are computed, each for as
-    many plates; 1 for the nominal plate.
-    """
+    """How plates are drawn."""
 
     count: int
+    """Number of plates."""
     seed: int
     thicknesses: int
+    """Number of their thicknesses."""
     bases: int = 1
+    """Number of thicknesses at which the effects of all other parameters are computed.
+
+    Each for equally many plates; 1 for the nominal thickness alone.
+    """
 
 
 JUDGING_DRAWS = Drawing(count=64, seed=1, thicknesses=5)
 PROMISED_DRAWS = Drawing(count=200, seed=8, thicknesses=40, bases=5)
-"""Drawn plates that judge candidates, and those of the promise."""
+"""Draws by which candidates are judged, and those of the promise."""
 
 COMMON = 2.0
-"""Standard deviations by which the gain of all ERAs together is off on drawn plates."""
+"""Error of the common gain of all ERAs on drawn plates, in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Parameters of d plates from the thinnest to the thickest, in standard deviations.
+    """Parameters of d plates from the thinnest to the thickest, with a attachments and fingers.
 
-    loss, damping (d,): of the plate, and of all ERAs; own (a, d): stiffness of each ERA and of
-    masses up to the last foot, nothing of others, load of each finger; gains (a, d): relative
-    change of each ERA's, complex; errors (k, d): of discretisation at each finger, complex of mean
-    square 1; harmonics (n, d): second harmonic of each ERA, complex, relative to its motion; node
-    (d,): which of the thicknesses each has.
+    In standard deviations unless stated otherwise.
     """
 
     loss: Float32Array
+    """Loss factor (d,) of the plate."""
     damping: Float32Array
+    """Damping (d,) of all ERAs."""
     own: Float32Array
+    """Stiffness (a, d) of each ERA and foot, 0 of other masses; load of each finger."""
     gains: Complex64Array
+    """Relative change (a, d) of the gain of each ERA, 0 elsewhere."""
     errors: Complex64Array
+    """Discretisation error (k, d) at each finger, of mean square 1."""
     harmonics: Complex64Array
+    """Second harmonic (n, d) of each ERA relative to its motion."""
     node: IntArray
+    """Thickness (d,) of each plate, by number."""
 
 
 @lru_cache(maxsize=64)
@@ -79,17 +84,17 @@ def draw(
     harmonic: float,
     thicknesses: int,
 ) -> Draws:
-    """Draw plates of ERAs, masses and fingers, of a number of thicknesses.
+    """Draw plates with ERAs, masses and fingers, of a number of thicknesses.
 
-    to_feet: of the masses, up to the last foot that deviates; gain, phase [rad]: standard
-    deviations of each ERA's; common_gain: of all together; harmonic: root mean square of each
-    ERA's. Of each thickness as many plates, or one less. All answers of a plate share its common
+    to_feet: number of masses up to the last foot that deviates; gain, phase [rad]: standard
+    deviations for each ERA; common_gain: for all together; harmonic: root mean square for each ERA.
+    Each thickness has equally many plates, or one less. All answers of a plate share its common
     gain: half of the plates have it COMMON standard deviations low, the others high, so that a
-    plate whose own is no farther off keeps nine of ten levels.
+    plate whose gain is not farther off keeps nine of ten levels.
     """
     rng = np.random.default_rng([seed, era_count, finger_count])
     n, k = era_count, finger_count
-    # Those of feet last, so that all else of a rig stays.
+    # Numbers of feet come last, so that they leave those of all else unchanged.
     numbers = standard_normal(rng, 3 + n + k + 2 * n + 2 * k + 1 + 2 * n + to_feet, count)
     numbers = numbers[:, numbers[0].argsort()]  # by thickness
     parameters, sizes, phases, real, imaginary, common, harmonics, quadrature, feet = np.split(
@@ -114,12 +119,12 @@ def draw(
 
 
 def _complex(real: FloatArray, imaginary: FloatArray, size: float = 1.0) -> Complex64Array:
-    """Complex normal numbers of a root mean square, of normal ones."""
+    """Return complex normal numbers of a root mean square (size), from real ones."""
     return np.asarray(math.sqrt(0.5) * size * (real + 1j * imaginary), dtype=np.complex64)
 
 
 def standard_normal(rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
-    """Normal numbers (rows, count) with mean 0 and variance 1 in each row."""
+    """Draw normal numbers (rows, count) with exactly mean 0 and variance 1 in each row."""
     numbers = rng.standard_normal((rows, count))
     numbers -= numbers.mean(axis=1, keepdims=True)
     return np.asarray(numbers / np.sqrt((numbers**2).mean(axis=1, keepdims=True)))
@@ -132,9 +137,9 @@ PERCENTILE = 10
 def over_fingertips(
     power: Float32Array | FloatArray, weights: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Mean amplitude, and squared one at the loudest point, of squared ones (c, k p, d): (c, k, d).
+    """Return mean amplitude and largest squared amplitude over fingertips, both (c, k, d).
 
-    weights (k, p): of the points in the mean.
+    power (c, k p, d): squared amplitudes at points; weights (k, p): of these in the mean.
     """
     by_finger = power.reshape(len(power), *weights.shape, -1)
     means = np.asarray((weights[:, None] @ np.sqrt(by_finger))[:, :, 0])
@@ -143,7 +148,7 @@ def over_fingertips(
 
 
 def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
-    """Percentile over the last axis, linear between values (...,)."""
+    """Return a percentile over the last axis, linear between values."""
     ordered = np.sort(values, axis=-1)
     place = percent / 100 * (ordered.shape[-1] - 1)
     low = int(place)
@@ -154,7 +159,7 @@ def percentile(values: FloatArray, percent: float = PERCENTILE) -> FloatArray:
 MAX_HELD = 0.0003
 """Error of a clock [s] up to which its amplifier plays contents together with others.
 
-Of 12 identified ERAs on three amplifiers, those of one alone promise more beyond it.
+Beyond it, of 12 identified ERAs on three amplifiers, those of one amplifier alone promise more.
 """
 
 _AS_GOOD_AS_UNKNOWN = 0.01  # s; a period of 100 Hz
@@ -163,21 +168,21 @@ _MAX_VARIANCE = 4.0  # of a phase [rad²]; more is no phase at all
 
 @dataclass(frozen=True)
 class ClockErrors:
-    """Delays of amplifiers, rms [s], and which of them each of n ERAs is on.
+    """Delays of amplifiers, and on which of them each of n ERAs is.
 
-    amplifier (n,): of each ERA, by index of errors; errors: of each amplifier, infinite for one
-    whose clock is not held to the others'. Empty where one amplifier has all ERAs, or all clocks
-    are exact: then nothing is drawn.
+    Empty if one amplifier has all ERAs or all clocks are exact; then nothing is drawn.
     """
 
     amplifier: tuple[int, ...] = ()
+    """Amplifier (n,) of each ERA, by index of `errors`."""
     errors: tuple[float, ...] = ()
+    """Rms delay [s] of each amplifier, infinite for one whose clock is not held to the others'."""
 
     @classmethod
     def of(
         cls, eras: Sequence[str], wiring: Mapping[str, Channel], errors: Mapping[str, float]
     ) -> "ClockErrors":
-        """Of ERAs by name, their wiring, and errors of the amplifiers' clocks, rms [s] by name.
+        """Make the errors of ERAs by name from their wiring and amplifiers' rms errors [s].
 
         Raises InputError for an amplifier whose error is missing, negative or not a number.
         """
@@ -195,9 +200,9 @@ class ClockErrors:
 
     @property
     def groups(self) -> tuple[int, ...]:
-        """Group of each ERA (n,): 0 for all whose clocks are held together, one for each other.
+        """Group of each ERA (n,): 0 for all whose clocks are held together, then one per amplifier.
 
-        Empty where all are held together. One content plays on the ERAs of one group only.
+        Empty if all are held together. A content plays on the ERAs of one group only.
         """
         alone = [number for number, each in enumerate(self.errors) if each > MAX_HELD]
         if not alone:
@@ -210,10 +215,10 @@ class ClockErrors:
         )
 
     def power_shares(self, frequencies: FloatArray) -> Float32Array | None:
-        """By how much the modelled power of pairs of ERAs grows, (f, n, n); None for none.
+        """Share (f, n, n) by which the modelled power of pairs of ERAs grows; None if exact.
 
-        Relative to the mean over the delays: exp(p²) - 1 of ERAs of one amplifier, p = 2 pi f times
-        its error, 0 of others.
+        Relative to the mean over the delays: exp(p²) - 1 for ERAs of one amplifier, with p = 2 pi f
+        times its error, and 0 for others.
         """
         if not self.errors:
             return None
@@ -225,7 +230,7 @@ class ClockErrors:
         return np.asarray(grown, dtype=np.float32)
 
     def delays(self, by: Drawing) -> FloatArray:
-        """By how much each of the amplifiers is late on drawn plates, (amplifiers, d) [s]."""
+        """Delay of each amplifier on drawn plates, (amplifiers, d) [s]."""
         return self._known[:, None] * _numbers(by.seed, len(self.errors), by.count)
 
     @property
@@ -239,16 +244,16 @@ EXACT_CLOCKS = ClockErrors()
 
 @lru_cache(maxsize=64)
 def _numbers(seed: int, amplifiers: int, count: int) -> FloatArray:
-    """In no order, where drawn plates are in that of their thicknesses."""
+    """Draw numbers in random order, unlike drawn plates, which ascend in thickness."""
     return standard_normal(np.random.default_rng([seed, amplifiers, 1]), amplifiers, count)
 
 
 def delayed(
     gains: Complex64Array, clocks: ClockErrors, by: Drawing, omega: FloatArray
 ) -> Complex64Array:
-    """Gains (a, d) on drawn plates, at each of f frequencies (f,) [rad/s], as clocks are off.
+    """Return gains (f, a, d) on drawn plates with delays, from gains (a, d) without.
 
-    The ERAs come first of the a attachments and fingers. Returns (f, a, d).
+    omega (f,) [rad/s]. Of the a attachments and fingers the ERAs come first.
     """
     factors = np.exp(-1j * omega[:, None, None] * clocks.delays(by))
     found = np.repeat(gains[None], len(omega), axis=0)

@@ -1,26 +1,25 @@
-"""Fingers on plates whose ERAs are eliminated, and what is felt of drawn ones, in numpy.
+"""Fingers on plates whose ERAs are eliminated, and what is felt of drawn ones, in numpy and in C.
 
 k fingers of dynamic stiffness D at centres c change fields X of a plate on its ERAs to
 
     X - G D P X_c,  P = (1 + G_cc D)^-1,
 
 where G is the displacement by a force at each finger without the others; with them -w² G P^T is the
-acceleration by it. Symbols are those of `attached_plate`; cases are those of a frequency and of a
-thickness each. The expected power of weights w at a fingertip is w^H R w to first order,
+acceleration by it. Symbols are those of `attached_plate`; a case is a frequency and a thickness.
+The expected power of weights w at a fingertip is w^H R w to first order,
 
     R = mean_p { h* h^T + dh* dh^T + dc* dc^T + sum_j |s_j t_pj|² r_j* r_j^T + sigma² diag |h|² },
 
-with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j by how much
-each ERA at full stroke deforms it. Each change d is one by a standard deviation, s_j that of the
-stiffness: the ERAs' damping c together, stiffness of each ERA and foot and load of each finger j on
-their own, gains as sigma: exact derivatives of the loaded plate, but for what a finger deflects
-locally. For the thickness, half the sum of dh* dh^T of the plates thicker and thinner by it,
-exactly; the modulus counts along with it (`attached_plate`). The loss factor changes next to
-nothing.
+with h the field of each ERA, t_pj the acceleration by a force at attachment j, and r_j the
+deformation of that attachment by each ERA at full stroke. Each change d is by one standard
+deviation, s_j that of the stiffness. The ERAs' damping c changes for all together; the stiffness of
+each ERA and foot and the load of each finger j change on their own, as do gains, by sigma. These
+are exact derivatives of the loaded plate, except for the local deflection under a finger. The
+thickness counts by half the sum of dh* dh^T of the plates thicker and thinner by one standard
+deviation, solved exactly; the modulus is included there (`attached_plate`). The loss factor changes
+next to nothing.
 
-`model.ensemble.touched_plate` runs the same in C.
-
-`model.ensemble.touched_plate` by kernels in C.
+`TouchedPlate` is in numpy, `TouchedByKernel` the same in C; `touch` takes the faster one there is.
 """
 
 import ctypes
@@ -55,71 +54,74 @@ from model.ensemble.draws import (
 )
 
 RIDGE = 1e-6
-"""Share of a form's trace that is added to its diagonal: keeps it definite."""
+"""Share of a form's mean diagonal that is added to it, which keeps it definite."""
+
+_MAX_LANES = 16
+_OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
+_OF_ROWS = ("minus_omega2", "forces", "strokes", "by_damping", "by_stiffness", "shapes")
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedContacts:
-    """What g fingertips, or other groups of points, have of the ERAs at f frequencies.
-
-    fields: (f, g, p, n) h [m/s²] at points; fine_fields: (f, g, fine, n) at others, None unless
-    wanted; power: (f, g, n, n) R; uncertain: (f, g, n, n) R without h* h^T.
-    """
+    """Fields and expected powers at g fingertips, or other groups of points, and f frequencies."""
 
     fields: Complex64Array
+    """h (f, g, p, n) at points [m/s²]."""
     fine_fields: Complex64Array | None
+    """h (f, g, fine, n) at fine points, None unless wanted."""
     power: Complex64Array
+    """R (f, g, n, n)."""
     uncertain: Complex64Array
+    """R without h* h^T (f, g, n, n)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Forces at attachments a in c cases, by one standard deviation of what is uncertain.
-
-    loss, damping, own (c, a): of the loss factor, of all dampers, and of the attachment's own
-    stiffness; drives (c, a): of each ERA as it plays, which its gain multiplies; by_loss (c, p):
-    acceleration at points by the loss factor beside those forces.
-    """
+    """Forces at attachments a in c cases, by one standard deviation of uncertain parameters."""
 
     loss: Complex64Array
+    """By the loss factor (c, a)."""
     damping: Complex64Array
+    """By all dampers (c, a)."""
     own: Complex64Array
+    """By the attachment's own stiffness (c, a)."""
     drives: Complex64Array
+    """Force of each ERA as it plays (c, a), which an error of its gain multiplies."""
     by_loss: Complex64Array
+    """Acceleration (c, p) at points by the loss factor, beside that by the forces."""
 
 
 @dataclass(frozen=True, eq=False)
 class FingertipAmplitudes:
-    """Amplitudes to threshold of m tones at k fingertips, nominal and on d drawn plates.
-
-    means: (m, k, 1 + d) mean amplitude over each fingertip; loudest: (m, k, 1 + d) squared
-    amplitude at its loudest point; powers: (m, k p, 1 + d) at all points, None unless wanted.
-    """
+    """Amplitudes to threshold of m tones at k fingertips, nominal and on d drawn plates."""
 
     means: Float32Array
+    """Mean amplitude over each fingertip (m, k, 1 + d)."""
     loudest: Float32Array
+    """Squared amplitude at its loudest point (m, k, 1 + d)."""
     powers: Float32Array | None
+    """Squared amplitude at all points (m, k p, 1 + d), None unless wanted."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchedPlate:
-    """Plates with k fingers at centres of shapes (k, r), of dynamic stiffness (f, k) [N/m].
-
-    clocks: errors of those of the amplifiers.
-    """
+    """A plate of every thickness with k fingers on it."""
 
     on: PlateOnEras
     centres: Float32Array
+    """Mode shapes (k, r) at the fingers."""
     stiffness: Complex64Array
+    """Dynamic stiffness (f, k) of the fingers [N/m]."""
     clocks: ClockErrors = EXACT_CLOCKS
+    """Errors of the amplifiers' clocks."""
 
     def sources(
         self, rows: IntArray, nodes: IntArray, points: Float32Array
     ) -> tuple[Complex64Array, Complex64Array]:
-        """Accelerations by forces, and motion by ERAs, in cases of rows (c,) and nodes (c,).
+        """Return responses to forces and ERAs, in cases of rows (c,) and nodes (c,).
 
-        Accelerations [m/s²/N] at points of shapes (p, r) by a force at each attachment and then
-        each finger, (c, p, b + k); displacement of these by each ERA at full stroke, (c, b + k, n).
+        Acceleration [m/s²/N] at points of shapes (p, r) by a force at each attachment and then each
+        finger, (c, p, b + k); displacement of these by each ERA at full stroke [m], (c, b + k, n).
         """
         on, plate, n = self.on, self.on.plate, self.on.plate.era_count
         w2 = plate.minus_omega2[rows, None, None]
@@ -157,11 +159,11 @@ class TouchedPlate:
         error_power: Float32Array,
         fine: Float32Array | None = None,
     ) -> LoadedContacts:
-        """Fields and expected powers at frequencies, by row (f,).
+        """Compute fields and expected powers at frequencies, by row (f,).
 
         points (g, p, r), fine (g, fine, r): shapes at groups of points, as under each finger;
-        weights (g, p): of its points, sum 1; error_power: mean square of the discretisation error
-        of each ERA's field, at all frequencies of the plate, (all, n).
+        weights (g, p): of a group's points, sum 1; error_power (all, n): mean square of the
+        discretisation error of each ERA's field at all frequencies of the plate.
         """
         plate, n, f, (g, p, r) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
         forces, every = plate.forces[rows, None], points.reshape(-1, r)
@@ -206,7 +208,7 @@ class TouchedPlate:
         moved: Complex64Array,
         points: Float32Array,
     ) -> Changes:
-        """What changes forces, of weights (c, n) and their motions moved (c, b + k) [m]."""
+        """Compute changes of forces, for weights (c, n) and the motion (c, b + k) by them [m]."""
         plate, n = self.on.plate, weights.shape[1]
         shapes = np.concatenate([plate.shapes, self.centres])
         stiffness = np.concatenate([plate.stiffness[rows], self.stiffness[rows]], axis=1)
@@ -238,11 +240,11 @@ class TouchedPlate:
         *,
         with_powers: bool = False,
     ) -> FingertipAmplitudes:
-        """What is felt on the nominal plate and on drawn ones of tones at rows (m,).
+        """Compute amplitudes on the nominal plate and on drawn ones, of tones at rows (m,).
 
         weights (m, n): of the ERAs; points (k p, r): shapes; shares (k, p): of the points in the
-        mean over fingertips; error_power (f, n): mean square of the discretisation error of each
-        ERA's field; threshold (f,) [m/s²]; both at all frequencies of the plate.
+        mean over a fingertip. At all frequencies of the plate: error_power (f, n), mean square of
+        the discretisation error of each ERA's field; threshold (f,) [m/s²].
         """
         m, (k, p), d, clocks = len(rows), shares.shape, by.count, self.clocks
         draws, nodes, (t, first_base), first = drawn_on(self.on, k, by)
@@ -291,8 +293,8 @@ class TouchedPlate:
     ) -> Float32Array:
         """Mean square of second harmonics over k fingertips [m²/s⁴], (m, k, 1 + d).
 
-        Of a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; the rest as
-        of `drawn`. None of the nominal plate.
+        For a plate at twice the frequencies (`at_harmonics`). points (k, p, r): shapes; the rest as
+        in `drawn`. The nominal plate has none.
         """
         (k, p), d, n = shares.shape, by.count, self.on.plate.era_count
         draws, _, (t, first_base), _ = drawn_on(self.on, k, by)
@@ -308,7 +310,7 @@ class TouchedPlate:
     def _fingers(
         self, rows: IntArray, nodes: IntArray
     ) -> tuple[Complex64Array, Complex64Array, Complex64Array]:
-        """T at the centres (c, k, b), G (c, k, r) and P (c, k, k)."""
+        """Return T at the centres (c, k, b), G (c, k, r) and P (c, k, k)."""
         on, by_force = self.on, self.on.by_force[rows, nodes]
         at = self.centres @ by_force.swapaxes(1, 2)
         free = on.receptance[rows, nodes][:, None] * self.centres
@@ -326,21 +328,114 @@ class TouchedPlate:
         G: Complex64Array,
         P: Complex64Array,
     ) -> tuple[Complex64Array, Complex64Array]:
-        """Coordinates (c, q, r) with the fingers, of those without; and the field at these.
+        """Return coordinates (c, q, r) with the fingers, and the field (c, k, q) at these.
 
-        at (c, k, q): of those without.
+        free (c, q, r): coordinates without fingers; at (c, k, q): their field at the fingers.
         """
         resting = np.asarray(P @ at)
         held = self.stiffness[rows, :, None] * resting
         return np.asarray(free - held.swapaxes(1, 2) @ G), resting
 
 
+@dataclass(frozen=True, eq=False)
+class TouchedByKernel(TouchedPlate):
+    """A plate with fingers, computed by kernels in C."""
+
+    kernels: Kernels = field(kw_only=True)
+
+    @cached_property
+    def structure(self) -> TouchedPlates:
+        """The plate as kernels read it."""
+        found = TouchedPlates.from_buffer_copy(plates_structure(self.on))
+        found.k = len(self.centres)
+        found.point(centres=self.centres, stiffness=self.stiffness)
+        return found
+
+    def forms(
+        self,
+        rows: IntArray,
+        points: Float32Array,
+        weights: Float32Array,
+        error_power: Float32Array,
+        fine: Float32Array | None = None,
+    ) -> LoadedContacts:
+        """As `TouchedPlate.forms`."""
+        plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
+        fine_count = 0 if fine is None else fine.shape[1]
+        of = PointGroups(
+            groups=g,
+            p=p,
+            fine=g * fine_count,
+            others=plate.uncertainty.frequency > 0,
+            gain_variance=plate.uncertainty.gain_variance,
+            ridge=RIDGE,
+        )
+        of.point(
+            points=points,
+            fine_points=fine,
+            weights=weights,
+            error=error_power,
+            shares=self.clocks.power_shares(plate.frequencies),
+        )
+        sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
+        found = [np.empty(size, dtype=np.complex64) for size in sizes]
+        to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
+        run(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
+        return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
+
+    def drawn(
+        self,
+        by: Drawing,
+        rows: IntArray,
+        weights: Complex64Array,
+        points: Float32Array,
+        shares: Float32Array,
+        error_power: Float32Array,
+        threshold: Float32Array,
+        *,
+        with_powers: bool = False,
+    ) -> FingertipAmplitudes:
+        """As `TouchedPlate.drawn`."""
+        m, (k, p) = len(rows), shares.shape
+        at = Sensors(k * p)
+        at.point(rows=points, weights=shares, error=error_power, threshold=threshold)
+        powers = np.empty((m, k * p, 1 + by.count) if with_powers else 0, dtype=np.float32)
+        means, loudest = (np.empty((m, k, 1 + by.count), dtype=np.float32) for _ in range(2))
+        at_rows, of_weights = as_given(rows), as_given(weights)
+        to = (ctypes.c_void_p * 3)(
+            powers.ctypes.data if with_powers else None, means.ctypes.data, loudest.ctypes.data
+        )
+        draws = draws_structure(self.on, self.clocks, k, by)
+        stage = self.kernels.library.tones_stage
+        run(stage, self.structure, draws, at, at_rows.ctypes, m, of_weights.ctypes, to)
+        return FingertipAmplitudes(means, loudest, powers if with_powers else None)
+
+
+def touch(
+    on: PlateOnEras,
+    centres: Float32Array,
+    loads: tuple[float, ...] = (),
+    clocks: ClockErrors = EXACT_CLOCKS,
+) -> TouchedPlate:
+    """Put fingers on a plate, by kernels in C where they can be compiled.
+
+    centres (k, r): shapes there; loads (k,): relative to the rig's fingertip, empty for 1 each;
+    clocks: errors of the amplifiers' clocks.
+    """
+    by, stiffness = kernels(), on.plate.finger_stiffness(len(centres), loads)
+    if by is None or not len(centres):
+        return TouchedPlate(on, centres, stiffness, clocks)
+    return TouchedByKernel(on, centres, stiffness, clocks, kernels=by)
+
+
 def drawn_on(
     on: PlateOnEras, finger_count: int, by: Drawing
 ) -> tuple[Draws, int, tuple[int, int], int]:
-    """Drawn plates; how many thicknesses they have; for changes how many, and the first's index.
+    """Draw plates for a number of fingers.
 
-    And that of the first of the plates' own. One, the nominal one, where it is certain.
+    Returns the draws; the number of their thicknesses; the number of thicknesses for changes and
+    the index of the first of these; and the index of the first thickness of the draws. There is one
+    thickness, the nominal one, if it is certain.
     """
     plate = on.plate
     first = on.first.get(by.thicknesses, MODELLED)
@@ -371,12 +466,12 @@ def expected_power(
     error_power: Float32Array,
     shares: Float32Array | None = None,
 ) -> Complex64Array:
-    """Expected powers R at g groups of points, (f, g, n, n).
+    """Compute expected powers R (f, g, n, n) at g groups of points.
 
     fields: h and each of its changes (f, g, p, n); own (f, g, j, n): changes by the stiffness of
-    each attachment and the load of each finger, root mean square over the points; weights (g, p) of
-    the points; error_power (f, ..., n): mean square of the error of each ERA's field; shares (f, n,
-    n): by which the power of h grows, as the clocks of amplifiers are off.
+    each attachment and the load of each finger, root mean square over the points; weights (g, p):
+    of the points; error_power (f, ..., n): mean square of the error of each ERA's field; shares
+    (f, n, n): by which delays of amplifiers increase the power of h.
     """
     f, g, _, n = own.shape
     root = np.sqrt(weights)[..., None]
@@ -391,123 +486,38 @@ def expected_power(
 
 
 def gram(rows: Complex64Array) -> Complex64Array:
-    """Forms of the sum over rows (..., rows, n): (..., n, n)."""
+    """Return the forms (..., n, n) of sums over rows (..., rows, n)."""
     return np.asarray(rows.conj().swapaxes(-1, -2) @ rows)
 
 
 def outer(rows: Complex64Array) -> Complex64Array:
-    """Forms conj(h) h^T of rows h (..., n): (..., n, n)."""
+    """Return the forms conj(h) h^T (..., n, n) of rows h (..., n)."""
     return np.asarray(rows.conj()[..., :, None] * rows[..., None, :])
 
 
 def power_of(values: Complex64Array) -> Float32Array:
-    """Squared magnitude."""
+    """Return squared magnitudes."""
     return np.asarray(values.real * values.real + values.imag * values.imag)
 
 
-_MAX_LANES = 16
-_OF_CASES = ("receptance", "by_force", "coupling", "moved", "by_loss")
-_OF_ROWS = ("minus_omega2", "forces", "strokes", "by_damping", "by_stiffness", "shapes")
-
-
-def touch(
-    on: PlateOnEras,
-    centres: Float32Array,
-    loads: tuple[float, ...] = (),
-    clocks: ClockErrors = EXACT_CLOCKS,
-) -> TouchedPlate:
-    """Put fingers on a plate, by kernels in C where they can be compiled.
-
-    centres (k, r): shapes there; loads (k,): of each relative to the rig's fingertip, empty for 1;
-    clocks: errors of those of the amplifiers.
-    """
-    by, stiffness = kernels(), on.plate.finger_stiffness(len(centres), loads)
-    if by is None or not len(centres):
-        return TouchedPlate(on, centres, stiffness, clocks)
-    return TouchedByKernel(on, centres, stiffness, clocks, kernels=by)
-
-
-@dataclass(frozen=True, eq=False)
-class TouchedByKernel(TouchedPlate):
-    """A plate with fingers, whose stages are kernels."""
-
-    kernels: Kernels = field(kw_only=True)
-
-    @cached_property
-    def structure(self) -> TouchedPlates:
-        """The plate as kernels read it."""
-        found = TouchedPlates.from_buffer_copy(plates_structure(self.on))
-        found.k = len(self.centres)
-        found.point(centres=self.centres, stiffness=self.stiffness)
-        return found
-
-    def forms(
-        self,
-        rows: IntArray,
-        points: Float32Array,
-        weights: Float32Array,
-        error_power: Float32Array,
-        fine: Float32Array | None = None,
-    ) -> LoadedContacts:
-        """As of `TouchedPlate`."""
-        plate, n, f, (g, p, _) = self.on.plate, self.on.plate.era_count, len(rows), points.shape
-        fine_count = 0 if fine is None else fine.shape[1]
-        known = plate.uncertainty
-        rules = known.frequency > 0, known.gain_variance, RIDGE
-        of = PointGroups(g, p, g * fine_count, *rules)
-        of.point(
-            points=points,
-            fine_points=fine,
-            weights=weights,
-            error=error_power,
-            shares=self.clocks.power_shares(plate.frequencies),
-        )
-        sizes = ((f, g, p, n), (f, g, fine_count, n), (f, g, n, n), (f, g, n, n))
-        found = [np.empty(size, dtype=np.complex64) for size in sizes]
-        to, at = (ctypes.c_void_p * 4)(*(each.ctypes.data for each in found)), as_given(rows)
-        run(self.kernels.library.forms_stage, self.structure, of, at.ctypes, f, to)
-        return LoadedContacts(found[0], None if fine is None else found[1], found[2], found[3])
-
-    def drawn(
-        self,
-        by: Drawing,
-        rows: IntArray,
-        weights: Complex64Array,
-        points: Float32Array,
-        shares: Float32Array,
-        error_power: Float32Array,
-        threshold: Float32Array,
-        *,
-        with_powers: bool = False,
-    ) -> FingertipAmplitudes:
-        """As of `TouchedPlate`."""
-        m, (k, p) = len(rows), shares.shape
-        at = Sensors(k * p)
-        at.point(rows=points, weights=shares, error=error_power, threshold=threshold)
-        powers = np.empty((m, k * p, 1 + by.count) if with_powers else 0, dtype=np.float32)
-        means, loudest = (np.empty((m, k, 1 + by.count), dtype=np.float32) for _ in range(2))
-        given = as_given(rows), as_given(weights)
-        to = (ctypes.c_void_p * 3)(
-            powers.ctypes.data if with_powers else None, means.ctypes.data, loudest.ctypes.data
-        )
-        draws = draws_structure(self.on, self.clocks, k, by)
-        run(
-            self.kernels.library.tones_stage,
-            *(self.structure, draws, at, given[0].ctypes, m, given[1].ctypes, to),
-        )
-        return FingertipAmplitudes(means, loudest, powers if with_powers else None)
-
-
 def plates_structure(on: PlateOnEras) -> TouchedPlates:
-    """A plate without fingers as kernels read it, kept with it."""
+    """Pack a plate without fingers for kernels; kept with it."""
     known = _kept.get(on)
     if known is not None:
         return known
     plate = on.plate
     (b, r), (f, t, _) = plate.shapes.shape, on.receptance.shape
     kept = min(t, THINNER + 1)  # thicknesses that searches rank by
-    n, off = plate.era_count, plate.by_stiffness.shape[1]
-    found = TouchedPlates(n, b, 0, r, t, off, f, 0, kept, plate.uncertainty.fingertip)
+    found = TouchedPlates(
+        n=plate.era_count,
+        b=b,
+        r=r,
+        t=t,
+        off=plate.by_stiffness.shape[1],
+        rows=f,
+        kept=kept,
+        load_std=plate.uncertainty.fingertip,
+    )
     found.point(
         **{name: getattr(on, name) for name in _OF_CASES},
         **{name: getattr(plate, name) for name in _OF_ROWS},
@@ -519,7 +529,7 @@ def plates_structure(on: PlateOnEras) -> TouchedPlates:
         found.arrays.append(room)
         found.of_blocks = room.ctypes.data + -room.ctypes.data % (4 * _MAX_LANES)  # whole registers
         run(by.library.blocks_stage, found)
-    return _kept.setdefault(on, found)  # of threads at once all take the first one's
+    return _kept.setdefault(on, found)  # concurrent threads all take the first one
 
 
 _kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()
@@ -528,7 +538,7 @@ _kept: WeakKeyDictionary[PlateOnEras, TouchedPlates] = WeakKeyDictionary()
 def draws_structure(
     on: PlateOnEras, clocks: ClockErrors, finger_count: int, by: Drawing
 ) -> PlateDraws:
-    """Drawn plates with so many fingers as kernels read them; of other clocks in no time."""
+    """Pack drawn plates with a number of fingers for kernels."""
     draws, nodes, (bases, first_base), first_node = drawn_on(on, finger_count, by)
     exact = _structure(draws, nodes, bases, first_base, first_node)
     if not clocks.errors:
@@ -544,16 +554,26 @@ def _structure(
     draws: Draws, nodes: int, bases: int, first_base: int, first_node: int
 ) -> PlateDraws:
     count = len(draws.node)
-    found = PlateDraws(count, bases, nodes, count + _MAX_LANES, first_base, first_node)
-    errors = np.stack([draws.errors.real, draws.errors.imag])
-    gains = np.stack([draws.gains.real, draws.gains.imag])
-    floats = {"loss": draws.loss, "damping": draws.damping, "own": draws.own}
-    harmonics = np.stack([draws.harmonics.real, draws.harmonics.imag])
-    floats |= {"gains": gains, "errors": errors, "harmonics": harmonics}
-    found.point(node=draws.node, **{name: _padded(each) for name, each in floats.items()})
+    found = PlateDraws(
+        count=count,
+        bases=bases,
+        nodes=nodes,
+        width=count + _MAX_LANES,
+        first_base=first_base,
+        first_node=first_node,
+    )
+    found.point(
+        node=draws.node,
+        loss=_padded(draws.loss),
+        damping=_padded(draws.damping),
+        own=_padded(draws.own),
+        gains=_padded(np.stack([draws.gains.real, draws.gains.imag])),
+        errors=_padded(np.stack([draws.errors.real, draws.errors.imag])),
+        harmonics=_padded(np.stack([draws.harmonics.real, draws.harmonics.imag])),
+    )
     return found
 
 
 def _padded(values: Float32Array | FloatArray) -> Float32Array:
-    """Values (..., d) as rows of one register more, in single precision."""
+    """Return values (..., d) in single precision, padded by one register."""
     return np.pad(as_given(values), [(0, 0)] * (values.ndim - 1) + [(0, _MAX_LANES)])

@@ -275,7 +275,7 @@ def expected_contrast(
             each = []
             for table in (written, identified):
                 drive = query(table, placed, MIN_LEVEL_DB_SL).layers[0].excitation
-                contrast = felt_on(identified, placed, drive, plates).contrast
+                _, contrast = felt_on(identified, placed, drive, plates)
                 assert contrast is not None  # noqa: S101  there are quiet fingers
                 each.append(20 * np.log10(contrast))
             before, after = each

@@ -1,13 +1,11 @@
-"""Random places of fingers that are apart from each other, as fingertips of two hands are.
+"""Felt contrast over the plate of a table: to random other fingers, and to given quiet ones.
 
-Felt contrast that the cells of a plate have to other fingers.
+`WeakCells`: for the centre of each cell as the target, the contrast that nine of ten plates give to
+another finger at random places at least 5 cm away. A cell is *feasible* if the median other finger
+leaves 12 dB at 20 dB SL: at 12 dB SL, which is clearly felt, the other finger is then at its
+threshold. It is *weak* if more than one other finger in ten leaves less.
 
-For the centre of each cell as the target, the contrast that nine of ten plates give to another
-finger at random places at least 5 cm away. A cell is *feasible* if the
-median other finger leaves 12 dB at 20 dB SL: turned down to 12 dB SL, which is felt well, the other
-finger is then at its threshold. It is *weak* if more than one other finger in ten leaves less.
-
-Contrast from every place of the plate to given quiet fingers.
+`ContrastMap`: the contrast of a finger at every place of the plate to the same quiet fingers.
 """
 
 import math
@@ -34,7 +32,7 @@ from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 
 MIN_DISTANCE = 0.05
-"""Distance of the fingers of a contact set at least [m], as fingertips of two hands."""
+"""Least distance of the fingers of a contact set [m], as of fingertips of two hands."""
 
 
 def are_apart(contacts: FloatArray) -> bool:
@@ -51,9 +49,9 @@ def random_contacts(
     apart: float = MIN_DISTANCE,
     tries: int = 10_000,
 ) -> tuple[Point, ...]:
-    """Draw places [m] of fingers on a plate, so far apart and from its edges [m].
+    """Draw places [m] of fingers on a plate, with least distances apart and from its edges [m].
 
-    Raises InputError where no try finds any.
+    Raises InputError if none are found in a number of tries.
     """
     sides = np.array([plate.length, plate.width])
     for _ in range(tries):
@@ -68,20 +66,23 @@ def random_contacts(
 
 
 WANTED_CONTRAST_DB = FELT_DB_SL
+"""Felt contrast from which a cell is feasible."""
+
 WANTED_LEVEL_DB_SL = STRONG_DB_SL
+"""Level of the target in maps."""
 
 STRATA = (2, 2)
-"""Strata of a quarter of the plate, one random place of the other finger in each.
+"""Strata of a quarter of the plate, with one random place of the other finger in each.
 
-Their mirror images in both axes are used too, so that a symmetric plate has a symmetric map, with
+Their mirror images in both axes are used, too, so that a symmetric plate has a symmetric map, with
 less variance than from places drawn freely.
 """
 
 Contrasts: TypeAlias = tuple[float, float]
-"""Felt contrast [dB] of nine of ten plates, and that of the nominal plate."""
+"""Promised felt contrast [dB], and that of the nominal plate."""
 
 Ask: TypeAlias = Callable[[Placement], Contrasts | None]
-"""Answers a finger beside quiet ones, None where the level is not reached."""
+"""Returns the contrasts of a finger beside quiet ones, None if the level is not reached."""
 
 _DECIMALS = 9  # of places [m]: below that is rounding
 
@@ -91,32 +92,35 @@ _MAX_GRID = Grid(8, 6)
 
 @dataclass(frozen=True, eq=False)
 class WeakCells:
-    """Median and tenth percentile of felt contrast [dB] from each cell to other fingers, (cells,).
+    """Promised felt contrast from each cell of a plate to other fingers.
 
-    -inf where the level is not reached, NaN on a plate too small for two fingers. errors_db: one
-    standard deviation of both by the choice of the other fingers, (2, cells). pairs_db: promised
-    and nominal felt contrast [dB] of all pairs that reach it, (2, pairs).
+    -inf where the level is not reached, NaN on a plate too small for two fingers.
     """
 
     grid: Grid
     centres: FloatArray
+    """Centres (cells, 2) of the cells [m]."""
     median_db: FloatArray
+    """Median (cells,) over other fingers."""
     tenth_db: FloatArray
+    """Tenth percentile (cells,) over other fingers."""
     errors_db: FloatArray
+    """One standard deviation of both by the choice of the other fingers, (2, cells)."""
     pairs_db: FloatArray
+    """Promised and nominal felt contrast (2, pairs) of all pairs that reach the level."""
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
-        """Mask of feasible cells."""
+        """Mask (cells,) of feasible cells."""
         return np.asarray(self.median_db >= WANTED_CONTRAST_DB)
 
     @property
     def weak(self) -> NDArray[np.bool_]:
-        """Mask of weak cells."""
+        """Mask (cells,) of weak cells."""
         return np.asarray(self.tenth_db < WANTED_CONTRAST_DB)
 
     def as_json(self) -> dict[str, Any]:
-        """The map for programs; null where a contrast is not finite."""
+        """Return the map for programs; null where a contrast is not finite."""
         return {
             "grid": str(self.grid),
             "centres_m": self.centres.tolist(),
@@ -130,11 +134,11 @@ class WeakCells:
 
 
 def sampling_error(values: ArrayLike, percent: float) -> float:
-    """One standard deviation of a percentile of a random sample (n,), NaN where it is not finite.
+    """Return one standard deviation of a percentile of a random sample (n,), NaN if not finite.
 
-    Half the distance between the order statistics that are one standard deviation of the number of
-    values below the percentile away from it, whatever the values' distribution. Equal values count
-    once, as those of questions that mirror each other.
+    For any distribution of the values: half the distance between the order statistics that are one
+    standard deviation of the number of values below the percentile away from it. Equal values count
+    once, since they are of questions that mirror each other.
     """
     sample = np.asarray(values, dtype=float)
     share, count = percent / 100, len(np.unique(sample))
@@ -146,14 +150,14 @@ def sampling_error(values: ArrayLike, percent: float) -> float:
 
 
 def map_grid(table: LocalizationTable) -> Grid:
-    """Grid of the map: the table's, or a coarser one in place of a fine one."""
+    """Return the grid of the map: the table's, or a coarser one if that is fine."""
     return Grid(min(table.grid.nx, _MAX_GRID.nx), min(table.grid.ny, _MAX_GRID.ny))
 
 
 def find_weak_cells(
     table: LocalizationTable, answered: Sequence[Sequence[Contrasts | None]]
 ) -> WeakCells:
-    """The map, of what `pair_questions` have been answered, cell by cell."""
+    """Make the map from answers to `pair_questions`, cell by cell."""
     grid = map_grid(table)
     found, errors = np.full((2, 2, len(answered)), np.nan)
     for cell, answers in enumerate(answered):
@@ -169,15 +173,15 @@ def find_weak_cells(
 
 
 def contrasts_reached(answered: Iterable[Contrasts | None]) -> FloatArray:
-    """Promised and nominal felt contrast [dB] of answers that reach the level, (2, answers)."""
+    """Return promised and nominal felt contrast (2, n) [dB] of n answers that reach the level."""
     return np.array([*filter(None, answered)], dtype=float).reshape(-1, 2).T
 
 
 def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
-    """For each cell of `map_grid` as the target, those with each other finger at a distance.
+    """Return questions for each cell of `map_grid` as the target, with one other finger each.
 
-    Places of the other finger are drawn for each cell, the same for cells that mirror each other
-    where the plate does.
+    Places of the other finger are drawn for each cell, at least MIN_DISTANCE away. They are the
+    same for cells that mirror each other if the plate is symmetric.
     """
     grid, plate = map_grid(table), table.plate
     centres = grid.centres(plate)
@@ -190,18 +194,20 @@ def pair_questions(table: LocalizationTable) -> list[list[Placement]]:
             min(y, grid.ny - 1 - y) if along_y else y,
         ]
 
-    return [
-        _questions(centres[x + y * grid.nx], _places(plate, seed(x, y)))
-        for y in range(grid.ny)
-        for x in range(grid.nx)
-    ]
+    found = []
+    for number, target in enumerate(centres):
+        places = _places(plate, seed(number % grid.nx, number // grid.nx))
+        far = places[np.linalg.norm(places - target, axis=1) >= MIN_DISTANCE].tolist()
+        at = (float(target[0]), float(target[1]))
+        found.append([Placement((at,), ((x, y),)) for x, y in far])
+    return found
 
 
 def ask_once(table: LocalizationTable) -> Ask:
-    """Promised and nominal felt contrast [dB] of questions, None where the level is not reached.
+    """Return a function that answers questions with their contrasts, each only once.
 
-    Questions that mirror each other, where plate, ERAs and masses do, have one answer, so that the
-    noise of the drawn plates does not make several samples of one.
+    Questions that mirror each other have one answer if plate, ERAs and masses are symmetric, so
+    that noise of the drawn plates does not turn one sample into several.
     """
     images, known = mirror_images(table), dict[Placement, Contrasts | None]()
 
@@ -220,7 +226,7 @@ def contrasts_of(
     level_db_sl: float = WANTED_LEVEL_DB_SL,
     drive_mode: str | None = None,
 ) -> Contrasts | None:
-    """Promised and nominal felt contrast [dB], None where the level is not reached."""
+    """Return the promised and nominal felt contrast [dB], None if the level is not reached."""
     try:
         found = query(table, placed, level_db_sl, drive_mode=drive_mode)
     except InputError:
@@ -232,9 +238,9 @@ def contrasts_of(
 
 
 def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
-    """The reflections, along x, along y or both, under which a table's plate is the same.
+    """Return the reflections, along x, y or both, under which a table's plate is the same.
 
-    That along neither is always one of them.
+    The one along neither is always included.
     """
     every = [(False, False), (True, False), (False, True), (True, True)]
     return [
@@ -250,7 +256,7 @@ def mirror_images(table: LocalizationTable) -> list[tuple[bool, bool]]:
 def _first_image(
     placed: Placement, table: LocalizationTable, images: Sequence[tuple[bool, bool]]
 ) -> Placement:
-    """The image of fingers that is the same for all their images."""
+    """Return the image of fingers that is the same for all their images."""
     if len(images) == 1:
         return placed
     count = len(placed.targets)
@@ -271,7 +277,7 @@ def _reflected(at: Point, table: LocalizationTable, along: tuple[bool, bool]) ->
 def _placed(
     attached: Iterable[Actuator | PointLoad], table: LocalizationTable, along: tuple[bool, bool]
 ) -> Counter[Actuator | PointLoad]:
-    """What is attached, without names, at its reflected places."""
+    """Count attachments without names, at their reflected places."""
     found: Counter[Actuator | PointLoad] = Counter()
     for each in attached:
         x, y = _reflected((each.x, each.y), table, along)
@@ -281,7 +287,7 @@ def _placed(
 
 
 def text_map(weak: WeakCells) -> Iterator[str]:
-    """Median contrast as lines of text, the largest y first, with * for weak cells."""
+    """Yield the median contrast as lines of text, the largest y first, with * for weak cells."""
     shape = (weak.grid.ny, weak.grid.nx)
     rows = zip(weak.median_db.reshape(shape), weak.weak.reshape(shape), strict=True)
     for median, marks in reversed(list(rows)):
@@ -292,7 +298,7 @@ def text_map(weak: WeakCells) -> Iterator[str]:
 
 
 def _places(plate: Plate, seed: list[int]) -> FloatArray:
-    """Random places all over a plate, with all their mirror images, (n, 2) [m]."""
+    """Draw random places (n, 2) [m] all over a plate, with all their mirror images."""
     corner = np.stack(np.meshgrid(*(np.arange(n) for n in STRATA)), axis=-1).reshape(-1, 1, 2)
     drawn = np.random.default_rng(seed).uniform(0, 1, corner.shape)
     drawn = (corner + drawn) / (2 * np.array(STRATA))
@@ -301,27 +307,23 @@ def _places(plate: Plate, seed: list[int]) -> FloatArray:
     return np.asarray(size * mirrored.reshape(-1, 2))
 
 
-def _questions(target: FloatArray, places: FloatArray) -> list[Placement]:
-    """A target [m], for each other finger at a distance."""
-    far = np.linalg.norm(places - target, axis=1) >= MIN_DISTANCE
-    at = (float(target[0]), float(target[1]))
-    return [Placement((at,), ((float(x), float(y)),)) for x, y in places[far]]
-
-
 @dataclass(frozen=True, eq=False)
 class ContrastMap:
-    """Contrast of a finger at every place to the same quiet fingers, by drive mode.
-
-    x (nx,), y (ny,) [m]: of the places; quiet [m]; promised_db, nominal_db: felt contrast [dB] that
-    nine of ten plates within the rig's uncertainty give, and of the nominal plate, each (ny,
-    nx), NaN where the level is not reached and under a quiet finger.
-    """
+    """Contrast of a finger at every place to the same quiet fingers, by drive mode."""
 
     x: FloatArray
+    """Places (nx,) along x [m]."""
     y: FloatArray
+    """Places (ny,) along y [m]."""
     quiet: tuple[Point, ...]
+    """Places of the quiet fingers [m]."""
     promised_db: dict[str, FloatArray]
+    """Felt contrast (ny, nx) that nine of ten plates give, by drive mode.
+
+    NaN where the level is not reached, and under a quiet finger.
+    """
     nominal_db: dict[str, FloatArray]
+    """The same, of the nominal plate."""
 
     def __repr__(self) -> str:
         modes = ", ".join(self.promised_db)
@@ -329,7 +331,7 @@ class ContrastMap:
 
     @property
     def columns(self) -> Columns:
-        """Places and contrasts as columns of one row a place, x changing first."""
+        """Places and contrasts as columns with one row per place, x changing first."""
         x, y = np.meshgrid(self.x, self.y)
         return {
             "x_m": x.ravel(),
@@ -339,11 +341,11 @@ class ContrastMap:
         }
 
     def to_frame(self) -> Any:
-        """The columns of `era table map -o FILE.csv` as a pandas DataFrame; needs pandas."""
+        """Return the columns of `era table map -o FILE.csv` as a pandas DataFrame; needs pandas."""
         return as_frame(self.columns)
 
     def as_json(self) -> dict[str, Any]:
-        """The map for programs, one row per y; null where there is no answer."""
+        """Return the map for programs, one row per y; null where there is no answer."""
         return {
             "x_m": self.x.tolist(),
             "y_m": self.y.tolist(),
@@ -362,9 +364,9 @@ def map_contrast(
     grid: Grid | None = None,
     progress: Progress = unseen,
 ) -> ContrastMap:
-    """Ask a table for a finger at every place of a grid, by default its cells.
+    """Query a table for a finger at every place of a grid, by default its own cells.
 
-    quiet [m]: one finger or more that must not feel it; drive_modes: the table's own for none;
+    quiet [m]: one finger or more that must not feel it; drive_modes: empty for the table's own;
     progress: called with the number of finished places, and the total. Raises InputError for quiet
     fingers that no question may have, and for an unknown drive mode.
     """

@@ -1,12 +1,10 @@
-"""What a table reaches: cells of its map, felt contrast of random contacts, their summary.
+"""Overview of a table: its map and summary, the cost of clock errors, and export to other programs.
 
-What two contents keep of their contrast while the amplifiers' clocks are held to some error.
-
-By answers of the rig's own plate, at few places and frequencies, in a second.
-
-Export of tables: a .mat file of everything, or .csv files of patterns or fields.
-
-`docs/reference/table-file.md` lists every name with its shape and unit.
+- `find_overview`, `summarize`: cells of the map, and felt contrast of random contacts.
+- `clock_cost`: the contrast that two contents keep while amplifiers' clocks have some error, by
+  answers of the rig's own plate at a few places and frequencies, in a second.
+- `export_mat`, `export_csv`: a .mat file of everything, or .csv files of patterns or fields;
+  `docs/reference/table-file.md` lists every name with its shape and unit.
 """
 
 import math
@@ -54,18 +52,16 @@ from model.table.table import PAPER_GRID, LocalizationTable
 from model.table.table_file import FORMAT_VERSION, TableProblem, solve_table
 
 CONTACT_SETS = 64
+"""Number of random contact sets for each number of fingers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """The map of a table, and its contrast to other fingers.
-
-    contrasts: to one, two and three others, each promised and nominal felt contrast [dB] of contact
-    sets (2, sets).
-    """
+    """The map of a table, and its contrast to other fingers."""
 
     cells: WeakCells
     contrasts: Sequence[FloatArray]
+    """Promised and nominal felt contrast (2, sets) [dB] to one, two and three other fingers."""
 
 
 def find_overview(
@@ -92,7 +88,7 @@ def find_overview(
 def set_questions(
     table: LocalizationTable, *, others: int, rng: np.random.Generator
 ) -> list[Placement]:
-    """Questions with fingers at random, one the target; none on a plate too small for them."""
+    """Draw questions with random fingers, one of them the target; none on too small a plate."""
     found: list[Placement] = []
     with suppress(InputError):
         for _ in range(CONTACT_SETS):
@@ -102,10 +98,10 @@ def set_questions(
 
 
 def summarize(table: LocalizationTable, overview: Overview) -> dict[str, Any]:
-    """Summarize a table; felt contrast [dB]: median and tenth percentile over contact sets.
+    """Summarize a table, with median and tenth percentile of felt contrast [dB] over contact sets.
 
-    Promised contrasts are those of nine of ten plates, the others those of the nominal plate;
-    beside each one standard deviation by the choice of the sets.
+    Promised contrasts are those of nine of ten plates, the others those of the nominal plate; each
+    has one standard deviation by the choice of the sets.
     """
     weak = overview.cells
     available = table.available_level_db_sl
@@ -149,16 +145,16 @@ _STEP, _HIGHEST = 20.0, 250.0  # Hz; fingers feel most there, and a table of mor
 
 @dataclass(frozen=True)
 class ClockCost:
-    """Contrast promised to the worst of two fingers, median over places, and what is kept [dB]."""
+    """Contrast [dB] promised to the worst of two fingers: with exact clocks, and with errors."""
 
     exact_db: float
     kept_db: float
 
 
 def clock_cost(rig: Rig, errors: Mapping[str, float]) -> ClockCost:
-    """Contrast of two contents with exact clocks, and with errors by amplifier, rms [s].
+    """Compute the contrast of two contents with exact clocks, and with rms errors [s] by amplifier.
 
-    Raises InputError for a plate on which two fingers have no room, or that makes no table.
+    Median over places. Raises InputError for a plate too small for two fingers, or without a table.
     """
     low, high = rig.limits.frequency_min, rig.limits.frequency_max
     frequencies = np.arange(low, max(min(high, _HIGHEST), low) + 1e-9, _STEP)
@@ -167,14 +163,14 @@ def clock_cost(rig: Rig, errors: Mapping[str, float]) -> ClockCost:
     clocks = ClockErrors.of([era.name for era in table.eras], rig.wiring, errors)
     exact = _promised_db(table)
     kept = _promised_db(table.with_clocks(clocks))  # made now: it shares what answers have computed
-    # Of places one by one, which differ by far more.
+    # The loss is taken place by place, since places differ by far more.
     lost = max(float(np.median(exact - kept)), 0.0)
     median = float(np.median(exact))
     return ClockCost(median, median - lost)
 
 
 def _promised_db(table: LocalizationTable) -> FloatArray:
-    """Contrast promised to the worst of two fingers at places anywhere (pairs,)."""
+    """Return the contrast (pairs,) promised to the worst of two fingers at random places."""
     rng, found = np.random.default_rng(_SEED), list[float]()
     for _ in range(_PAIRS):
         fingers = [
@@ -186,7 +182,7 @@ def _promised_db(table: LocalizationTable) -> FloatArray:
 
 
 MAX_MAT_BYTES = (1 << 31) - 1
-"""Size of one variable in a .mat file of version 5, its header included."""
+"""Largest size of a variable in a .mat file of version 5, its header included."""
 
 
 def export_mat(table: LocalizationTable, path: Path) -> None:
@@ -266,17 +262,13 @@ def _field_rows(table: LocalizationTable) -> Iterator[list[object]]:
     yield ["x_m", "y_m", "frequency_hz", *parts]
     for (x, y), at_point in zip(table.raster.points.tolist(), _fields(table), strict=True):
         for frequency, values in zip(table.frequencies.tolist(), at_point, strict=True):
-            yield [x, y, frequency, *_short(values.view(np.float32))]
+            # Text of single-precision numbers has the shortest decimals that identify them.
+            yield [x, y, frequency, *map(str, values.view(np.float32))]
 
 
 def _fields(table: LocalizationTable) -> Complex64Array:
-    """Acceleration [m/s²] on the raster by each ERA alone at full stroke, (points, f, eras)."""
+    """Return the acceleration (points, f, eras) on the raster by each ERA at full stroke [m/s²]."""
     return np.ascontiguousarray(table.unit_fields(table.raster.points).transpose(2, 0, 1))
-
-
-def _short(values: np.ndarray[Any, np.dtype[np.float32]]) -> list[str]:
-    """Shortest decimals that identify single-precision numbers."""
-    return [str(value) for value in values]
 
 
 _SECTIONS: tuple[type[Section], ...] = (
@@ -289,7 +281,7 @@ _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "
 
 
 def _physics(table: LocalizationTable) -> dict[str, Any]:
-    """All that a table must have of its rig, numbers with the units of the rig's file."""
+    """Return all of the rig that a table must have, with the units of the rig's file."""
     by_unit = {
         key: each.dimension.key(key)
         for section in _SECTIONS
@@ -303,7 +295,7 @@ def _physics(table: LocalizationTable) -> dict[str, Any]:
 
 
 def _exported(value: Any, names: Mapping[str, str]) -> Any:
-    """A value as .mat files have it; names: with units, by those of fields."""
+    """Convert a value for .mat files; names: with units, by names of fields."""
     if is_dataclass(value):
         each = {field.name: getattr(value, field.name) for field in fields(value)}
         return {names.get(key, key): _exported(own, names) for key, own in each.items()}
@@ -319,7 +311,7 @@ def _exported(value: Any, names: Mapping[str, str]) -> Any:
 
 
 def _structs(rows: list[dict[str, Any]]) -> np.ndarray[Any, np.dtype[Any]]:
-    """A struct array (n, 1) of rows; what a row has not is empty."""
+    """Make a struct array (n, 1) of rows; a field that a row lacks is empty."""
     names = dict.fromkeys(name for row in rows for name in row)
     structs = np.empty((len(rows), 1), dtype=[(name, object) for name in names])
     for number, row in enumerate(rows):

@@ -1,18 +1,16 @@
-"""What a table promises to accelerometers, and what they measured of it.
+"""What a table promises at accelerometers, and what they measure of it.
 
-Accelerometers stand for fingertips: patterns are asked for contacts at their places, of fingers
-without weight, since nothing touches the plate. The promise is what nine of ten plates within the
-rig's uncertainty give at these points, solved exactly; what fingers would feel over their whole
-tips is another number.
-
-The check of a table by what is measured, by the package that knows sound cards.
+Accelerometers stand for fingertips: patterns are for contacts at their places, of weightless
+fingers, since nothing touches the plate. The promise is what nine of ten plates within the rig's
+uncertainty give at these points, solved exactly; fingers would feel other numbers over their whole
+tips. The lab measures (`era_haptics.lab.measuring`), since it knows sound cards.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -36,22 +34,22 @@ _MAX_OTHERS = 3
 
 @dataclass(frozen=True)
 class Promise:
-    """A layer for a target and quiet places among sensors, and what it promises there.
-
-    sensors: names, the target's first; contrast_db: felt contrast that nine of ten plates give;
-    median_db: that every other one gives; level_db_sl: at the target on nine of ten plates.
-    """
+    """A layer for a target and quiet places among sensors, and what it promises there."""
 
     sensors: tuple[str, ...]
+    """Names of the sensors, the target's first."""
     layer: Layer
     contrast_db: float
+    """Felt contrast that nine of ten plates give."""
     median_db: float
+    """Felt contrast that half of the plates give."""
     level_db_sl: float
+    """Level at the target that nine of ten plates give."""
 
 
 @dataclass(frozen=True)
 class MeasuredPromise:
-    """A promise and what accelerometers measured: felt contrast [dB], level [dB SL]."""
+    """A promise, and the felt contrast and level that accelerometers measured."""
 
     promise: Promise
     contrast_db: float
@@ -65,7 +63,7 @@ class MeasuredPromise:
 
 @dataclass(frozen=True)
 class MeasuredVerification:
-    """All promises that were played."""
+    """The outcome of all promises that were played."""
 
     measured: tuple[MeasuredPromise, ...]
 
@@ -80,7 +78,7 @@ class MeasuredVerification:
         return self.kept_share >= MIN_KEPT_SHARE
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the outcome for programs."""
         return {
             "promises": [
                 {
@@ -111,10 +109,10 @@ def promises(
     level: float,
     seed: int,
 ) -> Iterator[Promise]:
-    """Promises for random sets of sensors, by name, with 1, 2, 3 quiet ones in turn.
+    """Yield promises for random sets of sensors, with 1, 2 and 3 quiet ones in turn.
 
-    level: of the loudest ERA in each, 0..1 of its stroke. Raises InputError for fewer than two
-    sensors 5 cm apart, and for those off the plate.
+    sensors: places [m] by name; level: of the loudest ERA in each promise, 0..1 of its stroke.
+    Raises InputError for fewer than two sensors 5 cm apart, and for sensors off the plate.
     """
     if len(sensors) < 2:
         raise InputError(f"sensors must be at two places or more, got {len(sensors)}")
@@ -124,7 +122,9 @@ def promises(
         names = _drawn(rng, sensors, others=1 + number % _MAX_OTHERS)
         target, *quiet = (sensors[name] for name in names)
         placed = Placement((target,), tuple(quiet))
-        layer = _at_level(query(weightless, placed).layers[0], table, level)
+        layer = query(weightless, placed).layers[0]
+        loudest = max(each["level"] for each in table.drive_of(layer.excitation).values())
+        layer = layer.scaled(float(decibels(np.array(level / loudest))))  # contrasts stay
         yield _promise(weightless, names, placed, layer, rng)
 
 
@@ -139,7 +139,7 @@ def measured_promise(
 def _drawn(
     rng: np.random.Generator, sensors: Mapping[str, Point], *, others: int
 ) -> tuple[str, ...]:
-    """Names of sensors 5 cm apart; fewer than wanted where they do not fit."""
+    """Draw names of sensors 5 cm apart; fewer than wanted if they do not fit."""
     names = list(sensors)
     for tries in range(_TRIES):
         count = min(len(names), 1 + max(1, others - tries // (_TRIES // _MAX_OTHERS)))
@@ -147,12 +147,6 @@ def _drawn(
         if are_apart(np.array([sensors[name] for name in drawn])):
             return tuple(drawn)
     raise InputError("sensors must be 5 cm apart, two of them at least, got none so; move them")
-
-
-def _at_level(layer: Layer, table: LocalizationTable, level: float) -> Layer:
-    """The layer with its loudest ERA at a level: contrasts stay."""
-    loudest = max(each["level"] for each in table.drive_of(layer.excitation).values())
-    return layer.scaled(float(decibels(np.array(level / loudest))))
 
 
 def _promise(
@@ -183,37 +177,23 @@ def _promise(
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """What `era table verify --device` was given.
-
-    sensors_file: of accelerometers; device: that records them and plays, unless url is an amplifier
-    that does; samples: promises to play; level: of the loudest ERA, None: half of what the rig's
-    limits allow.
-    """
+    """Settings of `era table verify --device`."""
 
     device: str
+    """Sound device that records the accelerometers, and plays unless there is a url."""
     sensors_file: Path
+    """File of the accelerometers."""
     url: str | None
+    """Amplifier that plays."""
     samples: int
+    """Number of promises to play."""
     seed: int
     level: float | None
-
-
-class TableCheck(Protocol):
-    """Plays promises of a table and measures them."""
-
-    def __call__(
-        self,
-        table: LocalizationTable,
-        rig: Rig,
-        settings: CheckSettings,
-        *,
-        progress: Progress,
-    ) -> MeasuredVerification:
-        """Raises InputError, LinkError."""
+    """Level of the loudest ERA, None for half of what the rig's limits allow."""
 
 
 _CHECK = "era_haptics.lab.measuring.table_measurement:check_table"
-"""By name: this package does not import the one beside it."""
+"""The check by measuring, by name: the model does not import the packages above it."""
 
 
 def check_by_measuring(
@@ -223,15 +203,15 @@ def check_by_measuring(
     *,
     progress: Progress,
 ) -> MeasuredVerification:
-    """Measure promises by the sound card's check."""
-    check: TableCheck = resolve_name(_CHECK)
+    """Play promises of a table and measure them; raises InputError, LinkError."""
+    check: Callable[..., MeasuredVerification] = resolve_name(_CHECK)
     return check(table, rig, settings, progress=progress)
 
 
 def plain_rig(table: LocalizationTable, *, level: float) -> Rig:
-    """The rig of a table without wiring of its own: its ERAs on channels 0, 1, ... in order.
+    """Make a rig from a table, with its ERAs on channels 0, 1, ... in order.
 
-    level: its limit, which a table does not know; frequencies are those of the table.
+    level: its limit, which a table does not have; its frequencies are the table's.
     """
     low, high = (float(table.frequencies[end]) for end in (0, -1))
     return Rig(

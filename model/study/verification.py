@@ -48,7 +48,7 @@ from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.spectral.direct_solution import Responder, direct_spectral_acceleration
-from model.spectral.modes import PlateMesh, SpectralMesh
+from model.spectral.modes import SpectralMesh
 from model.structure.attachments import (
     FingertipLoad,
     attached_stiffness,
@@ -68,27 +68,30 @@ from model.vibration import Excitation, base_amplitudes, tone_fields
 
 @dataclass(frozen=True, eq=False)
 class Plates:
-    """Factors of d plates relative to the modelled one.
-
-    thickness, loss (d,): of the plate; damping (d,): of the ERAs; stiffness (d, eras): of each ERA;
-    load (d, contacts): of each finger's dynamic stiffness; gain (d, eras): complex, of each ERA;
-    deviation (d, contacts): of the response at each finger, in errors of the field; modulus (d,):
-    of elasticity; feet (d, feet): of the stiffness of each foot. Further, places (d, eras, 2): by
-    how far each ERA is off [m]; harmonic (d, eras): complex second harmonic of each ERA's motion,
-    relative to its own.
-    """
+    """Parameters of d plates, as factors relative to the modelled one unless stated otherwise."""
 
     thickness: FloatArray
+    """Thickness (d,) of the plate."""
     loss: FloatArray
+    """Loss factor (d,) of the plate."""
     damping: FloatArray
+    """Damping (d,) of the ERAs."""
     stiffness: FloatArray
+    """Stiffness (d, eras) of each ERA."""
     load: FloatArray
+    """Dynamic stiffness (d, contacts) of each finger."""
     gain: ComplexArray
+    """Complex gain (d, eras) of each ERA."""
     deviation: ComplexArray
+    """Deviation (d, contacts) of the response at each finger, in errors of the field."""
     modulus: FloatArray
+    """Modulus of elasticity (d,)."""
     places: FloatArray
+    """Displacement (d, eras, 2) of each ERA from its place [m]."""
     harmonic: ComplexArray
+    """Second harmonic (d, eras) of each ERA's motion, relative to it."""
     feet: FloatArray
+    """Stiffness (d, feet) of each foot."""
 
 
 def draw_plates(
@@ -99,7 +102,7 @@ def draw_plates(
     count: int,
     contact_count: int,
 ) -> Plates:
-    """Draw plates on ERAs and feet: normal numbers, of logarithms for damping, loss, load, feet."""
+    """Draw plates; damping, loss, load and feet are log-normal, all else is normal."""
     era_count, foot_count = len(of.eras), len(feet_of(of.masses))
 
     def normal(*shape: int) -> FloatArray:
@@ -130,21 +133,14 @@ def draw_plates(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class LevelAndContrast:
-    """What fingers feel on d plates: amplitude to threshold at the weakest target (d,).
-
-    contrast (d,): of it to that at the loudest quiet point, None without quiet fingers.
-    """
-
-    level: FloatArray
-    contrast: FloatArray | None
-
-
 def felt_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
-) -> LevelAndContrast:
-    """What fingers feel of an excitation on plates; powers of its tones and harmonics add."""
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return what fingers feel of an excitation on d plates: level and contrast, both (d,).
+
+    Level is the amplitude to threshold at the weakest target, contrast its ratio to that at the
+    loudest quiet point, None without quiet fingers. Powers of tones and harmonics add.
+    """
     rows, power = powers_on(table, placed, excitation, plates)
     sensed = (power / table.thresholds[rows, None, None].astype(float) ** 2).sum(axis=0)
     sensed += harmonics_on(table, placed, excitation, plates)
@@ -153,14 +149,14 @@ def felt_on(
     count = len(placed.targets)
     level = means[:count].min(axis=0)
     if not placed.quiet:
-        return LevelAndContrast(level, None)
-    return LevelAndContrast(level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30))
+        return level, None
+    return level, level / np.maximum(np.sqrt(loudest[count:].max(axis=0)), 1e-30)
 
 
 def powers_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> tuple[IntArray, FloatArray]:
-    """Rows of an excitation's frequencies (m,), and squared amplitudes on plates (m, points, d).
+    """Return rows of an excitation's frequencies (m,) and squared amplitudes (m, points, d).
 
     At the fine points of `read_fingertips`, finger by finger.
     """
@@ -171,7 +167,7 @@ def powers_on(
 def harmonics_on(
     table: LocalizationTable, placed: Placement, excitation: Excitation, plates: Plates
 ) -> FloatArray:
-    """Power to threshold of an excitation's second harmonics on plates (points, d).
+    """Return the power to threshold of an excitation's second harmonics on plates, (points, d).
 
     At the points of `powers_on`.
     """
@@ -187,9 +183,9 @@ def harmonics_on(
 def amplitudes_on(
     table: LocalizationTable, points: Sequence[Point], excitation: Excitation, plates: Plates
 ) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (f,) [Hz] and amplitudes (f, points, d) [m/s²] where nothing touches the plate.
+    """Return frequencies (f,) [Hz] and amplitudes (f, points, d) [m/s²] on untouched plates.
 
-    points [m]; plates: of as many contacts as points, whose loads count for nothing.
+    points [m]; plates: with as many contacts as points, whose loads have no effect.
     """
     shapes = table.shapes_at(points)[:, None]
     rows, found = _responses(table, shapes, (), excitation, plates)
@@ -199,7 +195,7 @@ def amplitudes_on(
 def touched(
     table: LocalizationTable, placed: Placement
 ) -> tuple[FloatArray, Sequence[FingertipLoad]]:
-    """Shapes at the fine points of fingers (k, p, r), and their loads."""
+    """Return the shapes at the fine points of fingers (k, p, r), and their loads."""
     fine = read_fingertips(table, placed.contacts).fine.astype(float)
     return fine, fingertip_loads(table.fingertip, placed.contacts, placed.loads)
 
@@ -211,7 +207,7 @@ def _responses(
     excitation: Excitation,
     plates: Plates,
 ) -> tuple[IntArray, ComplexArray]:
-    """Rows of an excitation's frequencies (m,), and its accelerations (m, points, d) [m/s²]."""
+    """Return rows of an excitation's frequencies (m,), and accelerations (m, points, d) [m/s²]."""
     frequencies, bases = base_amplitudes(excitation, table.eras)
     rows = table.rows_of(frequencies)
     at = table.attached, rows, bases[:, None]
@@ -231,11 +227,11 @@ def accelerations_on(
     bases: ComplexArray,
     plates: Plates,
 ) -> ComplexArray:
-    """Acceleration (d, m, c, points) [m/s²] for base motions (m, c, eras) [m].
+    """Solve the acceleration (d, m, c, points) [m/s²] by base motions (m, c, eras) [m].
 
-    At rows (m,) of the frequencies of the attached plate, whose ERAs move as at the table's, and
-    points of shapes discs (k, p, r), each finger at the first point of its disc; without the
-    deviation of the field.
+    At rows (m,) of the frequencies of the attached plate, whose ERAs move as at the table's, and at
+    points of shapes discs (k, p, r). Each finger is at the first point of its disc; the deviation
+    of the field is not included.
     """
     check_scales(table.plate, plates.thickness, plates.modulus)
     w, eras = attached.omega[rows], table.eras
@@ -267,7 +263,7 @@ def accelerations_on(
 
 
 def _shifts(table: LocalizationTable, places: FloatArray) -> FloatArray:
-    """By how much the shapes at ERAs change that are off by places (d, n, 2) [m], (d, n, r)."""
+    """Return the change (d, n, r) of the shapes at ERAs that are off by places (d, n, 2) [m]."""
     known = footprints_of(table.eras)
     moved = np.repeat(known[None], len(places), axis=0)
     sides = np.array([table.plate.length, table.plate.width])
@@ -280,7 +276,7 @@ CONTENT_TOLERANCE = 1e-4
 """Relative L2 error of the content; the paper's plate has some 1e-5, on its coarsest mesh 2e-5."""
 
 MODAL_ERROR = 0.03
-"""What lossy layers and air couple among modes, relative to the field (`benchmarks.layers`)."""
+"""Coupling of modes by lossy layers and air, relative to the field (`benchmarks.layers`)."""
 
 ROUNDING_DB = 0.01
 
@@ -288,29 +284,29 @@ RASTER_ERROR = 2e-4
 """Interpolation error of a field on the raster, relative to its root mean square."""
 
 FINGER_ERROR = 7e-3
-"""What fingers deflect locally and the table's modes do not, relative to the same."""
+"""Local deflection under fingers that the table's modes lack, relative to the same."""
 
 TIME_TOLERANCE_DB = 1.0
 MAX_CONTRAST_IN_TIME_DB = 25.0
 
 PLATES = 200
-"""Plates drawn for each answer."""
+"""Number of plates drawn for each answer."""
 
 MIN_KEPT_SHARE = 0.8
-"""Of the plates that must keep a promise; nine of ten are expected, on average over answers."""
+"""Share of plates that must keep a promise; nine of ten are expected on average over answers."""
 
 SAMPLED_FREQUENCIES = 3
 
 _ALL_OVER = Grid(8, 6)  # where the root mean square is taken
 
 _WINDOW = 0.25  # s, in which steady amplitudes are read
-_LEFT = 1e-4  # of what the start excited, before they are
+_REMAINING = 1e-4  # share of the free vibration by the start that may be left then
 _MAX_DURATION = 20.0  # s
 
 
 @dataclass(frozen=True)
 class ContentCheck:
-    """A kind of content with its error and tolerance, relative L2."""
+    """Error and tolerance of a kind of content, relative L2."""
 
     name: str
     error: float
@@ -324,9 +320,9 @@ class ContentCheck:
 
 @dataclass(frozen=True)
 class AnswerCheck:
-    """An answer, its level [dB SL] and felt contrast [dB] predicted, solved directly, and in time.
+    """Level [dB SL] and felt contrast [dB] of an answer: predicted, solved directly, and in time.
 
-    The tolerances [dB] follow from `field_error`: more where less is left of the vibration.
+    The tolerances [dB] follow from `field_error`: they are larger where less vibration is left.
     """
 
     placed: Placement
@@ -340,7 +336,7 @@ class AnswerCheck:
 
     @property
     def is_passed(self) -> bool:
-        """Whether all are within their tolerances; NaN is not."""
+        """Whether all are within their tolerances; False for NaN."""
         level = abs(self.direct_level_db_sl - self.predicted_level_db_sl)
         contrast = abs(self.direct_contrast_db - self.predicted_contrast_db)
         predicted, in_time = (
@@ -361,7 +357,7 @@ class AnswerCheck:
 
 @dataclass(frozen=True)
 class PromiseCheck:
-    """Exact plates on which the answers keep their promised felt contrast: share, and number."""
+    """Share of exact plates on which answers keep their promised felt contrast."""
 
     kept_share: float
     plate_count: int
@@ -374,7 +370,7 @@ class PromiseCheck:
 
 @dataclass(frozen=True)
 class Verification:
-    """All recomputed content and answers."""
+    """The checks of all recomputed content and answers."""
 
     content: tuple[ContentCheck, ...]
     answer_checks: tuple[AnswerCheck, ...]
@@ -391,7 +387,7 @@ class Verification:
         return [check.is_passed for check in self.checks].count(False)
 
     def as_json(self) -> dict[str, Any]:
-        """All checks for programs."""
+        """Return all checks for programs."""
         return {
             "content": [
                 {"what": check.name, "relative_error": check.error, "passed": check.is_passed}
@@ -423,11 +419,11 @@ class Verification:
 
 
 def field_error(table: LocalizationTable, frequency: float) -> float:
-    """By how much the raster and the mesh may differ between their points, and fingers in them.
+    """Return the error of raster and mesh between their points, and of fingers on them.
 
-    Relative to the field's root mean square: next to nothing of polynomials of high degree;
-    elements of the first order make straight lines of a wave, the raster does not. Modes that
-    change with frequency are taken one by one.
+    Relative to the field's root mean square. Polynomials of high degree have next to none; elements
+    of the first order make straight lines of a wave, the raster does not. Modes that change with
+    frequency are computed one by one.
     """
     finger = 0.0 if table.fingertip is None else FINGER_ERROR
     return (
@@ -440,13 +436,6 @@ def field_error(table: LocalizationTable, frequency: float) -> float:
 
 def _modal_error(table: LocalizationTable) -> float:
     return 0.0 if table.modal_dispersion is None else MODAL_ERROR
-
-
-def _reference(rig: Rig, mesh: PlateMesh, free: FreePlate) -> Responder:
-    """The plate without modes, where that can be said of it."""
-    if isinstance(mesh, SpectralMesh) and not rig.plate.mode_deviations:
-        return partial(direct_spectral_acceleration, rig.plate, mesh)
-    return free.acceleration
 
 
 def verify_table(
@@ -465,13 +454,14 @@ def verify_table(
     """
     rng = np.random.default_rng(seed)
     free = solve_free_plate(rig.plate, table.mesh, frequency_max=float(table.frequencies[-1]))
-    respond = _reference(rig, table.mesh, free)
+    respond: Responder = free.acceleration
+    if isinstance(table.mesh, SpectralMesh) and not rig.plate.mode_deviations:  # without modes
+        respond = partial(direct_spectral_acceleration, rig.plate, table.mesh)
     content = tuple(_check_content(table, rig, respond, rng))
-    check = _AnswerChecker(table, rig, free, respond)
     answer_checks, kept = [], []
     for number in range(samples):
         answer = _random_answer(table, rng, others=1 + number % 3)
-        answer_checks.append(check(answer))
+        answer_checks.append(_check_answer(table, rig, free, respond, answer))
         kept.append(_kept_share(table, answer, rng))
         progress(number + 1, samples)
     promise = PromiseCheck(float(np.mean(kept)), samples * PLATES)
@@ -479,7 +469,7 @@ def verify_table(
 
 
 def _kept_share(table: LocalizationTable, answer: Answer, rng: np.random.Generator) -> float:
-    """Share of exact plates on which an answer keeps its promised felt contrast."""
+    """Return the share of exact plates on which an answer keeps its promised felt contrast."""
     layer, promise = answer.layers[0], answer.fingers[0].promised_contrast_db
     plates = draw_plates(
         rng,
@@ -488,7 +478,7 @@ def _kept_share(table: LocalizationTable, answer: Answer, rng: np.random.Generat
         of=table,
         contact_count=len(answer.fingers),
     )
-    contrast = felt_on(table, answer.placement(layer), layer.excitation, plates).contrast
+    _, contrast = felt_on(table, answer.placement(layer), layer.excitation, plates)
     if contrast is None or promise is None:
         return math.nan
     return float((decibels(contrast) >= promise - ROUNDING_DB).mean())
@@ -497,6 +487,7 @@ def _kept_share(table: LocalizationTable, answer: Answer, rng: np.random.Generat
 def _check_content(
     table: LocalizationTable, rig: Rig, respond: Responder, rng: np.random.Generator
 ) -> Iterator[ContentCheck]:
+    """Check fields on the raster and at the cells at some random frequencies."""
     count = min(SAMPLED_FREQUENCIES, len(table.frequencies))
     chosen = np.sort(rng.choice(len(table.frequencies), count, replace=False))
     points = np.concatenate([table.raster.points, table.cell_centres])
@@ -513,67 +504,61 @@ def _check_content(
 
 
 def _relative(found: NDArray[Any], exact: NDArray[Any]) -> float:
-    """The worst relative L2 error along the last axis."""
+    """Return the worst relative L2 error along the last axis."""
     size = np.linalg.norm(exact, axis=-1)
     return float((np.linalg.norm(found - exact, axis=-1) / size).max())
 
 
-class _AnswerChecker:
-    """Recomputes answers with the fingers on the plate."""
-
-    def __init__(
-        self, table: LocalizationTable, rig: Rig, free: FreePlate, respond: Responder
-    ) -> None:
-        self._table, self._rig, self._free, self._respond = table, rig, free, respond
-
-    def __call__(self, answer: Answer) -> AnswerCheck:
-        """One answer recomputed."""
-        rig, layer, target = self._rig, answer.layers[0], answer.fingers[0]
-        placed = answer.placement(layer)
-        contacts = placed.contacts
-        discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
-        weights = fingertip_weights(*contacts[0], rig.plate)
-        count = len(weights)
-        points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
-        fingers = fingertip_loads(rig.fingertip, contacts, placed.loads)
-        frequencies, everywhere = tone_fields(
-            layer.excitation,
-            rig.eras,
-            lambda f: self._respond(rig.eras, f, points, loads=[*rig.masses, *fingers]),
-        )
-        direct, rest = np.split(everywhere, [len(discs)], axis=1)
-        attached = footprints_of(rig.eras, rig.masses, fingers)
-        plate = plate_in_time(
-            reduce_free_plate(self._free, attached), rig.eras, loads=rig.masses, contacts=fingers
-        )
-        in_time = steady_in_time(plate, Transients(plate), layer.excitation, discs)
-        threshold = detection_threshold(frequencies, self._table.threshold)[:, None]
-        felt, felt_in_time, felt_elsewhere = (
-            np.linalg.norm(tones / threshold, axis=0) for tones in (direct, in_time, rest)
-        )
-        error = field_error(self._table, float(frequencies[-1]))
-        error *= math.sqrt(float((felt_elsewhere**2).mean()))
-        at_target = float(decibels(1 + error / (felt[:count] @ weights)))
-        at_quiet = float(decibels(1 + error / felt[count:].max()))
-        contrast = target.contrast_db
-        return AnswerCheck(
-            placed,
-            target.level_db_sl,
-            predicted_contrast_db=math.nan if contrast is None else contrast,
-            direct_level_db_sl=float(decibels(felt[:count] @ weights)),
-            direct_contrast_db=_contrast(felt, weights),
-            contrast_in_time_db=_contrast(felt_in_time, weights),
-            level_tolerance_db=ROUNDING_DB + at_target,
-            contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
-        )
+def _check_answer(
+    table: LocalizationTable, rig: Rig, free: FreePlate, respond: Responder, answer: Answer
+) -> AnswerCheck:
+    """Recompute an answer with its fingers on the plate, at frequencies and in time."""
+    layer, target = answer.layers[0], answer.fingers[0]
+    placed = answer.placement(layer)
+    contacts = placed.contacts
+    discs = np.concatenate([fingertip_points(*each, rig.plate) for each in contacts])
+    weights = fingertip_weights(*contacts[0], rig.plate)
+    count = len(weights)
+    points = np.concatenate([discs, _ALL_OVER.centres(rig.plate)])
+    fingers = fingertip_loads(rig.fingertip, contacts, placed.loads)
+    frequencies, everywhere = tone_fields(
+        layer.excitation,
+        rig.eras,
+        lambda f: respond(rig.eras, f, points, loads=[*rig.masses, *fingers]),
+    )
+    direct, rest = np.split(everywhere, [len(discs)], axis=1)
+    attached = footprints_of(rig.eras, rig.masses, fingers)
+    plate = plate_in_time(
+        reduce_free_plate(free, attached), rig.eras, loads=rig.masses, contacts=fingers
+    )
+    in_time = steady_in_time(plate, Transients(plate), layer.excitation, discs)
+    threshold = detection_threshold(frequencies, table.threshold)[:, None]
+    felt, felt_in_time, felt_elsewhere = (
+        np.linalg.norm(tones / threshold, axis=0) for tones in (direct, in_time, rest)
+    )
+    error = field_error(table, float(frequencies[-1]))
+    error *= math.sqrt(float((felt_elsewhere**2).mean()))
+    at_target = float(decibels(1 + error / (felt[:count] @ weights)))
+    at_quiet = float(decibels(1 + error / felt[count:].max()))
+    contrast = target.contrast_db
+    return AnswerCheck(
+        placed,
+        target.level_db_sl,
+        predicted_contrast_db=math.nan if contrast is None else contrast,
+        direct_level_db_sl=float(decibels(felt[:count] @ weights)),
+        direct_contrast_db=_contrast(felt, weights),
+        contrast_in_time_db=_contrast(felt_in_time, weights),
+        level_tolerance_db=ROUNDING_DB + at_target,
+        contrast_tolerance_db=ROUNDING_DB + at_target + at_quiet,
+    )
 
 
 def steady_in_time(
     plate: PlateInTime, transients: Transients, excitation: Excitation, points: FloatArray
 ) -> FloatArray:
-    """Amplitudes (f, p) [m/s²] at points [m] long after an excitation started from rest."""
+    """Return amplitudes (f, p) [m/s²] at points [m] long after an excitation started from rest."""
     slowest = -float(plate.eigenvalues.real.max())
-    settled = -math.log(_LEFT) / slowest if slowest > 0 else _MAX_DURATION
+    settled = -math.log(_REMAINING) / slowest if slowest > 0 else _MAX_DURATION
     duration = min(settled, _MAX_DURATION) + _WINDOW
     bases = ramped_onset(excitation, plate.eras, ramp=0.02)
     felt = transients.acceleration(bases, points, duration=duration)
@@ -586,13 +571,13 @@ def steady_in_time(
 
 
 def _contrast(felt: FloatArray, weights: FloatArray) -> float:
-    """Felt contrast [dB] of a target, whose points with their weights come first."""
+    """Return the felt contrast [dB] of a target, whose points come first, with their weights."""
     target, quiet = np.split(felt, [len(weights)])
     return float(contrast_db([target], quiet, [weights]))
 
 
 def _random_answer(table: LocalizationTable, rng: np.random.Generator, *, others: int) -> Answer:
-    """Contacts at least 5 cm apart, and the table's answer; where they do not fit, fewer."""
+    """Return the table's answer to random contacts 5 cm apart; fewer where they do not fit."""
     for tries in range(1000):
         count = 1 + max(1, others - tries // 200)
         with contextlib.suppress(InputError):

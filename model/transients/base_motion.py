@@ -9,7 +9,7 @@ import cmath
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
@@ -22,9 +22,10 @@ from model.vibration import Excitation
 
 
 class Term(NamedTuple):
-    """y(t) = Im[(c0 + c1 (t - start)) exp(i omega (t - start))] [m] while start <= t < end [s].
+    """A part of a base's motion, y(t) = Im[(c0 + c1 tau) exp(i omega tau)] [m], tau = t - start.
 
-    omega [rad/s]; c0 [m]; c1 [m/s]. The base moves as the sum of its terms; outside them it rests.
+    While start <= t < end [s]; omega [rad/s]; c0 [m]; c1 [m/s]. A base moves as the sum of its
+    terms and rests outside them.
     """
 
     start: float
@@ -39,16 +40,16 @@ Motion: TypeAlias = Sequence[Term]
 
 
 def rise(times: FloatArray, ramp: float) -> FloatArray:
-    """A raised cosine from 0 at time 0 to 1 from a ramp [s] on, at times [s] (n,)."""
+    """Return a raised cosine at times (n,) [s], from 0 at time 0 to 1 at the end of a ramp [s]."""
     return np.asarray((1 - np.cos(np.pi * np.clip(times / ramp, 0, 1))) / 2)
 
 
 def raised_cosine(
     start: float, ramp: float, omega: float, first: complex, last: complex
 ) -> tuple[Term, ...]:
-    """Terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
+    """Return the terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
 
-    a goes from first to last [m] within ramp [s] along a raised cosine, which is three terms, at
+    a goes from first to last [m] within ramp [s] along a raised cosine, which has three terms, at
     omega and omega +- pi / ramp, and stays there; a ramp of 0 is a jump.
     """
     settled = start + ramp
@@ -68,11 +69,11 @@ def raised_cosine(
 def along_lines(
     start: float, step: float, omega: float, values: Sequence[complex]
 ) -> tuple[Term, ...]:
-    """Terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
+    """Return the terms of Im[a(t) exp(i omega (t - start))] from start [s] on, omega [rad/s].
 
     a goes through values [m], one every step [s], along straight lines, and stays at the last.
     """
-    # Computed once: between a sum and a product, samples would belong to both terms or none.
+    # Computed once: rounded differently, ends and starts would overlap or leave samples out.
     moments = [start + number * step for number in range(len(values))]
     factors = [cmath.exp(1j * omega * number * step) for number in range(len(values))]
     terms = [
@@ -87,14 +88,14 @@ def along_lines(
 
 
 class BaseMotions:
-    """Sets of motions of all ERAs' bases, in terms that ascend in omega.
+    """Sets of motions of all ERAs' bases, as arrays over their terms, ascending in omega.
 
-    sets: in each the motion of each base. number, era (n,): set and base of each term; start, end
-    [s], omega, c0, c1 (n,): those of the terms, c1 None for 0. Terms that end by `since` [s] are
-    left out.
+    number, era (n,): set and base of each term; start, end [s], omega [rad/s], c0, c1 (n,): as in
+    `Term`, c1 None if all are 0.
     """
 
     def __init__(self, *sets: Sequence[Motion], since: float = -math.inf) -> None:
+        """Collect the terms of sets, each with the motion of every base, that end after `since`."""
         terms = [
             (number, era, *term)
             for number, motions in enumerate(sets)
@@ -112,7 +113,7 @@ class BaseMotions:
         self.c1: ComplexArray | None = np.array(c1, dtype=complex)[order] if any(c1) else None
 
     def moments(self, number: int, since: float, until: float) -> list[float]:
-        """When terms of a set start or end, after a time [s] and up to another, ascending."""
+        """Times [s] after since and up to until at which terms of a set start or end, ascending."""
         moments = self._moments.get(number)
         if moments is None:
             is_of_set = self.number == number
@@ -121,7 +122,7 @@ class BaseMotions:
         return moments[bisect_right(moments, since) : bisect_right(moments, until)]
 
     def active(self, numbers: ArrayLike, times: ArrayLike) -> NDArray[np.bool_]:
-        """Whether each term moves its base (k, n), if sets (k,) play at times (k,) [s]."""
+        """Mask (k, n) of the terms that move their bases, if sets (k,) play at times (k,) [s]."""
         now = np.asarray(times)[:, None]
         is_of_set = self.number == np.asarray(numbers)[:, None]
         return np.asarray(is_of_set & (self.start <= now) & (now < self.end))
@@ -135,15 +136,17 @@ KNOT_STEP = 0.005
 class BaseEnvelope:
     """Motion of an ERA's base, y(t) = Im[a(t) exp(2 pi i f t)] [m], with a(t) linear between knots.
 
-    a is `start` [m] at time 0, knots[k] [m] after k + 1 steps [s], and constant after the last
-    knot. frequency f [Hz]. The last knot is the final amplitude, unlike in the amplifier's
-    `drivers.command.Envelope`, where the command is.
+    The last knot is the final amplitude, unlike in the amplifiers' envelopes, where the command is.
     """
 
     frequency: float
+    """f [Hz]."""
     start: complex
+    """a [m] at time 0."""
     knots: tuple[complex, ...]
+    """a [m] after 1, 2, ... steps; constant after the last."""
     step: float = KNOT_STEP
+    """Time between knots [s]."""
 
     @property
     def duration(self) -> float:
@@ -156,13 +159,9 @@ class BaseEnvelope:
         return max(map(abs, (self.start, *self.knots)))
 
     def scaled(self, factor: float) -> "BaseEnvelope":
-        """Return it with all amplitudes times a factor."""
-        return BaseEnvelope(
-            self.frequency,
-            factor * self.start,
-            tuple([factor * each for each in self.knots]),
-            self.step,
-        )
+        """Return the envelope with all amplitudes multiplied by a factor."""
+        knots = tuple([factor * each for each in self.knots])
+        return replace(self, start=factor * self.start, knots=knots)
 
     def amplitude(self, times: FloatArray) -> ComplexArray:
         """Complex amplitude a [m] at times [s] (n,)."""
@@ -171,7 +170,7 @@ class BaseEnvelope:
         return np.asarray(np.interp(times, moments, values))
 
     def terms(self) -> tuple[Term, ...]:
-        """Motion of the base from time 0 on."""
+        """Return the motion of the base from time 0 on."""
         omega = 2 * math.pi * self.frequency
         return along_lines(0.0, self.step, omega, (self.start, *self.knots))
 
@@ -184,31 +183,31 @@ Bases: TypeAlias = tuple[tuple[Term, ...], ...]
 
 
 def ramped_onset(excitation: Excitation, eras: Sequence[Source], *, ramp: float) -> Bases:
-    """Motion of the bases when an excitation starts at time 0 along a raised cosine of ramp [s]."""
+    """Return the bases' motion if an excitation starts at time 0 along a raised cosine [s]."""
     return _faded(excitation, eras, ramp=ramp, gains=(0.0, 1.0))
 
 
 def ramped_ending(excitation: Excitation, eras: Sequence[Source], *, ramp: float) -> Bases:
-    """Motion of the bases when an excitation ends at time 0 along a raised cosine of ramp [s]."""
+    """Return the bases' motion if an excitation ends at time 0 along a raised cosine [s]."""
     return _faded(excitation, eras, ramp=ramp, gains=(1.0, 0.0))
 
 
 def ramped_pulse(
     excitation: Excitation, eras: Sequence[Source], *, ramp: float, duration: float
 ) -> Bases:
-    """Motion of the bases when an excitation starts at time 0 and ends after a duration [s].
+    """Return the bases' motion if an excitation starts at time 0 and ends after a duration [s].
 
-    Both along a raised cosine of ramp [s], at most the duration.
+    Both along a raised cosine of ramp [s], which is limited to the duration.
     """
     ramp = min(ramp, duration)
     onset = ramped_onset(excitation, eras, ramp=ramp)
-    # What rises from the end on is the tone itself, in opposite phase.
+    # From the end on the tone rises in opposite phase.
     release = _faded(excitation, eras, ramp=ramp, gains=(0.0, -1.0), start=duration)
     return tuple((*rise, *fall) for rise, fall in zip(onset, release, strict=True))
 
 
 def shaped(envelopes: Envelopes, eras: Sequence[Source]) -> Bases:
-    """Motion of the bases when envelopes begin at time 0."""
+    """Return the bases' motion if envelopes begin at time 0."""
     return tuple(envelopes[era.name].terms() if era.name in envelopes else () for era in eras)
 
 
@@ -220,7 +219,7 @@ def _faded(
     gains: tuple[float, float],
     start: float = 0.0,
 ) -> Bases:
-    """Motion of the bases from one gain of an excitation to another, from start [s] on."""
+    """Return the bases' motion from one gain of an excitation to another, from start [s] on."""
     found: list[tuple[Term, ...]] = [()] * len(eras)
     for number, era in enumerate(eras):
         if tone := excitation.get(era.name):

@@ -1,22 +1,18 @@
-"""How far the magnets of exciters move in time, and what keeps them within their excursion.
+"""How far the magnets of exciters move, and what keeps them within their excursion.
 
-An onset moves a magnet further than the settled vibration: the free vibration near its own
-resonance beats with the drive. A drive that rises or falls steadily, along whichever ramp, is a
-mean of drives that jump at different times; so it moves a magnet no further than the drive that
-jumps, with which shares of full level are counted; what comes and goes is followed
-(`model.transients.excursions`). Shaped envelopes rise above their last
-amplitude: of their difference to a plain ramp as much is kept as magnets allow.
+An onset moves a magnet further than the settled vibration: free vibration near its own resonance
+beats with the drive. A drive that rises or falls steadily, along whatever ramp, is a mean of drives
+that jump at different times, so it moves a magnet no further than a drive that jumps; shares of
+full level are computed for that (`MagnetMotions`). Levels that come and go are followed step by
+step (`Swing`): at the rate of the beat, 10 to 60 times a second, they pump the magnets' free
+vibration, since a side band is at their resonance. The eigenvectors near the drive are followed
+exactly, for straight lines between steps; those far above follow the level at once. Shaped
+envelopes rise above their final amplitude; as much of their difference to a plain ramp is kept as
+the magnets allow.
 
-Levels that come and go, and how far magnets of exciters move along them.
-
-A level that swings as often as drive and magnet beat, 10 to 60 times a second, pumps the free
-vibration of the magnets: its side band is at their resonance. In the eigenvectors near the drive
-that follows step by step, exactly for straight lines; those far above follow the level at once.
-
-From which frequency a rig reaches a level over its plate, and where it falls short.
-
-At each place, as the mean over a finger that rests there, all actuators are in phase at full level,
-or at the share of it that the rig's limits and the excursion of the magnets allow answers.
+`reach_of` finds from which frequency on a rig reaches a level over its whole plate. At each place,
+as the mean over a finger that rests there, all actuators add in phase, at full level or at the
+share of it that the rig's limits and the magnets' excursion allow.
 """
 
 import math
@@ -38,41 +34,40 @@ from model.transients.knots import RISE, SAMPLES
 from model.transients.time_response import PlateInTime, plate_in_time
 
 DECAYED = 0.25
-"""Time [s] after which little is left of a free vibration of magnets."""
+"""Time [s] after which little is left of the magnets' free vibration."""
 
 CLICKS_APART = 0.060
-"""Time [s] between the starts of clicks at least, at one finger or at several: nearer ones would be
-one."""
+"""Least time [s] between the starts of clicks, at one finger or several; closer ones merge."""
 
-_STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
-_PACES = 0.060  # s; from the shortest to the longest pause between what begins anew
-_NEAR, _BESIDE = 1.5, 50.0  # up to so many times the frequency of a drive, and so much above [Hz]
+_SWING_STEP = 0.002  # s; between samples: the beat with a magnet's own vibration takes 5 ms or more
+_PACES = 0.060  # s; from the shortest to the longest pause between repetitions
+_NEAR, _BESIDE = 1.5, 50.0  # near eigenvectors are below this multiple of a drive's, plus this [Hz]
 
 
 @dataclass(frozen=True)
 class Swing:
-    """A level over time: shares of full level, the first 0, a step [s] apart, lines between.
-
-    again: time [s] after which it may begin anew while it rings, infinite for never.
-    """
+    """A level that varies over time, linear between steps."""
 
     shares: tuple[float, ...]
+    """Shares of full level at each step, the first 0."""
     step: float
+    """Time between shares [s]."""
     again: float = math.inf
+    """Time [s] after which it may start again while the plate still rings, infinite for never."""
 
 
 def motions_along(
     plate: "PlateInTime", rows: ComplexArray, frequency: float, swing: Swing
 ) -> FloatArray:
-    """Largest motions (m,) [m] by drives at a frequency [Hz] whose full level swings, from rest.
+    """Return the largest motions (m,) [m] by drives at a frequency [Hz] along a swing, from rest.
 
-    rows (m, 2 r): motion of each in each eigenvector. Of all drives together, in those phases in
-    which the motions by each add; of what may begin anew over and over at the worst pace.
+    rows (m, 2 r): motion of each magnet in each eigenvector. For all drives at full level together,
+    in the phases in which their motions add, and at the worst pace of repetition.
     """
     s = 2j * math.pi * frequency
     settled = plate.following(np.array([s]))[0][0].T[:, :, None] * rows.T[:, None, :]
     near = np.abs(plate.eigenvalues) < 2 * math.pi * (_NEAR * frequency + _BESIDE)
-    parts = math.ceil(swing.step / _STEP)
+    parts = math.ceil(swing.step / _SWING_STEP)
     step, knots = swing.step / parts, len(swing.shares)
     level = np.interp(np.arange(parts * (knots - 1) + 1) / parts, np.arange(knots), swing.shares)
     rates: ComplexArray = plate.eigenvalues[near] - s
@@ -85,8 +80,8 @@ def motions_along(
     moved = np.tensordot(follows, settled[near], axes=1)
     moved += level[:, None, None] * settled[~near].sum(axis=0)
     largest = np.abs(moved).sum(axis=1).max(axis=0)
-    if swing.again < math.inf:  # phases go on from one to the next
-        for pause in np.arange(swing.again, swing.again + _PACES, _STEP):
+    if swing.again < math.inf:  # phases continue from one to the next
+        for pause in np.arange(swing.again, swing.again + _PACES, _SWING_STEP):
             count = math.ceil(pause / step)
             spare = np.pad(moved, ((0, -len(moved) % count), (0, 0), (0, 0)))
             anew = np.abs(spare.reshape(-1, count, *moved.shape[1:]).sum(axis=0))
@@ -94,52 +89,53 @@ def motions_along(
     return np.asarray(largest)
 
 
-_EXCURSIONS_STEP = 0.0005  # s
-_AFTER = 20  # steps after the last knot
-_KEPT, _SWINGS_KEPT = 16, 256
-_CHECKED = 1.0  # Hz between frequencies of a rig that are checked
+_JUMP_STEP = 0.0005  # s; between samples after a jump
+_AFTER = 20  # steps that are followed after the last knot
+_KEPT, _SWINGS_KEPT = 16, 256  # sizes of caches
+_CHECKED = 1.0  # Hz; between frequencies of a rig that are checked
 
 
 @dataclass(frozen=True, eq=False)
 class MagnetMotions:
-    """Motions of the m magnets that are limited, against their coils, by drives in full levels.
-
-    rows (m, 2 r): displacement of the coil in the magnet in each eigenvector; excursions (m,) [m].
-    """
+    """Motions of the m magnets of limited excursion against their coils."""
 
     plate: PlateInTime
     rows: ComplexArray
+    """Displacement (m, 2 r) of the coil in the magnet, in each eigenvector."""
     excursions: FloatArray
+    """Excursion (m,) of each magnet [m]."""
 
     @classmethod
     def of(cls, plate: PlateInTime) -> "MagnetMotions":
-        """Those of a plate; none where no source is limited."""
+        """Make the motions of a plate's magnets; empty if no source is limited."""
         limits = np.array([each.excursion for each in plate.eras])
         some = np.isfinite(limits)
         return cls(plate, plate.stretches[some] @ plate.displacement, limits[some])
 
     def shares(self, frequencies: FloatArray) -> FloatArray:
-        """Share of full level (f,), 1 at most, with which all may jump at frequencies [Hz]."""
+        """Share (f,) of full level, 1 at most, to which all may jump at frequencies [Hz]."""
         if not len(self.rows):
             return np.ones(len(frequencies))
         least: FloatArray = (self.excursions / self.by_jumps(frequencies)).min(axis=1)
         return np.asarray(np.minimum(least, 1.0))
 
     def share_along(self, frequency: float, swing: Swing) -> float:
-        """Share of full level, 1 at most, that may swing at a frequency [Hz]."""
+        """Share of full level, 1 at most, at which a level may swing at a frequency [Hz]."""
         return _share_along(self, frequency, swing)
 
     def by_jumps(self, frequencies: FloatArray) -> FloatArray:
         """Largest motions (f, m) [m] by drives that jump to full level at frequencies [Hz].
 
-        Of all together, in those phases in which the motions by each add; without fingers.
+        For all drives together, in the phases in which their motions add; without fingers.
         """
-        times = np.arange(0, DECAYED, _EXCURSIONS_STEP)
+        times = np.arange(0, DECAYED, _JUMP_STEP)
         decays = np.exp(np.outer(times, self.plate.eigenvalues))
         found = []
         for frequency in frequencies.tolist():
             s = 2j * math.pi * frequency
-            by_mode, settled = self._settled(s)
+            z = self.plate.following(np.array([s]))[0][0]
+            by_mode = (z.T[:, :, None] * self.rows.T[:, None, :]).reshape(z.shape[1], -1)
+            settled = by_mode.sum(axis=0)
             free = np.exp(-s * times)[:, None] * (decays @ by_mode)
             moved = np.abs(settled - free).reshape(len(times), -1, len(self.rows))
             steady = np.abs(settled).reshape(-1, len(self.rows)).sum(axis=0)
@@ -147,11 +143,11 @@ class MagnetMotions:
         return np.array(found)
 
     def within(self, frequency: float, knots: ComplexArray, *, full: float) -> ComplexArray:
-        """As much of a shape (n, eras) in full levels, first and last included, as magnets allow.
+        """Bring an envelope (n, eras) in full levels closer to a plain ramp, as far as necessary.
 
-        full: the share of full level that may jump. Each magnet may move by the part of its
-        excursion that the drives' steady amplitudes have of that share, so that those of several
-        contents may add.
+        Its first and last knots are steady amplitudes. full: share of full level to which drives
+        may jump. Each magnet may use the part of its excursion that the steady amplitudes have of
+        that share, so that the motions of several contents may add.
         """
         if not len(self.rows):
             return knots
@@ -168,9 +164,9 @@ class MagnetMotions:
         return np.asarray(plain + kept * (knots - plain))
 
     def largest(self, frequency: float, knots: ComplexArray) -> FloatArray:
-        """Largest motions (m,) [m] along an envelope (n, eras), steady at its first until time 0.
+        """Largest motions (m,) [m] along an envelope (n, eras) at a frequency [Hz], in any phase.
 
-        At a frequency [Hz], in whichever phase of it.
+        Until time 0 the drives are steady at the first knot.
         """
         ramps, settled = _ramps_of(self, frequency)
         count = (len(knots) + _AFTER) * SAMPLES
@@ -181,15 +177,8 @@ class MagnetMotions:
             moved[since:] += np.tensordot(ramps[: count - since], change, axes=(1, 0))
         return np.asarray(np.abs(moved).max(axis=0))
 
-    def _settled(self, s: complex) -> tuple[ComplexArray, ComplexArray]:
-        """Settled motions by each source, by eigenvector (2 r, eras m), and all in all."""
-        z = self.plate.following(np.array([s]))[0][0]
-        by_mode = z.T[:, :, None] * self.rows.T[:, None, :]
-        flat = by_mode.reshape(len(by_mode), -1)
-        return flat, flat.sum(axis=0)
 
-
-@lru_cache(_SWINGS_KEPT)  # of an answer that is asked for several times
+@lru_cache(_SWINGS_KEPT)  # the same answer is computed several times
 def _share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> float:
     moved = motions_along(magnets.plate, magnets.rows, frequency, swing)
     return min(1.0, float((magnets.excursions / moved).min()))
@@ -197,7 +186,7 @@ def _share_along(magnets: MagnetMotions, frequency: float, swing: Swing) -> floa
 
 @lru_cache(_KEPT)
 def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, ComplexArray]:
-    """Motions by each at full level per step since time 0, (t, eras, m), and settled ones.
+    """Return motions (t, eras, m) by levels that rise by one per step, and settled ones (eras, m).
 
     Long enough for every onset.
     """
@@ -212,16 +201,16 @@ def _ramps_of(magnets: MagnetMotions, frequency: float) -> tuple[ComplexArray, C
 
 
 def magnets_of(rig: Rig, free: FreePlate) -> MagnetMotions:
-    """Those of a rig; free: its plate."""
+    """Make the motions of a rig's magnets; free: the rig's plate."""
     reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
     return MagnetMotions.of(plate_in_time(reduced, rig.eras, loads=rig.masses))
 
 
 def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> ComplexArray:
-    """Settled motion of each exciter's coil in its magnet by each actuator, (f, eras, m) [m].
+    """Return the settled motion of each exciter's coil in its magnet, (f, eras, m) [m].
 
-    At full level: T (w - y), of the plate's motion w and the base y that stands for the current
-    (`Exciter.base`). free: the rig's plate. Without fingers, under which it moves less.
+    By each actuator at full level: T (w - y), with the plate's motion w and the base y that
+    stands for the current (`Exciter.base`). free: the rig's plate. Without fingers: they reduce it.
     """
     exciters, omega = exciters_of(rig), 2 * np.pi * frequencies
     places = np.array([[one.x, one.y] for one in exciters])
@@ -234,7 +223,7 @@ def relative_motions(rig: Rig, free: FreePlate, frequencies: FloatArray) -> Comp
 
 
 def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
-    """The excursions within the rig's frequencies and by its level; free: its plate, if solved."""
+    """Compute the excursions at the rig's frequencies and level; free: its plate, if solved."""
     limits, exciters = rig.limits, exciters_of(rig)
     low, high = limits.frequency_min, limits.frequency_max
     frequencies = np.append(np.arange(low, high, _CHECKED), high)
@@ -255,10 +244,10 @@ def excursions_of(rig: Rig, free: FreePlate | None = None) -> Excursions:
 
 
 MARGIN = 0.02
-"""Strip along the edges [m] that is left out."""
+"""Width of the strip along the edges [m] that is left out."""
 
 UP_TO, STEP = 300.0, 10.0
-"""Up to where frequencies are compared, and their step [Hz]."""
+"""Highest frequency of a reach, and the step of frequencies [Hz]."""
 
 _SPACING = 0.012  # m
 _AT_ONCE = 40  # places
@@ -266,30 +255,23 @@ _AT_ONCE = 40  # places
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Least level [dB SL] over the plate (f,) at frequencies (f,) [Hz], and the share of places.
-
-    shares (f,): of the places that reach `STRONG_DB_SL`.
-    """
+    """Levels that a rig reaches over its plate."""
 
     frequencies: FloatArray
+    """Frequencies (f,) [Hz]."""
     least_db_sl: FloatArray
+    """Least level over the plate (f,)."""
     shares: FloatArray
+    """Share (f,) of the places that reach STRONG_DB_SL."""
 
     @property
     def start(self) -> float | None:
-        """The lowest frequency [Hz] at which all places reach the level; None where none does."""
+        """Lowest frequency [Hz] at which all places reach the level, None if there is none."""
         whole = self.frequencies[self.shares == 1]
         return float(whole[0]) if len(whole) else None
 
-    @property
-    def falls_short(self) -> dict[float, float]:
-        """Share of the places that reach the level, by frequency above the start [Hz]."""
-        pairs = zip(self.frequencies.tolist(), self.shares.tolist(), strict=True)
-        start = -np.inf if self.start is None else self.start
-        return {frequency: share for frequency, share in pairs if share < 1 and frequency > start}
-
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the reach for programs."""
         return {
             "level_db_sl": STRONG_DB_SL,
             "from_hz": self.start,
@@ -300,7 +282,7 @@ class Reach:
 
 
 def reach_of(rig: Rig, free: FreePlate) -> Reach:
-    """Reach of a rig as its file has it up to UP_TO within its limits; free: its plate."""
+    """Compute the reach of a rig within its limits, up to UP_TO; free: the rig's plate."""
     plate, limits = rig.plate, rig.limits
     low = limits.frequency_min
     frequencies = np.arange(low, min(limits.frequency_max, max(UP_TO, low)) + 1e-9, STEP)
@@ -330,7 +312,7 @@ def reach_of(rig: Rig, free: FreePlate) -> Reach:
 
 
 def _held(rig: Rig, free: FreePlate, places: FloatArray, frequencies: FloatArray) -> FloatArray:
-    """By which factor a finger at a place lowers the motion there, 1 + D R of either, (f, p)."""
+    """Factor (f, p) by which a finger at a place reduces the motion there, 1 + D R."""
     if rig.fingertip is None:
         return np.ones((len(frequencies), len(places)))
     attached = (*rig.eras, *rig.masses)

@@ -1,24 +1,22 @@
-"""Optimal knots: minima of quadratic forms of the vibration at fingers and over the plate.
+"""Optimal knots of onsets and endings, which minimise the vibration at fingers and over the plate.
 
 Forms are over knots and ERAs, knots * eras rows, ERAs running fastest; amplitudes are in strokes.
 Gains and phases of the ERAs are known to a few percent and degrees only (the rig's `uncertainty`):
 with a complex factor 1 + d_e for ERA e the expected form grows by var(d) times each ERA's own part.
 Every form includes that, so that the minimum does not rely on exact cancellation.
 
-The basis of piecewise linear envelopes are hat functions, with responses in closed form. A hat is a
+The basis of piecewise linear envelopes is hat functions, with responses in closed form. A hat is a
 drive at a carrier exp(s t) that rises from zero to an ERA's full stroke in one step and falls to
-zero in the next. An envelope linear between knots is a sum of hats, one for each knot, and the
-responses to hats differ only by a shift in time: one response for each ERA serves all knots.
-Responses are demodulated: without the factor exp(s t), as the envelopes are.
+zero in the next. An envelope that is linear between knots is a sum of hats, one for each knot, and
+the responses to hats differ only by a shift in time: one response for each ERA serves all knots.
+Responses are demodulated: without the factor exp(s t), as the envelopes are. The response to a
+linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t) in the coordinates
+of `PlateInTime`; that to a hat is its second difference.
 
-The response to a linear ramp t / step from time 0 on is z(t) = a0 + a1 t - a0 exp((lambda - s) t)
-in the coordinates of `PlateInTime`; that to a hat is its second difference.
-
-Of many ERAs an onset takes a few combinations: the pattern's, and those that move the fingers most.
-What the others would add they would hardly do. Minima have bounded magnitudes of their complex
-knots: none exceeds the stroke. Single precision changes contrasts by some hundredths of a decibel.
-
-Knots of onsets and endings by one call of a kernel in C, or in numpy without a compiler.
+With many ERAs an onset uses a few combinations of them: the pattern's, and those that move the
+fingers most; others would hardly contribute. Magnitudes of the complex knots are bounded: none
+exceeds the stroke. Single precision changes contrasts by some hundredths of a decibel. Knots are
+found by one call of a kernel in C, or in numpy without a compiler.
 """
 
 import math
@@ -37,7 +35,7 @@ from model.transients.base_motion import KNOT_STEP
 from model.transients.time_response import PlateInTime
 
 Complex: TypeAlias = NDArray[np.complexfloating[Any, Any]]
-"""Of either precision."""
+"""Complex arrays of either precision."""
 
 ONSET_KNOTS = 21
 """Knots of an onset; the last, after 105 ms, is the pattern's amplitude."""
@@ -52,7 +50,7 @@ ENDING_KNOTS = 8
 TARGET_WEIGHT = 2.0
 
 RISE = 0.040
-"""How long [s] a target takes to full vibration along its raised cosine."""
+"""Time [s] in which a target rises to full vibration, along a raised cosine."""
 
 SAMPLES = 5  # for each step; a demodulated response changes little within a millisecond
 STEPS = ONSET_KNOTS + 9  # of an onset, until the plate has settled
@@ -65,35 +63,40 @@ RIDGE = 1e-6
 class Carrier:
     """Responses at one frequency that do not depend on the contacts, each ERA at full stroke.
 
-    Accelerations of the reduced coordinates. hats (samples, r, knots, eras): during the last step,
-    of a hat at each knot; they are those of one knot during all steps. steady (eras, r);
-    residual_form: form of the plate's mean square after an ending, its first block for the tone
-    that ends; gain_variance: var(d).
+    Responses are accelerations of the reduced coordinates.
     """
 
     hats: Complex64Array
+    """Response (samples, r, knots, eras) to a hat at each knot, during the last step.
+
+    Equally, the response to one hat during all steps.
+    """
     steady: ComplexArray
+    """Steady response (eras, r)."""
     residual_form: Complex64Array
+    """Form of the plate's mean square after an ending; the first block is of the tone that ends."""
     gain_variance: float
+    """var(d)."""
 
 
 @dataclass(frozen=True, eq=False)
 class FingerResponses:
-    """Responses of some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers.
-
-    hats (samples, t + d, knots, eras), steady (t + d, eras); combinations of ERAs in an onset.
-    """
+    """Responses to some ERAs, as in `Carrier`, at t targets and at d rows of quiet fingers."""
 
     targets: int
+    """t."""
     hats: Complex64Array
+    """Responses to hats (samples, t + d, knots, eras)."""
     steady: ComplexArray
+    """Steady responses (t + d, eras)."""
     combinations: int
+    """Number of combinations of ERAs in an onset."""
 
 
 def solve_carrier(
     plate: PlateInTime, frequency: float, *, residual_form: ComplexArray, gain_variance: float
 ) -> Carrier:
-    """Solve one frequency [Hz]; residual_form: `hats.mean_square` for the time after an ending."""
+    """Solve one frequency [Hz]; residual_form: `mean_square` for the time after an ending."""
     omega = 2 * math.pi * frequency
     steady = -(omega**2) * steady_states(plate, omega) @ plate.displacement.T
     hats = hat_accelerations(plate, omega, step=KNOT_STEP, steps=STEPS, samples=SAMPLES)
@@ -113,9 +116,9 @@ def solve_carrier(
 def onset_by_numpy(
     amplitudes: ComplexArray, found: FingerResponses, gain_variance: float
 ) -> ComplexArray:
-    """Find all knots (free, eras) in strokes but the last, the amplitudes (eras,).
+    """Find the knots (free, eras) of an onset in strokes, all but the last.
 
-    found: of these ERAs.
+    The last are the amplitudes (eras,). found: responses to these ERAs.
     """
     t, free = found.targets, ONSET_KNOTS - 1
     steady = amplitudes * found.steady
@@ -136,7 +139,7 @@ def onset_by_numpy(
 
 
 def _combinations(hats: Complex64Array, amplitudes: ComplexArray, count: int) -> Complex64Array:
-    """Orthonormal combinations (eras, c) of ERAs, the amplitudes among them."""
+    """Return orthonormal combinations (eras, c) of ERAs whose span includes the amplitudes."""
     eras = len(amplitudes)
     if eras <= count:
         return np.eye(eras, dtype=np.complex64)
@@ -147,14 +150,14 @@ def _combinations(hats: Complex64Array, amplitudes: ComplexArray, count: int) ->
 
 
 def risen() -> FloatArray:
-    """The raised cosine of the targets at each sample of each step, (steps, samples)."""
+    """Return the targets' raised cosine at each sample of each step, (steps, samples)."""
     times = KNOT_STEP * (np.arange(STEPS * SAMPLES) + 0.5) / SAMPLES
     return base_motion.rise(times, RISE).reshape(STEPS, SAMPLES)
 
 
 @cache
 def _rises() -> Float32Array:
-    """The raised cosine as the hat of each knot meets it.
+    """Return the raised cosine at the times of each knot's hat.
 
     By knot, and by sample and knot of `Carrier.hats`.
     """
@@ -171,10 +174,10 @@ def ending_by_numpy(
     found: FingerResponses | None,
     weight: float,
 ) -> ComplexArray:
-    """Find all knots (free, active) in strokes but the last, which are zero.
+    """Find the knots (free, active) in strokes of an ending that brings the whole plate to rest.
 
-    amplitudes (eras,). The whole plate comes to rest. found: of the active ERAs, with quiet fingers
-    that stay quiet meanwhile.
+    All but the last knots, which are zero. amplitudes (eras,); found: responses to the active ERAs
+    at quiet fingers that are kept quiet meanwhile.
     """
     eras, total = len(active), len(amplitudes)
     start = amplitudes[active]
@@ -194,16 +197,16 @@ def ending_by_numpy(
 def while_ending(
     found: FingerResponses, start: ComplexArray, gain_variance: float
 ) -> tuple[Complex, Complex]:
-    """Form and right side of the mean square at quiet fingers in an ending.
+    """Return form and right-hand side of the mean square at quiet fingers during an ending.
 
-    An ending from a start (eras,) is the steady tone, and at each knot a hat of what the knot is
-    above the start.
+    An ending from a start (eras,) is the steady tone, plus a hat at each knot of the knot's
+    difference to the start.
     """
     count = ENDING_KNOTS * SAMPLES
     hats = found.hats[:, found.targets :, -ENDING_KNOTS:]
     form = _summed(hats / np.float32(math.sqrt(count)), gain_variance)
     tones = start * found.steady[found.targets :]
-    tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # as errors have it
+    tones = tones.sum(axis=1, keepdims=True) + gain_variance * tones  # with errors, as the form
     by_knot = (hats.sum(axis=0).conj() * tones[:, None]).sum(axis=0)
     along = by_knot[::-1].cumsum(axis=0)[::-1].ravel() / count
     free = len(form) - len(start)
@@ -212,16 +215,16 @@ def while_ending(
 
 
 def _expected_power(responses: ComplexArray, gain_variance: float) -> float:
-    """Expected sum of squares over rows of all ERAs together (d, eras) under their errors."""
+    """Return the expected sum of squares over rows (d, eras) of all ERAs with their errors."""
     together = np.linalg.norm(responses.sum(axis=1)) ** 2
     return float(together + gain_variance * np.linalg.norm(responses) ** 2)
 
 
 def _summed(responses: Complex, gain_variance: float) -> Complex:
-    """Expected form over knots and ERAs, summed over time, of the squares over samples and rows.
+    """Return the expected form over knots and ERAs of squares, summed over samples, rows and steps.
 
-    responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before
-    the last, each hat is as that of the next knot in the last step, and so on.
+    responses (samples, d, knots, eras) as in `FingerResponses.hats`. In the step before the last,
+    each hat responds like that of the next knot in the last step, and so on.
     """
     knots, eras = responses.shape[2:]
     flat = responses.reshape(-1, knots * eras)
@@ -235,23 +238,23 @@ def _summed(responses: Complex, gain_variance: float) -> Complex:
 
 
 def _add_errors(form: Complex, eras: int, gain_variance: float) -> None:
-    """Add to a form what errors of the ERAs do: more of the parts of one ERA each."""
+    """Add the effect of the ERAs' errors to a form: more of the parts of a single ERA."""
     knots = len(form) // eras
     own = np.einsum("kele->kle", form.reshape(knots, eras, knots, eras))
     own *= np.float32(1 + gain_variance)
 
 
 def steady_states(plate: PlateInTime, omega: float) -> ComplexArray:
-    """Steady state z of the plate at omega [rad/s], each ERA alone at full stroke, (eras, 2 r)."""
+    """Return the steady state z (eras, 2 r) at omega [rad/s], by each ERA at full stroke."""
     return np.asarray(plate.following(np.array([1j * omega]))[0][0])
 
 
 def hat_accelerations(
     plate: PlateInTime, omega: float, *, step: float, steps: int, samples: int
 ) -> ComplexArray:
-    """Acceleration of the reduced coordinates after a hat on each ERA began, (n, eras, r).
+    """Return the acceleration (n, eras, r) of the reduced coordinates after the start of a hat.
 
-    omega [rad/s]; step [s]: from the start of a hat to its top. n = steps * samples times, at the
+    omega [rad/s]; step [s]: from the start of a hat to its top. n = steps * samples times, in the
     middle of each interval, since the force jumps at knots.
     """
     s = 1j * omega
@@ -269,10 +272,10 @@ def hat_accelerations(
 
 
 def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) -> ComplexArray:
-    """State z at the end of an ending of the given steps, (2 r, steps, eras), at full stroke.
+    """Return the state z (2 r, steps, eras) at the end of an ending, at full stroke.
 
-    First for the tone that was steady before and falls to zero within one step; then for a hat
-    whose top is after step 1, 2, ...
+    First for a steady tone that falls to zero within one step, then for hats whose tops are after
+    step 1, 2, ...
     """
     s = 1j * omega
     steady, slope = (each[0] for each in plate.following(np.array([s])))
@@ -288,7 +291,7 @@ def ending_states(plate: PlateInTime, omega: float, *, step: float, steps: int) 
 
 
 def mean_square(plate: PlateInTime, duration: float) -> ComplexArray:
-    """Hermitian form W (2 r, 2 r) of a free vibration's mean square over duration T [s].
+    """Return the Hermitian form W (2 r, 2 r) of a free vibration's mean square over T [s].
 
     z0^H W z0 = 2 <(1/T) int |q''|^2 dt>, mean over the phase of the state z0 at the start. With
     mass-normalised coordinates |q''|^2 is the plate's mass times its mean square acceleration.
@@ -306,11 +309,11 @@ ITERATIONS = 30
 
 
 def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array) -> ComplexArray:
-    """Minimise x^H form x - 2 Re right^H x where no ERA exceeds its stroke; its knots (k, eras).
+    """Minimise x^H form x - 2 Re right^H x such that no ERA exceeds its stroke; return the knots.
 
-    form: over knots and combinations, a positive semidefinite one; right (k, c); combinations
-    (eras, c): orthonormal. The unbounded solution where it is within the bounds; otherwise by
-    alternating directions (ADMM: Boyd and others, 2011, section 5), whose result is so exactly.
+    form: positive semidefinite, over knots and combinations; right (k, c); combinations (eras, c):
+    orthonormal. Returns knots (k, eras): the unbounded solution if it is within the bounds, else
+    that of alternating directions (ADMM: Boyd and others, 2011, section 5), always within them.
     """
     unit, size = np.eye(len(form)), float(form.diagonal().real.mean())
     to_knots, back = combinations.T, combinations.conj()
@@ -329,11 +332,11 @@ def bounded_minimum(form: Complex, right: Complex, combinations: Complex64Array)
             relaxed = RELAXATION * knots + (1 - RELAXATION) * feasible + dual
             feasible = _within(relaxed)
             dual = relaxed - feasible
-    return np.asarray(feasible * (1 - 1e-12), dtype=complex)  # whatever rounding does
+    return np.asarray(feasible * (1 - 1e-12), dtype=complex)  # within bounds despite rounding
 
 
 def _within(knots: Complex) -> Complex:
-    """Reduced to magnitudes of 1 at most."""
+    """Limit magnitudes to 1; returns the same array if none is larger."""
     sizes = np.abs(knots)
     return np.asarray(knots / np.maximum(sizes, 1)) if sizes.max() > 1 else knots
 
@@ -349,7 +352,7 @@ def onset_knots(
 ) -> ComplexArray:
     """Find start and knots (1 + ONSET_KNOTS, eras) in strokes, from rest to amplitudes (eras,).
 
-    found: of these ERAs.
+    found: responses to these ERAs.
     """
     knots = np.zeros((1 + ONSET_KNOTS, len(amplitudes)), dtype=complex)
     knots[-1] = amplitudes
@@ -364,7 +367,7 @@ def ending_knots(
 ) -> ComplexArray:
     """Find start and knots (1 + ENDING_KNOTS, active) in strokes, from amplitudes (eras,) to rest.
 
-    found: of the active ERAs, with quiet fingers that stay quiet meanwhile.
+    found: responses to the active ERAs at quiet fingers that are kept quiet meanwhile.
     """
     knots = np.zeros((1 + ENDING_KNOTS, len(active)), dtype=complex)
     knots[0] = amplitudes[active]
@@ -380,7 +383,7 @@ def ending_knots(
 def quiet_weight(
     carrier: Carrier, amplitudes: ComplexArray, active: IntArray, found: FingerResponses
 ) -> float:
-    """Weight of the mean square at quiet fingers in an ending, as `ending_by_numpy` has it."""
+    """Return the weight of the mean square at quiet fingers in an ending (`ending_by_numpy`)."""
     vibration = np.linalg.norm(amplitudes @ carrier.steady)
     target = np.linalg.norm(found.steady[: found.targets] @ amplitudes[active])
     return float(_QUIET_WEIGHT * (vibration / target) ** 2)
@@ -394,7 +397,7 @@ def _found_by_kernel(
     *,
     is_ending: bool,
 ) -> bool:
-    """Fill in all knots but the first and the last; False without a compiler."""
+    """Fill in all knots but the first and the last by a kernel; return False without a compiler."""
     by = kernels()
     if by is None:
         return False
@@ -409,8 +412,16 @@ def _found_by_kernel(
 
 @cache
 def _rules() -> Shaping:
+    """Pack the constants of shaping for kernels."""
     rules = Shaping(
-        *(SAMPLES, STEPS, ONSET_KNOTS, ENDING_KNOTS, ITERATIONS, RIDGE, PENALTY, RELAXATION)
+        samples=SAMPLES,
+        steps=STEPS,
+        knots=ONSET_KNOTS,
+        ending_knots=ENDING_KNOTS,
+        iterations=ITERATIONS,
+        ridge=RIDGE,
+        penalty=PENALTY,
+        relaxation=RELAXATION,
     )
     rules.point(rise=risen())
     return rules

@@ -1,19 +1,16 @@
-"""Shaped onsets and endings: envelopes that keep quiet fingers quiet, and that stop the plate.
+"""Shaped onsets and endings, and measures of them: transient contrast and residual vibration.
 
-Onset. Least squares over the knots of every ERA: each target follows its steady vibration times a
-raised cosine, each quiet fingertip stays still, from the first millisecond until the plate has
+Onset: least squares over the knots of every ERA. Each target follows its steady vibration times a
+raised cosine and each quiet fingertip stays still, from the first millisecond until the plate has
 settled.
 
-Ending. The plate's mean square over the time after the last knot is a quadratic form of its state
+Ending: the plate's mean square over the time after the last knot is a quadratic form of its state
 then, and so of the knots; the ending minimises it. It depends neither on the contacts nor on the
-carrier's phase at that moment. Known quiet fingers are kept quiet during the ending, too: stopping
-the plate takes other vibrations than the pattern's.
+phase of the carrier at that moment. Known quiet fingers are kept quiet during the ending, too:
+stopping the plate takes other vibrations than the pattern's.
 
-Both are robust against errors of the ERAs (`model.transients.knots`), and no knot ever exceeds the
-stroke (`model.transients.knots`), nor moves a magnet further than it may
-(`model.transients.excursions`).
-
-Measures of onsets and endings: transient contrast, and the residual vibration of the plate.
+Both are robust against errors of the ERAs; no knot exceeds the stroke (`model.transients.knots`),
+and none moves a magnet further than it may (`model.transients.excursions`).
 """
 
 import math
@@ -57,20 +54,20 @@ ENDING_WINDOW = 0.100
 """Time [s] after the last motion of a base over which an ending is measured."""
 
 SAMPLE_RATE = 8000.0
-"""Sixteen samples to a period of 500 Hz [Hz], so that a peak is found within 2 %."""
+"""Rate [Hz] of sixteen samples per period of 500 Hz, so that a peak is found within 2 %."""
 
-_FINE = 32  # samples; near the root of those of an onset
+_FINE = 32  # samples; about the square root of their number in an onset
 
 
 class _Piece(NamedTuple):
-    """A time [s] without changes: number of its forced solution, free part z, and z at its end."""
+    """An interval [s] without changes of the drives."""
 
     since: float
     until: float
     forced: ForcedVibration
-    number: int
-    free: ComplexArray
-    last: ComplexArray
+    number: int  # of its forced solution
+    free: ComplexArray  # z of the free part at its start
+    last: ComplexArray  # z at its end
 
 
 class Transients:
@@ -99,8 +96,8 @@ class Transients:
     ) -> float:
         """Contrast [dB] of the peaks over the first 100 ms of bases that start from rest.
 
-        Of what skin can feel of them (`model.finger`); mean over the points of the
-        weakest target to the loudest quiet point; positions in m.
+        For the part that skin can feel (`model.finger`): mean over the points of the weakest target
+        to the loudest quiet point; positions in m.
         """
         plate = self._plate.reduced.plate
         discs = [fingertip_points(*each, plate) for each in (*targets, *quiet)]
@@ -119,9 +116,9 @@ class Transients:
         duration: float = ONSET_WINDOW,
         after: Excitation | None = None,
     ) -> FloatArray:
-        """Acceleration [m/s²] at points [m] (p, 2) from time 0 on, every 1 / SAMPLE_RATE, (n, p).
+        """Acceleration (n, p) [m/s²] at points (p, 2) [m] from time 0 on, every 1 / SAMPLE_RATE.
 
-        after: the excitation that had been steady before; None for rest.
+        after: the excitation that was steady before, None for rest.
         """
         plate = self._plate
         shapes = plate.shapes_at(points)
@@ -172,7 +169,7 @@ class Transients:
         return 10 * math.log10(remaining / power)
 
     def _pieces(self, bases: Bases, total: ComplexArray, duration: float) -> Iterator[_Piece]:
-        """From time 0 to a duration [s], from a state z (2 r,), between changes of the bases."""
+        """Yield the intervals between changes of the bases, from a state z (2 r,) at time 0."""
         motions = BaseMotions(bases)
         edges = sorted({0.0, *motions.moments(0, 0.0, duration), duration})
         forced = self._plate.driven(motions, [0] * len(edges), edges)
@@ -183,7 +180,7 @@ class Transients:
             yield _Piece(since, until, forced, number, free, total)
 
     def _steady(self, excitation: Excitation) -> ComplexArray:
-        """Steady state (2 r,) at time 0, the reference of phases."""
+        """Return the steady state z (2 r,) at time 0, the reference of phases."""
         state = np.zeros(len(self._plate.eigenvalues), dtype=complex)
         for number, era in enumerate(self._plate.eras):
             tone = excitation.get(era.name)
@@ -194,13 +191,13 @@ class Transients:
 
 
 _SURROUNDINGS = Grid(8, 6)  # twice as fine changes the contrast by 0.1 dB
-_KEPT = 16  # readings; of an onset and its ending, and of fingers that rest
+_KEPT = 16  # sizes of caches: an onset and its ending share readings, as do resting fingers
 
-# Least combinations of ERAs in an onset; more for more than six quiet fingers. With all of sixteen
-# its contrast is lower, with six of eight 1 dB lower in one of ten cases.
+# Least number of combinations of ERAs in an onset; there are more for more than six quiet fingers.
+# With all of sixteen the contrast is lower, with six of eight 1 dB lower in one of ten cases.
 _COMBINATIONS = 8
 
-_COMBINATIONS_ALONE = 6  # in the onset of fingers that are alone
+_COMBINATIONS_ALONE = 6  # the same without quiet fingers
 
 Position = tuple[float, float]
 
@@ -211,15 +208,16 @@ Fingertips: TypeAlias = Callable[[Sequence[Position]], tuple[FloatArray, FloatAr
 class Shaper:
     """Shaping of onsets and endings for a plate on its ERAs.
 
-    Everything that does not depend on the contacts is computed once for each frequency.
+    All that does not depend on the contacts is computed once for each frequency.
     """
 
     def __init__(
         self, plate: PlateInTime, *, gain_variance: float, fingertips: Fingertips | None = None
     ) -> None:
-        """Prepare; gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`).
+        """Prepare for a plate.
 
-        fingertips: None for a reading point by point.
+        gain_variance: of the ERAs' complex gains (`Uncertainty.gain_variance`); fingertips: reads
+        shapes under fingertips, None to read them point by point.
         """
         self._plate = plate
         self._read_fingertips = fingertips or partial(_fingertips_on, plate)
@@ -232,13 +230,13 @@ class Shaper:
         self._carriers: dict[float, Carrier] = {}
         self._centres = _SURROUNDINGS.centres(plate.reduced.plate)
         self._shapes = plate.shapes_at(self._centres)
-        # Of fingers, the last ones: contents that begin together have each other's.
+        # Readings of the last fingers: contents that begin together have each other's.
         self._fingers: dict[Position, tuple[FloatArray, FloatArray]] = {}
         self._felt = lru_cache(_KEPT)(self._read)
         self._resting = lru_cache(_KEPT)(self._quiet_rows)
 
     def prepare(self, frequency: float) -> Carrier:
-        """Everything for a frequency [Hz] that does not depend on contacts, computed once."""
+        """Return what does not depend on the contacts at a frequency [Hz], computed once."""
         if frequency not in self._carriers:
             self._carriers[frequency] = solve_carrier(
                 self._plate,
@@ -255,11 +253,11 @@ class Shaper:
         targets: Sequence[Position],
         quiet: Sequence[Position] = (),
     ) -> Envelopes:
-        """Envelopes that lead from rest to an excitation and keep quiet fingers [m] quiet.
+        """Shape envelopes from rest to an excitation that keep quiet fingers [m] quiet.
 
         targets [m] follow their steady vibration along a raised cosine of RISE. Without quiet
-        fingers the plate beyond 50 mm of the targets takes their place. An ERA that the excitation
-        leaves silent helps where there is one frequency only.
+        fingers the plate beyond 50 mm of the targets takes their place. ERAs that the excitation
+        leaves silent help if there is only one frequency.
         """
         envelopes: dict[str, BaseEnvelope] = {}
         for frequency, amplitudes, active in self._groups(excitation, helped=True):
@@ -275,7 +273,7 @@ class Shaper:
         targets: Sequence[Position] = (),
         quiet: Sequence[Position] = (),
     ) -> Envelopes:
-        """Envelopes that lead from an excitation to silence and bring the whole plate to rest.
+        """Shape envelopes from an excitation to silence that bring the whole plate to rest.
 
         With targets and quiet fingers [m] the quiet ones are kept quiet meanwhile. Silent ERAs stay
         silent.
@@ -290,7 +288,7 @@ class Shaper:
         return envelopes
 
     def _envelopes(self, frequency: float, knots: ComplexArray, active: IntArray) -> Envelopes:
-        """From start and knots (n, active) in strokes, as far as magnets allow."""
+        """Make envelopes from start and knots (n, active) in strokes, as far as magnets allow."""
         every = np.zeros((len(knots), len(self._strokes)), dtype=complex)
         every[:, active] = knots
         knots = self._magnets.within(frequency, every, full=self._full(frequency))[:, active]
@@ -306,9 +304,9 @@ class Shaper:
     def _groups(
         self, excitation: Excitation, *, helped: bool
     ) -> list[tuple[float, ComplexArray, IntArray]]:
-        """Per frequency [Hz]: amplitudes (eras,) in strokes, and the indices of ERAs that play it.
+        """Return each frequency [Hz], amplitudes (eras,) in strokes, and indices of its ERAs.
 
-        helped: silent ERAs play too where there is one frequency.
+        helped: whether silent ERAs play, too, if there is only one frequency.
         """
         frequencies, phasors = base_amplitudes(excitation, self._plate.eras)
         helped = helped and len(frequencies) == 1
@@ -322,20 +320,22 @@ class Shaper:
     def _read(
         self, frequency: float, targets: tuple[Position, ...], quiet: tuple[Position, ...]
     ) -> FingerResponses:
+        """Read the responses of all ERAs at targets and quiet fingers [m], else over the plate."""
         weights, shapes = self._fingertips(targets)
         means = (weights[:, None] @ shapes)[:, 0]
         others = self._resting(quiet) if quiet else self._surroundings(targets)
         return responses_at(self.prepare(frequency), means, others, is_alone=not quiet)
 
     def _quiet_rows(self, positions: tuple[Position, ...]) -> FloatArray:
-        """Rows (d, r) whose sum of squares is the mean square under the fingertips, summed."""
+        """Return rows (d, r) whose sum of squares is that of the fingertips' mean squares."""
         weights, shapes = self._fingertips(positions)
         return np.asarray((np.sqrt(weights)[..., None] * shapes).reshape(-1, shapes.shape[-1]))
 
     def _fingertips(self, positions: tuple[Position, ...]) -> tuple[FloatArray, FloatArray]:
-        """Weights (k, p) of points under fingertips, and their shapes (k, p, r)."""
+        """Return weights (k, p) of points under fingertips and their shapes (k, p, r)."""
         known = self._fingers
-        found = dict(zip(positions, map(known.get, positions), strict=True))  # others drop some
+        # Looked up first, since other threads drop some.
+        found = dict(zip(positions, map(known.get, positions), strict=True))
         if new := [each for each, one in found.items() if one is None]:
             weights, shapes = self._read_fingertips(new)
             made = dict(zip(new, zip(weights, shapes, strict=True), strict=True))
@@ -347,7 +347,7 @@ class Shaper:
         return weights, self._plate.with_far_ends(shapes)
 
     def _surroundings(self, targets: Sequence[Position]) -> FloatArray:
-        """The same for the plate beyond 50 mm of all targets; all of a plate too small for it."""
+        """Return such rows for the plate beyond 50 mm of all targets, or all of a small plate."""
         shapes = self._shapes[is_background(self._centres, targets)]
         return np.asarray(shapes / math.sqrt(len(shapes)))
 
@@ -355,10 +355,10 @@ class Shaper:
 def responses_at(
     carrier: Carrier, target_rows: FloatArray, quiet_rows: FloatArray, *, is_alone: bool = False
 ) -> FingerResponses:
-    """Read all ERAs at rows (t, r) and (d, r) of shapes.
+    """Read the responses of all ERAs at rows of shapes.
 
-    target_rows: means under targets; quiet_rows: whose sum of squares is the mean square under
-    quiet fingers, or over the plate where the targets are alone.
+    target_rows (t, r): means under targets; quiet_rows (d, r): rows whose sum of squares is the
+    mean square under quiet fingers, or over the plate if the targets are alone.
     """
     rows = np.vstack([target_rows, quiet_rows])
     samples, r, knots, eras = carrier.hats.shape
@@ -370,7 +370,7 @@ def responses_at(
 
 
 def of_eras(found: FingerResponses, active: IntArray) -> FingerResponses:
-    """Responses of active ERAs only."""
+    """Select the responses of active ERAs."""
     if len(active) == found.steady.shape[1]:
         return found
     hats, steady = map(np.ascontiguousarray, (found.hats[..., active], found.steady[:, active]))
@@ -380,7 +380,7 @@ def of_eras(found: FingerResponses, active: IntArray) -> FingerResponses:
 def _fingertips_on(
     plate: PlateInTime, positions: Sequence[Position]
 ) -> tuple[FloatArray, FloatArray]:
-    """Read the shapes of a plate under fingertips, as `Fingertips`."""
+    """Read the shapes of a plate under fingertips point by point, as `Fingertips`."""
     on = plate.reduced.plate
     points, weights = fingertips_on(
         np.array(positions), length=on.length, width=on.width, rule=FIVE_POINTS

@@ -4,35 +4,29 @@
 
 q are the coordinates of the reduced free plate and the displacements of the phalanges of fingers
 on it, phi the shapes at an ERA, y the motion of the ERA's base; M, C and K are those of
-`model.reduction.reduced_plate`. Of exciters y is the voltage, k_b and c what pushes plate and
-magnet apart by it and its rate, and q has the displacements of their magnets. The first-order
-system is diagonalised once for each set of attachments; the base moves in terms with closed-form
-particular solutions (`model.transients.base_motion`), so no step size enters and no error grows
-with time.
+`model.reduction.reduced_plate`. For exciters y is the voltage, k_b and c are the forces by it and
+by its rate that push plate and magnet apart, and q includes the displacements of their magnets. The
+first-order system is diagonalised once for each set of attachments. There are three kinds of
+drives, all without a step size, so that no error grows with time:
+
+- Bases that move in terms with closed-form solutions (`model.transients.base_motion`):
+  `PlateInTime.driven`.
+- Samples of band-limited signals, from rest: `from_rest`. Between samples a signal is the
+  trigonometric polynomial through them, with a closed-form solution for each sinusoid; a free
+  vibration makes up for their sum at time 0.
+- An envelope, on a plate under fingers: `enveloped_accelerations`, a numerical Laplace transform.
+  The modes under fingers would take as long as several answers of a table. At a complex frequency s
+  fingers are a change of low rank of the plate on its ERAs, whose modes are known: with
+  displacements u0 of weightless fingers, receptances G between them and dynamic stiffness D, they
+  hold the plate by the forces (1 + D G)^-1 D u0. The demodulated response less its quasi-static
+  part, which a slow envelope would give, is inverted on the line s = i omega + sigma + i nu by a
+  discrete Fourier transform; what comes after the time that is followed returns as
+  exp(-sigma period). For long envelopes the plate is solved every half hertz, with linear
+  interpolation, up to where smooth envelopes have a spectrum, which is ended along a raised cosine.
 
 Not modelled: large deflections, air, the ERAs' own dynamics beyond spring, damper and bolt mass,
 rocking and drag at the bolts, and the impulse c times the jump that the damper would pass on if a
 base jumped (ramp 0): displacement and velocity of the plate are continuous through every change.
-
-The plate from rest under bases that move along samples of band-limited signals.
-
-Between samples a signal is the trigonometric polynomial through them, to each of whose sinusoids
-the plate in time has a closed-form solution; a free vibration makes up for what all of them are at
-time 0. So no step size enters, as elsewhere in `model.transients`.
-
-Drives along an envelope, on a plate under fingers, by a numerical Laplace transform.
-
-A plate under fingers has other modes, whose solution takes as long as several answers of a table.
-At a complex frequency s fingers are a change of low rank of the plate on its ERAs, whose modes are
-known: with displacements u0 of the fingers if they weighed nothing, receptances G between them and
-their dynamic stiffness D, they hold the plate by the forces
-
-    (1 + D G)^-1 D u0.
-
-The demodulated response less its quasi-static part, which a slow envelope would give, is inverted
-on a line s = i omega + sigma + i nu by a discrete Fourier transform: what comes after the time that
-is followed returns as exp(-sigma period). For long envelopes the plate is solved every half hertz,
-linear between, and as far as smooth ones have a spectrum, which ends along a raised cosine.
 """
 
 import math
@@ -60,36 +54,39 @@ from model.transients.base_motion import BaseMotions, rise
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForcedVibration:
-    """Particular solutions Im[vectors @ z(t)], one after the other, from times (k,) [s] on.
+    """k particular solutions Im[vectors @ z(t)], in n terms.
 
-    z = sum over n of (a0 + a1 tau) exp(i omega tau), tau = t - time; number (n,): of the solution;
-    omegas (n,) [rad/s], each once in a solution; a0, a1 (n, 2 r) in the eigenvectors of `plate`, a1
-    None for 0.
+    z = sum over the solution's terms of (a0 + a1 tau) exp(i omega tau), with tau = t - time.
     """
 
     plate: "PlateInTime"
     times: FloatArray
+    """Start (k,) of each solution [s]."""
     number: NDArray[np.intp]
+    """Solution (n,) of each term."""
     omegas: FloatArray
+    """omega (n,) [rad/s], each once in a solution."""
     a0: ComplexArray
+    """(n, 2 r), in the eigenvectors of the plate."""
     a1: ComplexArray | None
+    """(n, 2 r), None for 0."""
 
     def rows(self, number: int) -> slice:
-        """Which of n belong to a solution."""
+        """Return which of the n terms belong to a solution."""
         return slice(*self.number.searchsorted((number, number + 1)).tolist())
 
     def state(self, number: int, time: float) -> FloatArray:
-        """Displacement and velocity (2 r,) in a solution at a time [s]."""
+        """Return displacement and velocity (2 r,) in a solution at a time [s]."""
         return np.asarray((self.plate.vectors @ self.modal([number], [time])[0]).imag)
 
     def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
-        """z (j, m) of free vibrations with the state in solutions (j,) at times (j,) [s]."""
+        """Return z (j, m) of free vibrations in the state of solutions (j,) at times (j,) [s]."""
         z = self.modal(numbers, times)
         # The conjugate of an eigenvector is that of the conjugate eigenvalue.
         return np.asarray(-0.5j * (z[:, self.plate.half] - z[:, self.plate.partner].conj()))
 
     def acceleration(self, number: int, times: FloatArray, shapes: ComplexArray) -> FloatArray:
-        """Acceleration (n, p) of a solution at times (n,) [s]; shapes (2 r, p): by z."""
+        """Return the acceleration (n, p) in a solution at times (n,) [s]; shapes (2 r, p): by z."""
         rows = self.rows(number)
         s, tau = 1j * self.omegas[rows], times[:, None] - self.times[number]
         phase_factor = np.exp(s * tau)
@@ -102,7 +99,7 @@ class ForcedVibration:
         return np.asarray((phase_factor @ (constant @ shapes) + growing).imag)
 
     def modal(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
-        """z (j, 2 r) in solutions (j,) at times (j,) [s]."""
+        """Return z (j, 2 r) in solutions (j,) at times (j,) [s]."""
         tau = np.array(times)[:, None] - self.times[self.number]
         is_of_solution = self.number == np.array(numbers)[:, None]
         phase_factor = is_of_solution * np.exp(1j * self.omegas * tau)
@@ -116,45 +113,48 @@ class ForcedVibration:
 class PlateInTime:
     """The plate on its ERAs as z' = diag(eigenvalues) z + participation f, f [N] per ERA.
 
-    eigenvalues (2 r,) [1/s], in conjugate pairs; vectors (2 r, 2 r): displacement and velocity of
-    the r coordinates, the reduced plate's and one for each free magnet and each phalanx, are
-    vectors @ z; inverse: of the vectors; participation (2 r, eras); forced (2 r, r): z' by a force
-    on each coordinate; stretches (eras, r): displacement at each ERA less that of its free magnet.
+    Its r coordinates are the reduced plate's, and one for each free magnet and each phalanx.
     """
 
     reduced: ReducedPlate
     eras: tuple[Source, ...]
     eigenvalues: ComplexArray
+    """Eigenvalues (2 r,) [1/s], in conjugate pairs."""
     vectors: ComplexArray
+    """Eigenvectors (2 r, 2 r): displacement and velocity of the coordinates are vectors @ z."""
     inverse: ComplexArray
+    """Inverse of the eigenvectors (2 r, 2 r)."""
     participation: ComplexArray
+    """z' (2 r, eras) by the force of each ERA."""
     forced: ComplexArray
+    """z' (2 r, r) by a force on each coordinate."""
     stretches: FloatArray
+    """Displacement (eras, r) at each ERA less that of its free magnet, by each coordinate."""
 
     def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Shapes of all coordinates at points (p, 2) [m], (p, r)."""
+        """Return the shapes (p, r) of all coordinates at points (p, 2) [m]."""
         return self.with_far_ends(self.reduced.at(points))
 
     def with_far_ends(self, shapes: FloatArray) -> FloatArray:
-        """Shapes (..., r) of all coordinates, from those of the reduced plate's, which come first.
+        """Return the shapes (..., r) of all coordinates, from those of the reduced plate's.
 
-        Magnets and phalanges are not on the plate.
+        These come first; magnets and phalanges are not on the plate, and have 0.
         """
         others = len(self.vectors) // 2 - shapes.shape[-1]
         return np.pad(shapes, (*[(0, 0)] * (shapes.ndim - 1), (0, others))) if others else shapes
 
     @cached_property
     def displacement(self) -> ComplexArray:
-        """Displacement of the reduced coordinates in each eigenvector, (r, 2 r)."""
+        """Displacement of the coordinates in each eigenvector, (r, 2 r)."""
         return self.vectors[: len(self.vectors) // 2]
 
     def driven(
         self, motions: BaseMotions, numbers: Sequence[int], times: Sequence[float]
     ) -> ForcedVibration:
-        """Particular solutions for sets of motions (k,) that play from times (k,) [s] on.
+        """Return particular solutions for sets of motions (k,) that play from times (k,) [s] on.
 
-        Each for the terms that move the ERAs' bases at its time. Terms of one frequency are one
-        there, so that its samples cost what its frequencies do.
+        Each is for the terms that move the ERAs' bases at its time. Terms of one frequency are
+        added up, so that the cost of samples depends on the number of frequencies only.
         """
         moments = np.array(times, dtype=float)
         number, active = motions.active(numbers, moments).nonzero()
@@ -182,37 +182,34 @@ class PlateInTime:
     def _by_forces(
         self, cell: NDArray[np.intp], forces: ComplexArray, omegas: FloatArray
     ) -> ComplexArray:
-        """z' (n, 2 r) at n omegas by forces [N] in cells of n times the number of ERAs."""
+        """Return z' (n, 2 r) at n omegas by forces [N] in cells, numbered by omega and ERA."""
         shape = len(omegas), len(self.eras)
         size = shape[0] * shape[1]
         summed = np.empty(shape, dtype=complex)
         summed.real = np.bincount(cell, forces.real, size).reshape(shape)
         summed.imag = np.bincount(cell, forces.imag, size).reshape(shape)
-        for number in self._gained:
-            summed[:, number] *= self.eras[number].gain(omegas / (2 * np.pi))
+        for number, era in enumerate(self.eras):
+            if era.gains:
+                summed[:, number] *= era.gain(omegas / (2 * np.pi))
         return np.asarray(summed @ self.participation.T)
 
     @cached_property
-    def _gained(self) -> list[int]:
-        return [number for number, era in enumerate(self.eras) if era.gains]
-
-    @cached_property
     def by_drive(self) -> FloatArray:
-        """Force by the drive of each ERA: its stiffness [N/m], or [N/V] of an exciter."""
+        """Force by the drive of each ERA: its stiffness [N/m], N/V of exciters."""
         return np.array([era.in_time.by_drive for era in self.eras])
 
     @cached_property
     def by_rate(self) -> FloatArray:
-        """Force by the rate of the drive of each ERA: its damping [N s/m], or [N s/V]."""
+        """Force by the rate of the drive of each ERA: its damping [N s/m], N s/V of exciters."""
         return np.array([era.in_time.by_rate for era in self.eras])
 
     def following(self, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """z (f, eras, 2 r) of each ERA alone at full stroke times exp(s t), s (f,) [1/s].
+        """Return z (f, eras, 2 r) by each ERA alone at full stroke times exp(s t), s (f,) [1/s].
 
-        And its derivative by s: a base that rises as t exp(s t) leads to (derivative + t z) exp(s
-        t). No s may be an eigenvalue, as no imaginary number is where anything damps. An ERA's
-        measured gain is taken at the frequency of s; what it does between two frequencies while the
-        base rises is not modelled.
+        Also its derivative by s: a base that rises as t exp(s t) leads to (derivative + t z)
+        exp(s t). No s may be an eigenvalue; imaginary ones never are if anything damps. An ERA's
+        measured gain is taken at the frequency of s; its change while the base rises is not
+        modelled.
         """
         bases = self._bases(s)
         forces = bases * (self.by_drive + s[:, None] * self.by_rate)
@@ -222,30 +219,30 @@ class PlateInTime:
         return z, (by_velocity - z) / away
 
     def following_all(self, s: ComplexArray, weights: ComplexArray) -> ComplexArray:
-        """z (f, 2 r) of all ERAs together, of weights (f, eras) in full strokes; s (f,) [1/s]."""
+        """Return z (f, 2 r) by weights (f, eras) of all ERAs in full strokes, s (f,) [1/s]."""
         forces = weights * self._bases(s) * (self.by_drive + s[:, None] * self.by_rate)
         return np.asarray(forces @ self.participation.T / (s[:, None] - self.eigenvalues))
 
     def _bases(self, s: ComplexArray) -> ComplexArray:
-        """Drive of each ERA at full level, its own gain included, (f, eras)."""
+        """Return the drive of each ERA at full level with its gain, (f, eras)."""
         drives = [era.full_level * era.gain(s.imag / (2 * np.pi)) for era in self.eras]
         return np.stack(drives, axis=1)
 
     @cached_property
     def acceleration(self) -> ComplexArray:
-        """Acceleration of the reduced coordinates in each eigenvector left free, (r, 2 r)."""
+        """Acceleration of the coordinates in free vibration in each eigenvector, (r, 2 r)."""
         return self.displacement * self.eigenvalues**2
 
     @property
     def own_acceleration(self) -> ComplexArray:
-        """The same of the reduced plate's coordinates alone."""
+        """The rows of `acceleration` for the reduced plate's own coordinates."""
         return self.acceleration[: len(self.reduced.omega)]
 
     @cached_property
     def half(self) -> NDArray[np.intp]:
-        """Numbers (m,) of one eigenvalue of every conjugate pair, and of the real ones.
+        """Indices (m,) of one eigenvalue of every conjugate pair and of the real ones.
 
-        From the one that decays slowest to the one that decays fastest.
+        Ordered from the slowest to the fastest decay.
         """
         numbers = np.flatnonzero(self.eigenvalues.imag >= 0)
         order = np.argsort(-self.eigenvalues.real[numbers], kind="stable")
@@ -253,8 +250,8 @@ class PlateInTime:
 
     @cached_property
     def partner(self) -> NDArray[np.intp]:
-        """Numbers (m,) of the eigenvalues that are conjugate to those, a real one its own."""
-        # LAPACK has the conjugate behind each eigenvalue above the real axis.
+        """Indices (m,) of the conjugates of the eigenvalues in `half`; a real one is its own."""
+        # LAPACK puts the conjugate behind each eigenvalue above the real axis.
         return np.asarray(self.half + (self.decay.imag > 0))
 
     @cached_property
@@ -263,22 +260,22 @@ class PlateInTime:
 
     @cached_property
     def decay(self) -> ComplexArray:
-        """One eigenvalue of every conjugate pair, and the real ones, (m,) [1/s]."""
+        """Eigenvalues (m,) of `half` [1/s]."""
         return self.eigenvalues[self.half]
 
     @cached_property
     def free_state(self) -> ComplexArray:
-        """Displacement and velocity of a free vibration are Re[free_state @ z], (2 r, m)."""
+        """Matrix (2 r, m): displacement and velocity of a free vibration are Re[free_state @ z]."""
         return self.vectors[:, self.half] * self._upper
 
     @cached_property
     def free_acceleration(self) -> ComplexArray:
-        """Acceleration of a free vibration is Re[free_acceleration @ z], (r, m)."""
+        """Matrix (r, m): acceleration of a free vibration is Re[free_acceleration @ z]."""
         return self.free_state[: len(self.vectors) // 2] * self.decay**2
 
     @cached_property
     def to_free(self) -> ComplexArray:
-        """z of a free vibration with a displacement and velocity is to_free @ those, (m, 2 r)."""
+        """Matrix (m, 2 r): z of a free vibration is to_free @ its displacement and velocity."""
         return self.inverse[self.half]
 
 
@@ -290,10 +287,10 @@ def plate_in_time(
     contacts: Sequence[FingertipLoad] = (),
     attachment_shapes: FloatArray | None = None,
 ) -> PlateInTime:
-    """Diagonalise the equations of motion of a reduced plate on its ERAs, with what it carries.
+    """Diagonalise the equations of motion of a reduced plate on its ERAs, with loads and fingers.
 
-    contacts: fingertips that rest on it; attachment_shapes: shapes at the ERAs, loads and contacts
-    (n, r) where known already. Raises InputError for ERAs that do not hold the plate (fewer than
+    contacts: fingertips that rest on it; attachment_shapes (n, r): shapes at the ERAs, loads and
+    contacts, if known already. Raises InputError for ERAs that do not hold the plate (fewer than
     three, or all in one line), and for a mode that is damped critically.
     """
     if attachment_shapes is None:
@@ -302,7 +299,7 @@ def plate_in_time(
         reduced, eras, loads=loads, contacts=contacts, attachment_shapes=attachment_shapes
     )
     r = len(K)
-    # NumPy's, which let other threads run meanwhile, as SciPy's do not.
+    # NumPy's solvers let other threads run meanwhile; SciPy's do not.
     inverse = np.linalg.inv(M)
     A = np.block([[np.zeros((r, r)), np.eye(r)], [-inverse @ K, -inverse @ C]])
     eigenvalues, vectors = np.linalg.eig(A)
@@ -330,14 +327,14 @@ def plate_in_time(
 
 
 def _inverse(vectors: ComplexArray) -> ComplexArray:
-    """Inverse of the eigenvectors; nan where they are dependent."""
+    """Return the inverse of the eigenvectors, NaN if they are dependent."""
     try:
         return np.asarray(np.linalg.inv(vectors))
     except np.linalg.LinAlgError:
         return np.full_like(vectors, np.nan)
 
 
-_AT_ONCE = 512  # frequencies or samples, at some kilobytes each
+_BATCH = 512  # frequencies or samples at once, at some kilobytes each
 
 
 def from_rest(
@@ -348,7 +345,7 @@ def from_rest(
     sample_rate: float,
     factors: ComplexArray,
 ) -> FloatArray:
-    """Acceleration [m/s²] at the times of the samples, the first at time 0, (n, p).
+    """Return the acceleration (n, p) [m/s²] from rest, at the times of samples from time 0 on.
 
     signals (eras, n) in full strokes, sampled at sample_rate [Hz]; shapes (p, r) of the reduced
     plate at points; factors (eras,): gain and phase of each ERA. Displacement and velocity of the
@@ -363,24 +360,24 @@ def from_rest(
     by_forced, by_free = (points @ plate.displacement).T, (points @ plate.free_acceleration).T
     forced = np.empty((len(s), len(points)), dtype=complex)
     start = np.zeros(len(plate.eigenvalues), dtype=complex)
-    for first in range(0, len(s), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    for first in range(0, len(s), _BATCH):
+        some = slice(first, first + _BATCH)
         z = plate.following_all(s[some], spectrum[some])
         forced[some] = s[some, None] ** 2 * (z @ by_forced)
         start += 2 * z.sum(axis=0) - (z[0] if first == 0 else 0)
     free = -plate.to_free @ (plate.vectors @ start).real / period
     ringing = [
         ((free * np.exp(np.outer(times, plate.decay))) @ by_free).real
-        for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _AT_ONCE)
+        for times in np.array_split(np.arange(count) / sample_rate, 1 + count // _BATCH)
     ]
     return np.asarray(np.fft.irfft(forced, period, axis=0)[:count] + np.concatenate(ringing))
 
 
 def _continued(signals: FloatArray) -> FloatArray:
-    """Signals (eras, n) that go on from their last samples and fade to rest, (eras, 2 n - 1).
+    """Continue signals (eras, n) from their last samples and fade them to rest, (eras, 2 n - 1).
 
-    What comes later moves nothing before; a jump would show between samples. An odd number of
-    samples has no frequency of half their rate.
+    The continuation has no effect on earlier times; a jump would show between samples. An odd
+    number of samples has no frequency at half their rate.
     """
     count = signals.shape[1]
     onward = 2 * signals[:, -1:] - signals[:, -2::-1]
@@ -388,13 +385,16 @@ def _continued(signals: FloatArray) -> FloatArray:
     return np.hstack([signals, fading * onward])
 
 
-_DAMPING = 5.0  # sigma times the period, by which what is late has grown
+_DAMPING = 5.0  # sigma times the period
 
-_RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; of what is long, to each side
+_RESOLUTION, _LONG_BAND = 0.5, 80.0  # Hz; for long envelopes, the band to each side
 
 _GUARD = 12
-"""Steps after the end that are left out: before a jump at the start the plate seems to ring, for no
-spectrum is without an end, and that comes round there, where it has grown most."""
+"""Steps after the end that are computed and left out.
+
+Spectra are cut off, so the plate seems to ring before a jump at the start. That wraps around to the
+end, where it has grown most.
+"""
 
 
 def enveloped_accelerations(
@@ -407,11 +407,11 @@ def enveloped_accelerations(
     envelope: FloatArray,
     step: float,
 ) -> ComplexArray:
-    """Demodulated accelerations (n + 1, p) [m/s²] along an envelope from rest; the last is steady.
+    """Return demodulated accelerations (n + 1, p) [m/s²] along an envelope from rest, then steady.
 
-    plate: without fingers; bases (eras,): motions [m] at a frequency [Hz], times the envelope (n,),
-    whose values are a step [s] apart; points (p, r): shapes; fingers: shape (r,) under each and its
-    load. At the times of the envelope.
+    At the times of the envelope, whose values (n,) are a step [s] apart. plate: without fingers;
+    bases (eras,): motions [m] at a frequency [Hz], which the envelope multiplies; points (p, r):
+    shapes; fingers: shape (r,) under each and its load.
     """
     asked, envelope = len(envelope), np.pad(envelope, (0, _GUARD))
     count = len(envelope)
@@ -445,7 +445,7 @@ def _held_by(
     points: FloatArray,
     fingers: Sequence[tuple[FloatArray, Fingertip]],
 ) -> ComplexArray:
-    """Accelerations (m, p) at complex frequencies s (m,) by bases (eras,), held by fingers."""
+    """Return accelerations (m, p) at complex frequencies s (m,) by bases (eras,), under fingers."""
     single, p, k = np.complex64, len(points), len(fingers)
     gains = np.array([era.gain(np.array(frequency)) for era in plate.eras], dtype=complex)
     driven = np.array([gains * bases * each for each in (plate.by_drive, plate.by_rate)])

@@ -65,11 +65,8 @@ LEAST_THICKNESS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class AttachedPlate:
-    """The plate with b fixed attachments, n ERAs first and then masses, at f frequencies.
-
-    Arrays for answers are in single precision: accelerations are within 1e-5 of their largest.
-    """
+class Mounts:
+    """b fixed attachments of a plate, n ERAs first and then masses, at f frequencies."""
 
     minus_omega2: Float32Array
     """-w² (f,) [rad²/s²]."""
@@ -86,6 +83,41 @@ class AttachedPlate:
     """
     by_damping: Complex64Array
     """Change (f, n) of the ERAs' dynamic stiffness by one standard deviation of damping [N/m]."""
+
+
+def mounts_of(
+    eras: Sequence[Source], masses: Sequence[PointLoad], w: FloatArray, uncertainty: Uncertainty
+) -> Mounts:
+    """Compute ERAs and masses at w (f,) [rad/s], wherever they are.
+
+    Errors of an ERA's stiffness are half the difference between one standard deviation up and down,
+    since the suspension of an exciter is resonant; feet deviate by `supports`.
+    """
+    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
+    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
+    feet = feet_of(masses) if uncertainty.supports else ()
+    by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
+    for number in feet:
+        by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
+    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
+    single = np.complex64
+    return Mounts(
+        minus_omega2=-(w**2).astype(np.float32),
+        stiffness=attached_stiffness(w, eras, masses).astype(single),
+        forces=drive_forces(w, eras).astype(single),
+        strokes=np.array([era.base(w) for era in eras]).T.astype(single),
+        by_stiffness=np.hstack([(stiffer - softer) / 2, by_foot]).astype(single),
+        by_damping=(math.log(uncertainty.damping) * np.array(damped).T).astype(single),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class AttachedPlate(Mounts):
+    """The plate with its fixed attachments.
+
+    Arrays for answers are in single precision: accelerations are within 1e-5 of their largest.
+    """
+
     modal: ComplexArray
     """s lambda (f, r) of the reduced coordinates [rad²/s²], with all losses."""
     shapes: Float32Array
@@ -168,29 +200,14 @@ def attach(
     """Attach ERAs and masses to a reduced free plate.
 
     omega (r,) [rad/s] and losses (r,) [rad²/s²]: of its coordinates; shapes (eras + masses, r);
-    frequencies (f,) [Hz]; dispersion: how omega² changes with them. Errors of an ERA's stiffness
-    are half the difference between one standard deviation up and down, since the suspension of an
-    exciter is resonant; feet deviate by `supports`. Raises InputError for a plate that does not
-    scale with one thickness.
+    frequencies (f,) [Hz]; dispersion: how omega² changes with them. Raises InputError for a plate
+    that does not scale with one thickness.
     """
     check_scales(plate, 1 + uncertainty.thickness)
     w = 2 * np.pi * frequencies
     elasticity = ModalElasticity.of(plate, omega**2, losses, dispersion)
-    off = (1 + uncertainty.stiffness, 1 - uncertainty.stiffness)
-    stiffer, softer = (np.array([era.deviating(w, by, 1.0)[0] for era in eras]).T for by in off)
-    feet = feet_of(masses) if uncertainty.supports else ()
-    by_foot = np.zeros((len(w), max(feet, default=-1) + 1), dtype=complex)
-    for number in feet:
-        by_foot[:, number] = uncertainty.supports * masses[number].spring(w)
-    damped = [getattr(era, era.fields["damping"]) * era.slopes(w)["damping"][0] for era in eras]
-    single = np.complex64
     return AttachedPlate(
-        minus_omega2=-(w**2).astype(np.float32),
-        stiffness=attached_stiffness(w, eras, masses).astype(single),
-        forces=drive_forces(w, eras).astype(single),
-        strokes=np.array([era.base(w) for era in eras]).T.astype(single),
-        by_stiffness=np.hstack([(stiffer - softer) / 2, by_foot]).astype(single),
-        by_damping=(math.log(uncertainty.damping) * np.array(damped).T).astype(single),
+        **vars(mounts_of(eras, masses, w, uncertainty)),
         modal=elasticity.stiffness(w),
         shapes=shapes.astype(np.float32),
         omega=w,

@@ -1,6 +1,6 @@
-"""Drives in hertz, fractions of full stroke and degrees, and their conversion to layers.
+"""Arguments of the public functions: checks of rigs, positions, loads and signals, and drives.
 
-Checks of arguments that several functions take: positions of fingers, loads, frequencies.
+A drive is given in hertz, fractions of full stroke and degrees, and converted to layers.
 """
 
 import math
@@ -25,9 +25,17 @@ Positions: TypeAlias = Sequence[float] | Sequence[Sequence[float]]
 Fingers: TypeAlias = Positions | Sequence[Finger]
 """Positions [m] of fingers, or fingers with their loads and bounds."""
 
-
 MAX_LEVEL = 1 + 1e-9
 """Full stroke, with the rounding of weights that were divided by the largest."""
+
+_MAX_SUM = 1 + 1e-6
+"""Highest sum of levels, with the rounding of answers in single precision."""
+
+_UNITS_OF_A_TONE = {
+    "frequency": "hertz",
+    "amplitude": "metres, or volts of an exciter",
+    "phase": "radians",
+}
 
 
 def expect_rig(value: object) -> None:
@@ -156,20 +164,13 @@ class Drive:
             raise InputError(f"phase of a drive must be finite, got {self.phase_deg} degrees")
 
 
-_MAX_SUM = 1 + 1e-6
-"""Highest sum of levels, with the rounding of answers in single precision."""
-
-_UNITS_OF_A_TONE = {
-    "frequency": "hertz",
-    "amplitude": "metres, or volts of an exciter",
-    "phase": "radians",
-}
-
 Driven: TypeAlias = float | Drive | Tone
 """A frequency [Hz] at full level, a `Drive`, or a `Tone` [Hz; m, or V of an exciter; rad]."""
 
+
 Drives: TypeAlias = Mapping[str, Driven | Sequence[Driven]]
 """By ERA name: what it plays, or a list of what it plays at once."""
+
 
 Played: TypeAlias = Answer | Layer | Drives
 """What ERAs are to play: an answer with all its layers, one layer, or drives."""

@@ -1,4 +1,4 @@
-"""Where the packages behind these names come from, looked at before any of them is loaded.
+"""Checks of the packages behind `era_haptics`, before any of them is loaded.
 
 Their names are common, and Python takes the first one on its path: a file beside a program, or the
 package of another distribution.

@@ -1,6 +1,6 @@
-"""The plate of a rig, solved once: modes, maps, and playback in time.
+"""The plate of a rig, solved once: modes, maps, playback in time, and pictures of these.
 
-Pictures as matplotlib figures, without pyplot.
+Pictures are matplotlib figures, made without pyplot.
 """
 
 from collections.abc import Sequence

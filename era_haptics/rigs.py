@@ -1,4 +1,5 @@
-"""Rigs for scripts: their parts by the keys of a rig file, their amplifiers, their calibration."""
+"""Rigs for scripts: parts by the keys of a rig file, amplifiers, layers for them, and
+calibration."""
 
 from pathlib import Path
 from typing import Any

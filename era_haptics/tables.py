@@ -1,4 +1,4 @@
-"""The localization table, and what fingers are to feel of it."""
+"""Localization tables of rigs, their answers for fingers, and maps of their contrast."""
 
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,9 +1,7 @@
-"""The figures of the founding paper for any rig: pictures, and the numbers drawn.
+"""`era figure`: the figures of the founding paper for any rig, with the numbers drawn.
 
 Frequencies, layouts and stiffnesses are the paper's; `examples/founding_paper` compares the numbers
-with what it prints.
-
-`era figure`: the founding paper's figures.
+with those in the paper.
 """
 
 import math
@@ -58,6 +56,8 @@ STATISTICS = ("minimum", "lower_quartile", "median", "upper_quartile", "maximum"
 """Of the cumulative peak acceleration over the plate [m/s²]."""
 
 _MODES = (1, 5)
+
+figure_app = typer.Typer()
 
 
 @dataclass(frozen=True)
@@ -266,9 +266,6 @@ _FIGURES: dict[str, tuple[Callable[[Rig, FreePlate], PaperFigure], ...]] = {
     "12": (_switched,),
     "13": (_stiffnesses,),
 }
-
-
-figure_app = typer.Typer()
 
 
 @figure_app.command()

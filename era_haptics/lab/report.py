@@ -1,11 +1,8 @@
-"""Collect what a bug report needs in one file.
+"""`era report`: collect what a bug report needs in one file.
 
-Collects a bug report into a file: versions, configuration, daemon status, fault dumps.
-
-Of keys that this program does not know only the names remain. Free text, as in causes and names, is
-not searched: whoever sends a report looks at it before.
-
-`era report`: what a bug report needs, in one file.
+The file has versions, configuration, the daemon's status and its fault dumps. Values of keys that
+this program does not know are hidden. Free text, as in causes and names, is not searched: look at
+the file before you send it.
 """
 
 import json
@@ -45,6 +42,19 @@ _GROUPS = "era_haptics."  # prefix of our entry point groups
 _REQUIREMENT = re.compile(r"(?im)^[ \t]*([A-Z0-9](?:[A-Z0-9._-]*[A-Z0-9])?)")
 """The name of the distribution at the start of each line, a requirement of PEP 508."""
 
+_COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
+_HOST = re.compile(r"(?<=://)[^/?#\s\"']+")
+_PARAMETER = re.compile(r"""([\w-]+)(=)([^\s,&#}"']+)""")  # of a URL
+_ENTRY = re.compile(
+    r"""([\w-]+)(["']?[ \t]*:[ \t]*)(?!//)("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
+)  # of YAML or JSON
+
+_HIDDEN = "hidden"
+
+_OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
+_PRIVATE = frozenset({"serial_number"})
+_OTHERS = ("baud", "bitrate", "timeout", "cause", "unix_time_s", "link", "way", "message")
+
 
 @dataclass(frozen=True)
 class ReportFiles:
@@ -52,6 +62,36 @@ class ReportFiles:
 
     files: Mapping[str, str]
     missing: tuple[str, ...]
+
+
+def report(
+    configs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
+        "era-report.zip"
+    ),
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
+    ] = None,
+) -> None:
+    """Collect versions, files and daemon state for a bug report.
+
+    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
+    """
+
+    for path in configs or ():
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check its name and folder")
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
+    collected = collect(configs or [], socket=socket, home=home)
+    write_zip(output, collected)
+    for name, text in collected.files.items():
+        print(f"  {name}: {len(text)} characters")
+    for what in collected.missing:
+        print(f"  skipped: {what}")
+    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
 
 
 def collect(configs: Iterable[Path], *, socket: Path | None, home: Path) -> ReportFiles:
@@ -176,17 +216,6 @@ def _include(path: Path, files: dict[str, str], missing: list[str]) -> None:
     files[name] = text
 
 
-_COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
-_HOST = re.compile(r"(?<=://)[^/?#\s\"']+")
-_PARAMETER = re.compile(r"""([\w-]+)(=)([^\s,&#}"']+)""")  # of a URL
-_ENTRY = re.compile(
-    r"""([\w-]+)(["']?[ \t]*:[ \t]*)(?!//)("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
-)  # of YAML or JSON
-
-
-_HIDDEN = "hidden"
-
-
 def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
     """Hide in a text the values of unknown keys, hosts and comments.
 
@@ -202,11 +231,6 @@ def shown(text: str, *, home: Path, is_dump: bool = False) -> str:
         text = text.replace(str(home), "~")
     text = _HOST.sub(_HIDDEN, _COMMENT.sub("", text))
     return _ENTRY.sub(entry, _PARAMETER.sub(entry, text))
-
-
-_OF_FILES = (RigSection, DaemonSection, LayoutSection, StatusResult)
-_PRIVATE = frozenset({"serial_number"})
-_OTHERS = ("baud", "bitrate", "timeout", "cause", "unix_time_s", "link", "way", "message")
 
 
 @cache
@@ -240,33 +264,3 @@ def _properties(schema: dict[str, Any] | list[Any]) -> Iterator[str]:
     for each in schema.values() if isinstance(schema, dict) else schema:
         if isinstance(each, dict | list):
             yield from _properties(each)
-
-
-def report(
-    configs: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
-    ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
-        "era-report.zip"
-    ),
-    socket: Annotated[
-        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
-    ] = None,
-) -> None:
-    """Collect versions, files and daemon state for a bug report.
-
-    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
-    """
-
-    for path in configs or ():
-        if not path.exists():
-            raise InputError(f"{path}: no such file; check its name and folder")
-    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
-    collected = collect(configs or [], socket=socket, home=home)
-    write_zip(output, collected)
-    for name, text in collected.files.items():
-        print(f"  {name}: {len(text)} characters")
-    for what in collected.missing:
-        print(f"  skipped: {what}")
-    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")

@@ -1,12 +1,8 @@
-"""Keys of a rig file with the ERAs of a layout in place of the rig's own.
+"""A design: layouts of ERAs searched or given, judged on processes, and written as files.
 
-Running a design: layouts searched or given, judged on processes.
-
-A layout is judged by the answers of its localization table to fresh contact sets.
-
-Files, pictures and summary of a design.
-
-A design as it is asked for, by the command or a program: checked, then searched or ranked.
+A layout is judged by the answers of its localization table to contact sets that no search has seen.
+`design` checks the request, then searches or ranks layouts; `write_design` writes the rig with the
+best one, a table of all layouts, pictures and a template.
 """
 
 import math
@@ -22,9 +18,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from era_haptics.lab.design.problem import (
+    DEFAULT_ERA_GAP,
     DEFAULT_LOWEST,
     EDGE,
-    PROBLEM_DEFAULT_APART,
     DesignProblem,
     NamedLayouts,
     area_of,
@@ -70,71 +66,6 @@ from model.table.table_file import build_table
 MAX_CHANNELS = 4
 """Channels of an amplifier beyond the rig's own ones."""
 
-
-def layout_keys(
-    problem: DesignProblem, positions: FloatArray, data: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Data of a rig file with ERAs at positions [m], on free channels; data: of the rig's file.
-
-    Amplifiers that are missing are added, simulated.
-    """
-    rig = problem.rig
-    before, amplifiers = data["eras"], data["amplifiers"]
-    channels = iter(_free_channels(rig, problem.kept, count=problem.count))
-    eras: dict[str, Any] = {}
-    mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
-    for name, mount in zip(rig.supports, mounts, strict=True):
-        eras[name] = _damped(before[name], mount.damping)
-    used = {}
-    like = _damped(before[problem.like.name], problem.like.damping)
-    if problem.stiffness is not None:
-        for key in _instead_of("stiffness", like):
-            like.pop(key, None)
-        like["stiffness"] = problem.stiffness
-    for era in problem.eras(positions):
-        if era.name in problem.kept:
-            eras[era.name] = _damped(before[era.name], era.damping)
-            continue
-        channel = next(channels)
-        used[channel.amplifier] = True
-        eras[era.name] = deepcopy(like) | {
-            "at": [round(era.x, 6), round(era.y, 6)],
-            "amplifier": channel.amplifier,
-            "channel": channel.number,
-        }
-    own = {rig.wiring[name].amplifier for name in problem.kept}
-    given = {name: amplifiers[name] for name in amplifiers if name in own or name in used}
-    added = {name: {"url": "sim://"} for name in used if name not in amplifiers}
-    return {**data, "eras": eras, "amplifiers": {**given, **added}}
-
-
-def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
-    """A copy of an ERA's keys with its damping by itself: a ratio refers to the number of ERAs.
-
-    And a quality of an exciter to its stiffness.
-    """
-    replaced = _instead_of("damping", section)
-    keys = {key: value for key, value in deepcopy(section).items() if key not in replaced}
-    return keys | {"damping": float(f"{damping:.6g}")}
-
-
-def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
-    """Keys that one replaces in an actuator of the section's kind."""
-    return section_by_kind([*KINDS.values()], section).instead.get(key, ())
-
-
-def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
-    """The rig's channels without those of kept ERAs, and further amplifiers of MAX_CHANNELS."""
-    free = [channel for name, channel in rig.wiring.items() if name not in kept]
-    names = (
-        name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers
-    )
-    while len(free) < count:
-        name = next(names)
-        free += [Channel(name, number) for number in range(MAX_CHANNELS)]
-    return free
-
-
 SENSITIVITY_STEP = 0.005
 """Step [m] of an ERA by which the sensitivity to its place is measured."""
 
@@ -151,8 +82,12 @@ _HERE: Machines = partial(on_processes, 1)
 
 _search_of = lru_cache(maxsize=4)(LayoutSearch)
 
-
 _LEVEL_MARGIN = 0.1  # dB
+
+MAX_SHOWN = 10
+"""Layouts in a summary; the CSV file has all."""
+
+MAX_STIFFNESSES, MAX_ERAS = 9, 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,33 +127,6 @@ class Assessment:
     def reached_share(self) -> float:
         """Share of the sets whose contents have the level on nine of ten plates."""
         return float((self.level_db_sl >= STRONG_DB_SL - _LEVEL_MARGIN).mean())
-
-
-def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
-    """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
-
-    For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
-    shared or held back. Raises InputError for ERAs that do not support the plate.
-    """
-    table = build_table(rig, drive_mode="phased")
-    contrast, level = np.array([_answer(table, contacts, contents) for contacts in sets]).T
-    quiet = np.array([len(contacts) - contents for contacts in sets])
-    return Assessment(quiet, contrast, level)
-
-
-def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tuple[float, float]:
-    places = [(float(x), float(y)) for x, y in contacts]
-    fingers = [Finger(at, Stimulus()) for at in places[:contents]]
-    found = answer(
-        table,
-        fingers,
-        quiet=places[contents:],
-        drive_mode=UNRESTRICTED,
-        min_contrast_db=-math.inf,
-    )
-    assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers
-    level = min(each.promised_level_db_sl for each in found.fingers[:contents])
-    return found.promised_worst_db, level
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +235,107 @@ class Runner:
             done[number] = result
             self.progress(len(done), len(tasks))
         return [done[number] for number in range(len(tasks))]
+
+
+def design(
+    rig: Rig,
+    eras: int | Sequence[int] | None = None,
+    *,
+    layouts: str | PathLike[str] | None = None,
+    keep: Sequence[str] = (),
+    where: str | PathLike[str] = EDGE,
+    contacts: str | PathLike[str] | None = None,
+    contents: int = 1,
+    apart: float = DEFAULT_ERA_GAP,
+    lowest: float = DEFAULT_LOWEST,
+    stiffness: Sequence[float] = (),
+    finalists: int = DEFAULT_FINALISTS,
+    starts: int = 4,
+    seed: int = 0,
+    workers: int | None = None,
+    cluster: str | None = None,
+    progress: Progress = unseen,
+) -> Design:
+    """Find or compare layouts of ERAs, the best promised felt contrast first, as `era design` does.
+
+    eras: how many, or several numbers, as many as the rig's for None; layouts: None to search,
+    `random:N` or a file to rank layouts; keep: names of ERAs that stay; where: `edge`, `anywhere`
+    or a file; contacts: a file, anywhere for None; contents: at the same time, a finger for each;
+    apart [m]: least distance of two ERAs; lowest [Hz]: least rigid-body frequency of a supported
+    plate; stiffness [N/m]: of which new ERAs get the best, that of the rig's for none; finalists:
+    given layouts that are judged by their tables' answers; starts: of a search; workers: processes,
+    one for None; cluster: address of a Dask scheduler in their place; progress: called with the
+    tasks done and all, of one stage after the other. Raises InputError.
+
+    Example:
+        >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
+        >>> better = designed.best.rig
+    """
+    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
+    check_progress(progress)
+    requested: Any = len(rig.eras) if eras is None else eras
+    counts = [requested] if is_whole(requested) or isinstance(requested, str) else requested
+    for what, row, made_by in (
+        ("eras", counts, "range(3, 7)"),
+        ("keep", keep, '["SW"]'),
+        ("stiffness", stiffness, "[17e3]"),
+    ):
+        expect(row, Sequence, what=what, made_by=made_by)
+    for what, value, least in (
+        *(("eras", each, 1) for each in (*counts, len(counts))),
+        ("contents", contents, 1),
+        ("finalists", finalists, 1),
+        ("starts", starts, 1),
+        ("seed", seed, 0),
+        ("workers", 1 if workers is None else workers, 1),
+    ):
+        if not is_whole(value):
+            raise InputError(f"{what} must be a whole number, got {shown(value)}")
+        expect_between(value, least, MAX_ERAS if what == "eras" else MAX_VALUE, what=what)
+    for what, number, unit in (
+        ("apart", apart, "metres"),
+        ("lowest", lowest, "hertz"),
+        *(("stiffness", each, "newtons per metre") for each in stiffness),
+    ):
+        expect_number(number, what=what, unit=unit)
+    expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
+    if not 0 < apart < max(rig.plate.length, rig.plate.width):
+        raise InputError(f"apart must be above 0 and below the plate's length, got {apart:g} m")
+    own = [era.name for era in rig.eras]
+    if any(each not in own or keep.count(each) > 1 for each in keep) or len(keep) > min(counts):
+        raise InputError(
+            f"keep must be up to {min(counts)} different ERAs of the rig, {', '.join(own)}, got "
+            f"{', '.join(map(str, keep))}"
+        )
+    tried = sorted({float(each) for each in stiffness if 0 < each < math.inf})
+    if len(tried) < len(stiffness) or len(tried) > MAX_STIFFNESSES:
+        raise InputError(
+            f"stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
+            f"{', '.join(f'{each:g}' for each in stiffness)}"
+        )
+    rule = contact_rule(
+        None if contacts is None else expect_path(contacts, what="contacts"), rig.plate, contents
+    )
+    area = area_of(str(expect_path(where, what="where")), rig.plate)
+    problems = [
+        DesignProblem(
+            rig, count, area, rule, tuple(keep), float(apart), float(lowest), seed, stiffness=each
+        )
+        for count in counts
+        for each in (tried or (None,))
+    ]
+    if cluster is not None and workers is not None:
+        raise InputError("only one of workers and cluster can be given")
+    machines: Machines = (
+        partial(on_processes, workers or 1) if cluster is None else partial(on_cluster, cluster)
+    )
+    if layouts is None:
+        return search_layouts(problems, starts=starts, runner=Runner(machines, progress))
+    return rank_layouts(
+        supported_layouts(str(expect_path(layouts, what="layouts")), problems),
+        finalists=finalists,
+        runner=Runner(machines, progress),
+    )
 
 
 def search_layouts(problems: Sequence[DesignProblem], *, starts: int, runner: Runner) -> Design:
@@ -455,8 +464,31 @@ def _answers(problems: Sequence[DesignProblem], task: tuple[int, FloatArray | No
     return judge(rig, problem.judged_sets(), contents=problem.contacts.contents)
 
 
-MAX_SHOWN = 10
-"""Layouts in a summary; the CSV file has all."""
+def judge(rig: Rig, sets: Sequence[FloatArray], *, contents: int = 1) -> Assessment:
+    """What a rig's table answers at contact sets (fingers, 2) [m], fingers with contents first.
+
+    For contents of STRONG_DB_SL, where it cannot be reached for the highest found, none of which is
+    shared or held back. Raises InputError for ERAs that do not support the plate.
+    """
+    table = build_table(rig, drive_mode="phased")
+    contrast, level = np.array([_answer(table, contacts, contents) for contacts in sets]).T
+    quiet = np.array([len(contacts) - contents for contacts in sets])
+    return Assessment(quiet, contrast, level)
+
+
+def _answer(table: LocalizationTable, contacts: FloatArray, contents: int) -> tuple[float, float]:
+    places = [(float(x), float(y)) for x, y in contacts]
+    fingers = [Finger(at, Stimulus()) for at in places[:contents]]
+    found = answer(
+        table,
+        fingers,
+        quiet=places[contents:],
+        drive_mode=UNRESTRICTED,
+        min_contrast_db=-math.inf,
+    )
+    assert found.promised_worst_db is not None  # noqa: S101  a set has two fingers
+    level = min(each.promised_level_db_sl for each in found.fingers[:contents])
+    return found.promised_worst_db, level
 
 
 def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> list[Path]:
@@ -476,28 +508,6 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     return [rig, table, *(folder / name for name in pictures), template]
 
 
-def _columns(layouts: Sequence[RankedLayout]) -> Columns:
-    """A row for each layout, in the order of their ranks."""
-    rows = [_row(each) for each in layouts]
-    at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
-    columns = {key: ["" if row[key] is None else row[key] for row in rows] for key in rows[0]}
-    contrast = [f"{each.mean_db:.6g}" if each.judged else "" for each in layouts]
-    return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
-
-
-def _row(layout: RankedLayout) -> dict[str, Any]:
-    """A layout for JSON."""
-    eras = layout.eras
-    return {
-        "layout": layout.name,
-        "at_m": {era.name: [era.x, era.y] for era in eras},
-        "stiffness_n_m": eras[-1].in_time.stiffness,
-        "supported": layout.found.is_supported,
-        "expected_contrast_db": layout.expected_contrast,
-        "contrast_db": layout.judged.summary if layout.judged else None,
-    }
-
-
 def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     """The text of the rig's file with the ERAs of the best layout, on free channels."""
     keys = layout_keys(design.problem, design.best.found.positions, data)
@@ -509,6 +519,70 @@ def rig_text(design: Design, data: Mapping[str, Value]) -> str:
     if added:
         comment += f"# Give the amplifiers {', '.join(added)} the URLs of real ones.\n"
     return comment + data_text(keys)
+
+
+def layout_keys(
+    problem: DesignProblem, positions: FloatArray, data: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Data of a rig file with ERAs at positions [m], on free channels; data: of the rig's file.
+
+    Amplifiers that are missing are added, simulated.
+    """
+    rig = problem.rig
+    before, amplifiers = data["eras"], data["amplifiers"]
+    channels = iter(_free_channels(rig, problem.kept, count=problem.count))
+    eras: dict[str, Any] = {}
+    mounts = rig.masses[len(rig.masses) - len(rig.supports) :]
+    for name, mount in zip(rig.supports, mounts, strict=True):
+        eras[name] = _damped(before[name], mount.damping)
+    used = {}
+    like = _damped(before[problem.like.name], problem.like.damping)
+    if problem.stiffness is not None:
+        for key in _instead_of("stiffness", like):
+            like.pop(key, None)
+        like["stiffness"] = problem.stiffness
+    for era in problem.eras(positions):
+        if era.name in problem.kept:
+            eras[era.name] = _damped(before[era.name], era.damping)
+            continue
+        channel = next(channels)
+        used[channel.amplifier] = True
+        eras[era.name] = deepcopy(like) | {
+            "at": [round(era.x, 6), round(era.y, 6)],
+            "amplifier": channel.amplifier,
+            "channel": channel.number,
+        }
+    own = {rig.wiring[name].amplifier for name in problem.kept}
+    given = {name: amplifiers[name] for name in amplifiers if name in own or name in used}
+    added = {name: {"url": "sim://"} for name in used if name not in amplifiers}
+    return {**data, "eras": eras, "amplifiers": {**given, **added}}
+
+
+def _damped(section: Mapping[str, Any], damping: float) -> dict[str, Any]:
+    """A copy of an ERA's keys with its damping by itself: a ratio refers to the number of ERAs.
+
+    And a quality of an exciter to its stiffness.
+    """
+    replaced = _instead_of("damping", section)
+    keys = {key: value for key, value in deepcopy(section).items() if key not in replaced}
+    return keys | {"damping": float(f"{damping:.6g}")}
+
+
+def _instead_of(key: str, section: Mapping[str, Any]) -> tuple[str, ...]:
+    """Keys that one replaces in an actuator of the section's kind."""
+    return section_by_kind([*KINDS.values()], section).instead.get(key, ())
+
+
+def _free_channels(rig: Rig, kept: tuple[str, ...], *, count: int) -> list[Channel]:
+    """The rig's channels without those of kept ERAs, and further amplifiers of MAX_CHANNELS."""
+    free = [channel for name, channel in rig.wiring.items() if name not in kept]
+    names = (
+        name for number in range(2, 99) if (name := f"amplifier{number}") not in rig.amplifiers
+    )
+    while len(free) < count:
+        name = next(names)
+        free += [Channel(name, number) for number in range(MAX_CHANNELS)]
+    return free
 
 
 def summary(design: Design) -> dict[str, Any]:
@@ -544,6 +618,28 @@ def summary(design: Design) -> dict[str, Any]:
         "lowest_rigid_body_hz": lowest,
         "contents": problem.contacts.contents,
         "sets": len(design.sets),
+    }
+
+
+def _columns(layouts: Sequence[RankedLayout]) -> Columns:
+    """A row for each layout, in the order of their ranks."""
+    rows = [_row(each) for each in layouts]
+    at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
+    columns = {key: ["" if row[key] is None else row[key] for row in rows] for key in rows[0]}
+    contrast = [f"{each.mean_db:.6g}" if each.judged else "" for each in layouts]
+    return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
+
+
+def _row(layout: RankedLayout) -> dict[str, Any]:
+    """A layout for JSON."""
+    eras = layout.eras
+    return {
+        "layout": layout.name,
+        "at_m": {era.name: [era.x, era.y] for era in eras},
+        "stiffness_n_m": eras[-1].in_time.stiffness,
+        "supported": layout.found.is_supported,
+        "expected_contrast_db": layout.expected_contrast,
+        "contrast_db": layout.judged.summary if layout.judged else None,
     }
 
 
@@ -597,107 +693,3 @@ def count_figure(design: Design) -> Figure:
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure
-
-
-MAX_STIFFNESSES, MAX_ERAS = 9, 32
-
-
-def design(
-    rig: Rig,
-    eras: int | Sequence[int] | None = None,
-    *,
-    layouts: str | PathLike[str] | None = None,
-    keep: Sequence[str] = (),
-    where: str | PathLike[str] = EDGE,
-    contacts: str | PathLike[str] | None = None,
-    contents: int = 1,
-    apart: float = PROBLEM_DEFAULT_APART,
-    lowest: float = DEFAULT_LOWEST,
-    stiffness: Sequence[float] = (),
-    finalists: int = DEFAULT_FINALISTS,
-    starts: int = 4,
-    seed: int = 0,
-    workers: int | None = None,
-    cluster: str | None = None,
-    progress: Progress = unseen,
-) -> Design:
-    """Find or compare layouts of ERAs, the best promised felt contrast first, as `era design` does.
-
-    eras: how many, or several numbers, as many as the rig's for None; layouts: None to search,
-    `random:N` or a file to rank layouts; keep: names of ERAs that stay; where: `edge`, `anywhere`
-    or a file; contacts: a file, anywhere for None; contents: at the same time, a finger for each;
-    apart [m]: least distance of two ERAs; lowest [Hz]: least rigid-body frequency of a supported
-    plate; stiffness [N/m]: of which new ERAs get the best, that of the rig's for none; finalists:
-    given layouts that are judged by their tables' answers; starts: of a search; workers: processes,
-    one for None; cluster: address of a Dask scheduler in their place; progress: called with the
-    tasks done and all, of one stage after the other. Raises InputError.
-
-    Example:
-        >>> designed = era.design(rig, 4, layouts="random:6", finalists=2)
-        >>> better = designed.best.rig
-    """
-    expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
-    check_progress(progress)
-    requested: Any = len(rig.eras) if eras is None else eras
-    counts = [requested] if is_whole(requested) or isinstance(requested, str) else requested
-    for what, row, made_by in (
-        ("eras", counts, "range(3, 7)"),
-        ("keep", keep, '["SW"]'),
-        ("stiffness", stiffness, "[17e3]"),
-    ):
-        expect(row, Sequence, what=what, made_by=made_by)
-    for what, value, least in (
-        *(("eras", each, 1) for each in (*counts, len(counts))),
-        ("contents", contents, 1),
-        ("finalists", finalists, 1),
-        ("starts", starts, 1),
-        ("seed", seed, 0),
-        ("workers", 1 if workers is None else workers, 1),
-    ):
-        if not is_whole(value):
-            raise InputError(f"{what} must be a whole number, got {shown(value)}")
-        expect_between(value, least, MAX_ERAS if what == "eras" else MAX_VALUE, what=what)
-    for what, number, unit in (
-        ("apart", apart, "metres"),
-        ("lowest", lowest, "hertz"),
-        *(("stiffness", each, "newtons per metre") for each in stiffness),
-    ):
-        expect_number(number, what=what, unit=unit)
-    expect_between(lowest, MIN_RIGID_BODY_FREQUENCY, what="lowest")
-    if not 0 < apart < max(rig.plate.length, rig.plate.width):
-        raise InputError(f"apart must be above 0 and below the plate's length, got {apart:g} m")
-    own = [era.name for era in rig.eras]
-    if any(each not in own or keep.count(each) > 1 for each in keep) or len(keep) > min(counts):
-        raise InputError(
-            f"keep must be up to {min(counts)} different ERAs of the rig, {', '.join(own)}, got "
-            f"{', '.join(map(str, keep))}"
-        )
-    tried = sorted({float(each) for each in stiffness if 0 < each < math.inf})
-    if len(tried) < len(stiffness) or len(tried) > MAX_STIFFNESSES:
-        raise InputError(
-            f"stiffness must be at most {MAX_STIFFNESSES} different values above 0 N/m, got "
-            f"{', '.join(f'{each:g}' for each in stiffness)}"
-        )
-    rule = contact_rule(
-        None if contacts is None else expect_path(contacts, what="contacts"), rig.plate, contents
-    )
-    area = area_of(str(expect_path(where, what="where")), rig.plate)
-    problems = [
-        DesignProblem(
-            rig, count, area, rule, tuple(keep), float(apart), float(lowest), seed, stiffness=each
-        )
-        for count in counts
-        for each in (tried or (None,))
-    ]
-    if cluster is not None and workers is not None:
-        raise InputError("only one of workers and cluster can be given")
-    machines: Machines = (
-        partial(on_processes, workers or 1) if cluster is None else partial(on_cluster, cluster)
-    )
-    if layouts is None:
-        return search_layouts(problems, starts=starts, runner=Runner(machines, progress))
-    return rank_layouts(
-        supported_layouts(str(expect_path(layouts, what="layouts")), problems),
-        finalists=finalists,
-        runner=Runner(machines, progress),
-    )

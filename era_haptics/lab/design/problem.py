@@ -1,12 +1,9 @@
-"""Where ERAs may stand: along the edge, anywhere, in polygons, on the white of a picture.
+"""The problem of a design: a number of ERAs, where they may stand, and the contacts they serve.
 
-Contact sets for which a plate is designed: fingers with contents, and some quiet ones.
-
-What is sought: a number of ERAs, where they may stand, and the contacts they serve.
-
-A layout supports the plate by its lowest rigid-body mode, and with weight on every ERA. Layouts to
-be ranked are those of a file, or the rig's own, those with a name, and random ones.
-"""
+ERAs may stand along the edge, anywhere, in polygons, or on the white of a picture. Contact sets
+have fingers with contents, and some quiet ones. A layout supports the plate by its lowest
+rigid-body mode, and with weight on every ERA. Layouts to be ranked are those of a file, or the
+rig's own, those with a name, and random ones."""
 
 import io
 import math
@@ -59,6 +56,53 @@ _PICTURE_SIDE = 1000  # pixels of the longer side of the picture proposed
 _MAX_BYTES = 16 << 20
 _ON_EDGE = 1e-9  # m
 _MAX_CANDIDATES = 2000
+
+DEFAULT_FINGER_GAP = 0.05
+"""Distance [m] between the fingers of a set."""
+
+DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
+"""Fewest and most quiet fingers beside one content, and beside several."""
+
+MIN_FINGERS = 2
+"""Fingers of a set."""
+
+_MAX_TRIES = 20_000
+_DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
+
+Draw = Callable[[np.random.Generator, int], FloatArray]
+"""Draws places [m] (n, 2)."""
+
+DEFAULT_LOWEST = 20.0
+"""Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
+
+MIN_SUPPORTING = 3
+"""ERAs, and other mounts, that can support a plate."""
+
+_ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
+
+CANDIDATES = {True: 48, False: 80}
+"""Candidates along the edge, and over an area."""
+
+SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
+
+JUDGED_SETS = 200
+"""Contact sets by which layouts are judged, other than those of the search."""
+
+DEFAULT_ERA_GAP = 0.03
+"""Least distance [m] of two ERAs."""
+
+_JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
+
+OWN = "own"
+"""Name of the rig's own layout."""
+
+MAX_LAYOUTS = 1_000_000
+
+_RANDOM = re.compile(r"random:(\d{1,9})")
+_TRIES = 20  # draws for each layout, of which some are there already
+
+NamedLayouts = dict[str, FloatArray]
+"""Positions [m] (n, 2) of the ERAs by the name of a layout, those kept first."""
 
 
 @dataclass(frozen=True)
@@ -202,22 +246,6 @@ def _white(path: Path, content: bytes, plate: Plate) -> NDArray[np.bool_]:
     return np.asarray(grey > (127.5 if grey.max() > 1 else 0.5))
 
 
-DEFAULT_APART = 0.05
-"""Distance [m] between the fingers of a set."""
-
-DEFAULT_QUIET = {True: (1, 3), False: (0, 1)}
-"""Fewest and most quiet fingers beside one content, and beside several."""
-
-MIN_FINGERS = 2
-"""Fingers of a set."""
-
-_MAX_TRIES = 20_000
-_DRAWN_FOR_EACH = 8  # drawn for each place of a pool, of which the loneliest is taken
-
-Draw = Callable[[np.random.Generator, int], FloatArray]
-"""Draws places [m] (n, 2)."""
-
-
 @dataclass(frozen=True, eq=False)
 class ContactRule:
     """Distribution of contact sets: anywhere, in regions, or those given.
@@ -296,7 +324,7 @@ class ContactRule:
 def anywhere(plate: Plate, contents: int = 1) -> ContactRule:
     """Fingers with contents and DEFAULT_QUIET ones anywhere on a plate."""
     draw = partial(_drawn, [Rectangle(0.0, 0.0, plate.length, plate.width)], plate)
-    return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_APART, draw, contents=contents)
+    return ContactRule(DEFAULT_QUIET[contents == 1], DEFAULT_FINGER_GAP, draw, contents=contents)
 
 
 def contact_rule(path: Path | None, plate: Plate, contents: int = 1) -> ContactRule:
@@ -388,22 +416,13 @@ class _ContactsSection(Section):
     """Contacts of a design. Effects and the like of a surface layout are passed over."""
 
     quiet: Annotated[tuple[int, int], Strict(strict=False)] | None = None
-    apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_APART
+    apart: Annotated[float, Quantity(LENGTH, at_least=0.026, at_most=10)] = DEFAULT_FINGER_GAP
     regions: Annotated[
         dict[Identifier, _RegionSection], Field(min_length=1, max_length=256, default_factory=dict)
     ]
     sets: Annotated[list[_SetSection], Field(min_length=1, max_length=1000, default_factory=list)]
     effects: Any = None
     elsewhere: Any = None
-
-
-DEFAULT_LOWEST = 20.0
-"""Lowest natural frequency [Hz] of the plate on its ERAs: it sags by 0.6 mm under its weight."""
-
-MIN_SUPPORTING = 3
-"""ERAs, and other mounts, that can support a plate."""
-
-_ROUNDING = 1e-9  # share of the mean load below which a pull is none: an ERA may carry nothing
 
 
 def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
@@ -420,20 +439,6 @@ def shortfall(rig: Rig, eras: Sequence[Actuator], *, lowest: float) -> float:
     return max(0.0, 1 - frequency / lowest) + (pulled if pulled > _ROUNDING else 0.0)
 
 
-CANDIDATES = {True: 48, False: 80}
-"""Candidates along the edge, and over an area."""
-
-SEARCH_FINGERS, SEARCH_FREQUENCIES = 32, 16
-
-JUDGED_SETS = 200
-"""Contact sets by which layouts are judged, other than those of the search."""
-
-PROBLEM_DEFAULT_APART = 0.03
-"""Least distance [m] of two ERAs."""
-
-_JUDGED_SEED = 0x5EED  # added to that of a search, whose own sets are others
-
-
 @dataclass(frozen=True, eq=False)
 class DesignProblem:
     """What is sought.
@@ -448,7 +453,7 @@ class DesignProblem:
     area: Area
     contacts: ContactRule
     kept: tuple[str, ...] = ()
-    apart: float = PROBLEM_DEFAULT_APART
+    apart: float = DEFAULT_ERA_GAP
     lowest: float = DEFAULT_LOWEST
     seed: int = 0
     stiffness: float | None = None
@@ -564,18 +569,6 @@ class DesignProblem:
         return found
 
 
-OWN = "own"
-"""Name of the rig's own layout."""
-
-MAX_LAYOUTS = 1_000_000
-
-_RANDOM = re.compile(r"random:(\d{1,9})")
-_TRIES = 20  # draws for each layout, of which some are there already
-
-NamedLayouts = dict[str, FloatArray]
-"""Positions [m] (n, 2) of the ERAs by the name of a layout, those kept first."""
-
-
 class _LayoutsSection(Section):
     """Places of the ERAs that are not kept, by the name of the layout."""
 
@@ -620,7 +613,7 @@ def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
     """
     found: NamedLayouts = {}
     known: set[bytes] = set()
-    for name, positions in _problem_drawn(problem, count):
+    for name, positions in _different_layouts(problem, count):
         key = np.unique(positions.round(9), axis=0).tobytes()
         if key not in known:
             known.add(key)
@@ -630,7 +623,7 @@ def random_layouts(problem: DesignProblem, count: int) -> NamedLayouts:
     return found
 
 
-def _problem_drawn(problem: DesignProblem, count: int) -> Iterator[tuple[str, FloatArray]]:
+def _different_layouts(problem: DesignProblem, count: int) -> Iterator[tuple[str, FloatArray]]:
     """Names, empty for random ones, and positions."""
     if len(problem.rig.eras) == problem.count and not problem.kept:
         yield OWN, problem.own_positions

@@ -1,9 +1,10 @@
-"""A fast score of a layout: expected contrast over sampled contact sets.
+"""A fast score of layouts, and the search for the places of ERAs by it.
 
-As answers are found (`model.ensemble.touched_plate`, `model.drive_modes`), at a few
-frequencies, from the receptances of the free plate, and with each finger loading the plate where it
-rests: what it changes at the others is left out, so that all is computed once for each finger. With
-ERAs e of dynamic stiffness Z on the plate, a finger f of dynamic stiffness D and its points p:
+The score is the expected contrast over sampled contact sets, found as answers are
+(`model.ensemble.touched_plate`, `model.drive_modes`), at a few frequencies, from the receptances of
+the free plate. Each finger loads the plate where it rests; what it changes at the others is left
+out, so that all is computed once for each finger. With ERAs e of dynamic stiffness Z on the plate,
+a finger f of dynamic stiffness D and its points p:
 
     K = (1 + Z A_ee)^-1,  G = A_pe K,  L = A_pf - G Z A_ef,  M = D / (1 + D L_f)
     t_e = G_p - L_p M G_f,  h = -w² t_e z stroke,  r_e = stroke - u_e,  r_f = -u_f
@@ -14,15 +15,13 @@ with dh of the plates thicker and thinner by a standard deviation, each solved e
 half, dc by the ERAs' damping, s_j of each ERA's stiffness and the finger's load, and the last over
 the plate without fingers, as `LocalizationTable.error_power`. The score of a set is |h_t w|² /
 max_q w^H R_q w of the best weights w at the best frequency, less a tenth of what they miss the
-wanted level by: an answer that has to reach it loses little. Of several contents that of the worst,
-all other fingers quiet: their foreign levels add to little more than the highest (docs/decisions,
-0067), each searched at as many times the level, since they share the stroke.
+wanted level by: an answer that has to reach it loses little. For several contents it is the worst
+one's, with all other fingers quiet: their foreign levels add to little more than the highest
+(docs/decisions, 0067). Each is searched at as many times the level, since they share the stroke.
 
-Search for the places of ERAs: greedy, then exchange, then places moved freely.
-
-Greedy adds the candidate that raises the score most; an exchange moves one ERA at a time to the
-best candidate until none gains; then every ERA is moved by ever smaller steps, no longer bound to
-the candidates. A list of layouts is a search without steps.
+The search adds the candidate that raises the score most, one ERA after the other; then exchanges
+move one ERA at a time to the best candidate until none gains; then every ERA is moved by ever
+smaller steps, no longer bound to the candidates. A list of layouts is a search without steps.
 """
 
 import math
@@ -56,9 +55,18 @@ LEVEL_PENALTY = 0.1
 
 _LEAST = np.float32(1e-30)
 
+MAX_SWEEPS = 4
+"""Exchanges of every ERA."""
+
+FINEST_STEP = 0.001
+"""Last step [m] of freely moved places."""
+
+_GAIN = 0.01  # dB; smaller ones are not worth a move
+_UNSUPPORTED = -100.0  # dB; below every layout that supports the plate
+
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class PlaceReceptances:
     """Receptances [m/N] from c places of plates of v thicknesses, the modelled one first.
 
     at (c, 2) [m]; between (v, f, c, c); to_tips (v, f, m p, c): at the points of m fingertips;
@@ -116,11 +124,11 @@ class Scorer:
         tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
         self._own = np.moveaxis(tips[:, :, every, :, every], 0, 2)
 
-    def places(self, at: FloatArray) -> Positions:
+    def places(self, at: FloatArray) -> PlaceReceptances:
         """Solve for ERAs at places [m] (c, 2)."""
         return self._solved(np.column_stack([at, np.full(len(at), self._rig.eras[0].foot)]))
 
-    def _solved(self, footprints: FloatArray) -> Positions:
+    def _solved(self, footprints: FloatArray) -> PlaceReceptances:
         between, to_points = self._free.receptances(
             footprints,
             self._points,
@@ -133,9 +141,11 @@ class Scorer:
             footprints, self._cells, self._frequencies, loads=self._rig.masses
         )
         over_plate = np.asarray(to_plate.swapaxes(1, 2), dtype=np.complex64)
-        return Positions(footprints[:, :2], between.astype(np.complex64), to_tips, over_plate)
+        return PlaceReceptances(
+            footprints[:, :2], between.astype(np.complex64), to_tips, over_plate
+        )
 
-    def mean(self, places: Positions, chosen: IntArray) -> float:
+    def mean(self, places: PlaceReceptances, chosen: IntArray) -> float:
         """Mean score [dB] of ERAs at chosen places (n,), each number of fingers counting alike."""
         target, power = self._forms(places, chosen)
         scores = [self._of_sets(target, power, fingers).mean() for fingers in self._groups]
@@ -151,7 +161,9 @@ class Scorer:
         ]
         return np.asarray(np.min(each, axis=0))
 
-    def _forms(self, places: Positions, chosen: IntArray) -> tuple[Complex64Array, Complex64Array]:
+    def _forms(
+        self, places: PlaceReceptances, chosen: IntArray
+    ) -> tuple[Complex64Array, Complex64Array]:
         """Mean fields (f, m, n) [m/s²] at the fingertips, and expected power there (f, m, n, n)."""
         uncertainty, weights, D = self._rig.uncertainty, self._weights, self._finger
         m, p = weights.shape
@@ -264,16 +276,6 @@ def _grouped(sizes: Sequence[int], numbers: IntArray) -> tuple[IntArray, ...]:
         numbers[first[np.equal(sizes, size)][:, None] + np.arange(size)]
         for size in np.unique(sizes).tolist()
     )
-
-
-MAX_SWEEPS = 4
-"""Exchanges of every ERA."""
-
-FINEST_STEP = 0.001
-"""Last step [m] of freely moved places."""
-
-_GAIN = 0.01  # dB; smaller ones are not worth a move
-_UNSUPPORTED = -100.0  # dB; below every layout that supports the plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,7 +394,7 @@ class LayoutSearch:
                 return found
         return area_of(ANYWHERE, plate).moved(place, step)
 
-    def _score_at(self, places: Positions, positions: FloatArray) -> float:
+    def _score_at(self, places: PlaceReceptances, positions: FloatArray) -> float:
         """Score [dB] of positions among places, far below 0 if they do not support the plate."""
         if len(positions) + self.problem.supports >= MIN_SUPPORTING:
             shortfall = self.problem.shortfall(positions)

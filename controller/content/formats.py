@@ -1,27 +1,23 @@
-"""Formats of content by the ending of a file: those of the project and of installed packages.
+"""Formats of content by the ending of a file, and the named contents that come with the project.
 
-Also the named contents that come with the project.
+AHAP: the haptic and audio patterns of Apple, version 1. Missing values have their defaults, those
+out of range are clamped, unknown keys are ignored, and trailing commas pass; the remarks say what
+was clamped, ignored or left out. Sources: Apple, "Representing haptic patterns in AHAP files", and
+the header CHHapticParameter.h. Apple publishes neither the defaults of HapticIntensity and
+HapticSharpness, here 1 (no attenuation) and 0.5, nor AttackTime, DecayTime and ReleaseTime in
+seconds, here 10 ms times 100 to that power, and 0 s for 0.
 
-AHAP, the haptic and audio patterns of Apple, version 1, as Apple documents it.
+.haptic: the files of Haptics Studio and NiceVibrations, version 1. Intensity is the root of an
+amplitude, and the sharpness of what lasts the root of a frequency, as in the format's own converter
+to AHAP (NiceVibrations, core/datamodel/src/ios/v1.rs); files that it refuses are refused here.
+Unknown keys, of later minor versions, are ignored.
 
-Missing values have their defaults, those out of range are clamped, unknown keys are ignored, and
-trailing commas pass; what was clamped, ignored or left out is in the remarks. Sources: Apple,
-"Representing haptic patterns in AHAP files", and the header CHHapticParameter.h. Apple publishes
-neither the defaults of HapticIntensity and HapticSharpness, here 1 (no attenuation) and 0.5, nor
-times of AttackTime, DecayTime and ReleaseTime in seconds, here 10 ms times 100 to that power; 0,
-the shortest, is none.
+HJIF: the interchange format of ISO/IEC 23090-31 (MPEG haptics), of 2023. The bands Transient,
+VectorialWave and Curve of profile Main are read, of one channel of vibration; bands of wavelets are
+refused. Intensity is the amplitude, as the reference encoder writes that of AHAP; a wave other than
+a sine counts by its root mean square.
 
-The .haptic files of Haptics Studio and NiceVibrations, version 1.
-
-Intensity is the root of an amplitude, and the sharpness of what lasts the root of a frequency, as
-in the format's own converter to AHAP (NiceVibrations, core/datamodel/src/ios/v1.rs); what that file
-refuses is refused here. Unknown keys, of later minor versions, are ignored.
-
-HJIF, the interchange format of ISO/IEC 23090-31 (MPEG haptics), of 2023.
-
-Of profile Main the bands Transient, VectorialWave and Curve; bands of wavelets are refused. One
-channel of vibration is read. Intensity is the amplitude, as the reference encoder writes that of
-AHAP; a wave of another form than a sine counts by its root mean square.
+WAV is in `reading`; installed packages add formats of their own.
 """
 
 import math
@@ -159,7 +155,7 @@ class Ahap(ContentFormat):
 
 
 class _AhapReading:
-    """Collects events and parameters of a file, and what of them was clamped or left out."""
+    """Collects the events and parameters of a file, and counts those clamped or left out."""
 
     def __init__(self) -> None:
         self.end = 0.0  # s, of the events so far
@@ -170,7 +166,7 @@ class _AhapReading:
         self._clamped: dict[str, list[float]] = {}
 
     def add(self, entry: _Entry) -> None:
-        """Take an entry of a pattern."""
+        """Add an entry of a pattern."""
         if entry.Event is not None:
             self._add_event(entry.Event)
         if entry.Parameter is not None:
@@ -259,7 +255,7 @@ class _AhapReading:
         return intensity_curve, sharpness, tuple(transients)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return in words what was left out and clamped."""
+        """Return a remark for each kind of entry that was left out or clamped."""
         lasts = any(event.EventType == "HapticContinuous" for event, _ in self._events)
         for name in [] if lasts else [f"Haptic{each}Control" for each in _PHASES]:
             self._skipped[name, f"{name}s"] += len(self._controls[name])
@@ -455,12 +451,25 @@ _RMS = {
 }
 """Root mean square of a wave over that of a sine."""
 
-_NOT_FELT = (
-    *("id", "level", "date", "description", "avatars", "avatar_id", "semantic_keywords"),
-    *("reference_devices", "reference_device_id", "body_part_mask", "body_part_target"),
-    *("actuator_resolution", "actuator_target", "mixing_coefficient", "block_length", "phase"),
-)
-"""Keys of the standard that say nothing of what one channel's vibration feels like."""
+_NOT_FELT = {
+    "actuator_resolution",
+    "actuator_target",
+    "avatar_id",
+    "avatars",
+    "block_length",
+    "body_part_mask",
+    "body_part_target",
+    "date",
+    "description",
+    "id",
+    "level",
+    "mixing_coefficient",
+    "phase",
+    "reference_device_id",
+    "reference_devices",
+    "semantic_keywords",
+}
+"""Keys of the standard without an effect on how the vibration of one channel feels."""
 
 _Ticks = Annotated[float, Field(ge=0)]
 _Hz = Annotated[float, Field(ge=0, le=1e6)]
@@ -551,7 +560,7 @@ class Hjif(ContentFormat):
 
 
 class _HjifReading:
-    """Collects what a channel's bands ask for."""
+    """Collects the vibrations of a channel's bands."""
 
     def __init__(
         self,
@@ -572,7 +581,7 @@ class _HjifReading:
         self._remarks: tuple[str, ...] = ()
 
     def add(self, band: _Band, path: KeyPath) -> None:
-        """Take a band; adds the first that is wrong with it to the problems of the file."""
+        """Add a band, or its first problem to those of the file."""
         if band.band_type == "WaveletWave":
             self._validation.add(
                 (*path, "band_type"),
@@ -670,7 +679,7 @@ class _HjifReading:
         return sharpness_of(hertz).tolist()
 
     def pattern(self, source: str, remarks: tuple[str, ...]) -> Pattern:
-        """Return what the bands ask for together."""
+        """Return the pattern of all bands."""
         intensity, sharpness = mixed(source, self._segments)
         if self._moved:
             what = counted(self._moved, "frequency", plural="frequencies")
@@ -693,7 +702,7 @@ def _course(
 
 
 BUILT_IN: tuple[type[ContentFormat], ...] = (Ahap, Haptic, Hjif, Wav)
-"""The formats of the project itself."""
+"""Formats of the project itself."""
 
 _FORMATS: PluginRegistry[type[ContentFormat]] = PluginRegistry(
     "format of content",
@@ -714,7 +723,7 @@ _NAMED = Path(__file__).with_name("named")
 
 
 def content_formats() -> tuple[str, ...]:
-    """Return the endings of all formats, those of the project first, without any plug-in."""
+    """Return the endings of all formats, those of the project first; loads no plug-in."""
     return _FORMATS.names()
 
 

@@ -1,11 +1,7 @@
-"""Patterns: the one form into which all content formats are read.
+"""Patterns: the one form into which all content is read, from files and from points of a program.
 
-Events and curves over time, as AHAP, HJIF and their relatives have them: how strongly what lasts is
-felt, how sharply, and transients beside it.
-
-Sharpness: the frequencies that 0 to 1 stand for, both ways.
-
-Points and taps that a program gives: time [s], intensity and sharpness of each.
+A pattern has curves over time, as AHAP, HJIF and their relatives: the intensity and sharpness of
+what lasts, and transients beside it. Sharpness, 0 to 1, stands for frequencies.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,22 +32,22 @@ class Transient:
 
 @dataclass(frozen=True)
 class Pattern:
-    """What a file asks for.
-
-    duration [s]; intensity, sharpness: of what lasts, intensity 0 outside its curve, sharpness as
-    at its ends; transients: ascending in time; remarks: what of the file was changed or left out,
-    in words.
-    """
+    """The content of a file."""
 
     duration: float
+    """[s]"""
     intensity: Curve = ()
+    """Of what lasts; 0 outside the curve."""
     sharpness: Curve = ()
+    """Of what lasts; as at its ends outside the curve."""
     transients: tuple[Transient, ...] = ()
+    """Ascending in time."""
     remarks: tuple[str, ...] = ()
+    """What was changed or left out of the file."""
 
 
 def misfit(pattern: Pattern) -> str:
-    """Return what is wrong with a pattern that a format has made, or ""."""
+    """Return the first problem of a pattern that a format has made, or ""."""
     if not pattern.duration >= 0:  # also for NaN
         return f"must last 0 s or longer, got {pattern.duration:g} s"
     taps = pattern.transients
@@ -73,7 +69,7 @@ def misfit(pattern: Pattern) -> str:
 
 
 def along(curve: Curve, times: FloatArray, *, beyond: float | None = None) -> FloatArray:
-    """Values of a curve at times [s]; outside of it a value, by default that of its ends."""
+    """Return a curve at times [s]; beyond: its value outside, by default that of its ends."""
     moments, values = np.array(curve or ((0.0, 0.0),)).T
     return np.asarray(np.interp(times, moments, values, left=beyond, right=beyond))
 
@@ -83,12 +79,12 @@ MIN_HZ, MAX_HZ = 65.0, 300.0
 
 
 def sharpness_of(hertz: FloatArray) -> FloatArray:
-    """Sharpness of frequencies [Hz], 0 and 1 outside their range."""
+    """Return the sharpness of frequencies [Hz], 0 and 1 outside their range."""
     return np.asarray(((hertz - MIN_HZ) / (MAX_HZ - MIN_HZ)).clip(0, 1))
 
 
 def hertz_of(sharpness: FloatArray) -> FloatArray:
-    """Frequencies [Hz] of sharpness, 0 to 1."""
+    """Return the frequencies [Hz] of sharpness, 0 to 1."""
     return MIN_HZ + sharpness * (MAX_HZ - MIN_HZ)
 
 
@@ -102,9 +98,9 @@ _Row: TypeAlias = tuple[float, float, float]
 
 
 def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
-    """Return the pattern of points, between which straight lines last, and of taps beside them.
+    """Return the pattern of straight lines between points, and of taps beside them.
 
-    Raises InputError, with the index of one, for what is none.
+    Raises InputError, with the index of the first invalid point or tap.
     """
     if not 1 <= (count := len(points) + len(taps)) <= MAX_GIVEN:
         raise InputError(f"points and taps must be 1 to {MAX_GIVEN} together, got {count}")
@@ -118,7 +114,7 @@ def pattern_of_points(points: Given, taps: Given = ()) -> Pattern:
 
 
 def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
-    """Return the points and taps of a pattern: at even distances where it has too many points.
+    """Return the points and taps of a pattern, evenly spaced points if it has too many.
 
     Raises InputError for too many taps.
     """
@@ -143,7 +139,7 @@ def points_of(pattern: Pattern) -> tuple[list[_Row], list[_Row]]:
 
 
 def _checked(what: str, given: Given) -> Iterator[_Row]:
-    """Yield each of what is given; raises InputError for what is none."""
+    """Yield points or taps; raises InputError for the first invalid one."""
     before = 0.0
     for index, each in enumerate(given):
         if len(each) != 3:

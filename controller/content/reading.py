@@ -1,15 +1,12 @@
-"""What every format of content is, and the bounds of a file of any.
+"""Reading of content: the base of all formats, strict JSON, mixed vibrations, and WAV files.
 
-JSON files of content, read strictly; a line for every key, found when an error needs it.
+JSON files are bounded before they are parsed; the line of a key is found when an error needs it.
+Vibrations that last at the same time are mixed into one curve of intensity and one of sharpness.
 
-Vibrations that last at the same time, made one: a curve of intensity and one of sharpness.
-
-WAV files: level and centre frequency of a signal over time.
-
-A signal is felt by the strength of its vibration, not by its waveform: it is split into two bands,
-below and above 140 Hz; intensity is the amplitude of both together, 1 for a sine of full scale, and
-the sharpness is that of the stronger. What lies outside the frequencies that a sharpness can stand
-for is left out, and said in dB.
+A WAV signal is felt by the strength of its vibration, not by its waveform: it is split into two
+bands, below and above 140 Hz. Intensity is the amplitude of both together, 1 for a sine of full
+scale, and sharpness that of the stronger band. Parts outside the frequencies that a sharpness can
+stand for are left out, with a remark in dB.
 """
 
 import json
@@ -40,19 +37,19 @@ MAX_POINTS = 20_000
 
 
 def refusal(source: str, message: str, *, line: int | None = None, key: str = "") -> ConfigError:
-    """Return the error of a file as a whole, or of a key on a line."""
+    """Return the error of a whole file, or of a key on a line."""
     return ConfigError(source, [ConfigProblem(line, key, message)])
 
 
 def too_much(end: float, count: int) -> str:
-    """Return what is wrong with content that ends at a time [s] and has so many points, or ""."""
+    """Return why content with an end [s] and a number of points is too much, or ""."""
     if end > MAX_DURATION:
         return f"must end within {MAX_DURATION:g} s, got {end:g} s; shorten it"
     return f"has more than {MAX_POINTS} points; leave some out" if count > MAX_POINTS else ""
 
 
 class ContentFormat(ABC):
-    """A format of content; a class for each, named by the ending of its files."""
+    """A format of content, with the ending of its files as its name."""
 
     ending: ClassVar[str]
     """What a file's name ends with after the dot, in lower case."""
@@ -62,11 +59,11 @@ class ContentFormat(ABC):
 
     @abstractmethod
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return what a file asks for.
+        """Return the pattern of a file.
 
         content: all bytes of the file; source: its name, for errors; channel: counted from 1.
-        Raises InputError for what the format does not allow, with the line and key where it has
-        any. Nothing may be executed, or read from elsewhere, that a file names.
+        Raises InputError for an invalid file, with line and key if there are any. Nothing that a
+        file names may be executed or read.
         """
 
 
@@ -87,7 +84,7 @@ _T = TypeVar("_T")
 
 
 class _FirstOfMany:
-    """Annotation of a list: the first invalid entry is reported, and no more of them are looked at.
+    """Annotation of a list of which only the first invalid entry is reported.
 
     pydantic's own, FailFast, cannot be in a union.
     """
@@ -111,7 +108,7 @@ class JsonDocument(Document):
     """The content of a JSON file; lines are found when asked for."""
 
     def line_of(self, path: KeyPath) -> int:
-        """The line of a key or list entry, or of the nearest one above it if it is missing."""
+        """Return the line of a key or list entry, or of the nearest one above if it is missing."""
         start = value = _skipped(self.text, 0)
         for key in path:
             found = (where for name, *where in _entries(self.text, value) if name == key)
@@ -122,7 +119,7 @@ class JsonDocument(Document):
 
 
 def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> JsonDocument:
-    """Read an object; raises ConfigError for what is not JSON, nested too deep or repeated."""
+    """Read an object; raises ConfigError if it is invalid, nested too deep, or repeats a key."""
     if len(content) > _MAX_SIZE:
         raise refusal(source, f"is larger than {_MAX_SIZE >> 20} MiB; shorten the content")
     text = decoded(source, content).removeprefix("\ufeff")
@@ -147,9 +144,9 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
-    """Return in words which keys of a file are ignored, the first ones by name.
+    """Return a remark on the unknown keys of a file, the first ones by name, if it has any.
 
-    but: those that say nothing of what is felt, besides all that are empty.
+    but: keys without an effect on what is felt; empty ones do not count either.
     """
     found = Counter(name for name in _extra(section) if name not in but)
     if not found:
@@ -192,7 +189,7 @@ def _repeated(text: str, at: int, path: KeyPath) -> Iterator[tuple[int, KeyPath,
 
 
 def _check_size(source: str, text: str) -> None:
-    """Refuse what is nested too deep, or has too many values, before it is parsed."""
+    """Refuse text that is nested too deep, or has too many values, before it is parsed."""
     bare = _STRINGS.sub("", text)
     codes = np.frombuffer(bare.encode("utf-32-le", "surrogatepass"), np.uint32)
     opened = (codes == ord("{")) | (codes == ord("["))
@@ -205,7 +202,7 @@ def _check_size(source: str, text: str) -> None:
 
 
 def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:
-    """Yield the key, where it begins and where its value begins, of an object or a list."""
+    """Yield each key of an object or list, and where it and its value begin."""
     closing = {"{": "}", "[": "]"}.get(text[at])
     if closing is None:
         return
@@ -224,7 +221,7 @@ def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:
 
 
 def _skipped(text: str, at: int) -> int:
-    """Return where something stands next that is no space."""
+    """Return the position of the next character that is no space."""
     found = _SPACE.match(text, at)
     return at if found is None else found.end()
 
@@ -335,7 +332,7 @@ class Wav(ContentFormat):
     has_channels = True
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
-        """Return the course of one channel's vibration."""
+        """Return the pattern of one channel."""
         rate, samples = _samples(content, source)
         count = samples.shape[1]
         if count > 2:
@@ -363,7 +360,7 @@ def _samples(content: bytes, source: str) -> tuple[int, FloatArray]:
 
 
 def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:
-    """Return intensity and sharpness of a signal at a rate [Hz], and what is left out."""
+    """Return intensity and sharpness of a signal at a rate [Hz], and remarks on what is lost."""
     import scipy.fft
 
     duration = len(signal) / rate
@@ -429,7 +426,7 @@ def _band(spectrum: Any, points: int, step: float, count: int) -> tuple[FloatArr
 
 
 def _rise(frequencies: FloatArray, low: float, high: float) -> FloatArray:
-    """Return 0 below and 1 above two frequencies; rises and falls between add as powers to 1."""
+    """Return 0 below and 1 above two frequencies; powers of a rise and a fall between add to 1."""
     share = np.log(frequencies / low) / math.log(high / low)
     return np.asarray(np.sin(share.clip(0, 1) * math.pi / 2))
 

@@ -1,4 +1,4 @@
-"""Renditions: what a pattern becomes on a plate at a level, before anybody else's is known.
+"""Renditions: a pattern as stimuli of one finger at a level, whatever other fingers feel.
 
 The reasons are in docs/how-to/play-content.md.
 """
@@ -21,10 +21,13 @@ Band: TypeAlias = tuple[float, float]
 """Lowest and highest frequency [Hz]."""
 
 LEAST_DB_SL = 10.0
-"""Level of the faintest intensity, the least that Android's builder of envelopes guarantees."""
+"""Level [dB SL] of the faintest intensity: the lowest that envelopes of Android guarantee."""
 
-CLICK_DURATION, DUCKING = 0.040, 0.030
-"""Of a transient [s], and while what lasts fades before it and returns after it."""
+CLICK_DURATION = 0.040
+"""Duration of a transient [s]."""
+
+DUCKING = 0.030
+"""Time [s] in which what lasts fades before a transient, and returns after it."""
 
 SMOOTHING = 0.020
 """Width at half height [s] of the raised cosine over which courses beside others are averaged."""
@@ -39,7 +42,7 @@ _TEXTURE = 3.0  # Hz; on each side of a modulation, of which it is
 
 @dataclass(frozen=True)
 class Tap:
-    """A transient: when it starts [s], its level [dB SL] and its band [Hz]."""
+    """A transient: its start [s], level [dB SL] and band [Hz]."""
 
     time: float
     level_db_sl: float
@@ -48,27 +51,28 @@ class Tap:
 
 @dataclass(frozen=True)
 class Rendition:
-    """A pattern as stimuli of one finger.
-
-    duration [s]; course: of what lasts, ducked around the clicks, None without any; level_db_sl: at
-    its highest share, 1; band [Hz]: of its carrier; modulation_hz: how often a second its course
-    comes and goes, None where that is not most of what changes; clicks: ascending, 60 ms
-    apart; remarks: what was changed or lost on the way, in words.
-    """
+    """A pattern as stimuli of one finger."""
 
     duration: float
+    """[s]"""
     course: Course | None
+    """Of what lasts, ducked around the clicks; None if nothing lasts."""
     level_db_sl: float
+    """Where the share of the course is 1."""
     band: Band
+    """Of the carrier of the course [Hz]."""
     modulation_hz: float | None
+    """Frequency [Hz] at which the course comes and goes, if that is most of its change."""
     clicks: tuple[Tap, ...]
+    """Ascending in time, at least 60 ms apart."""
     remarks: tuple[str, ...]
+    """What was changed or lost."""
 
     def smoothed(self) -> "Rendition":
-        """Return it as it is played where other fingers are on the plate: averaged over 20 ms.
+        """Return the rendition beside other fingers: its course averaged over 20 ms.
 
-        Its modulation stays. It starts from rest and ends at rest, within its duration. Bands reach
-        a third of an octave to each side: about what a finger tells, for 1 dB of contrast.
+        Its modulation stays. The course starts and ends at rest. Bands reach a third of an octave
+        to each side, which fingers hardly notice, for 1 dB of contrast.
         """
         clicks = tuple([replace(each, band=_wider(each.band)) for each in self.clicks])
         among = replace(self, band=_wider(self.band), clicks=clicks)
@@ -87,10 +91,10 @@ class Rendition:
 
 
 def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
-    """Levels [dB SL] that a pattern asks for at times [s] (n,), before anything of it is lost.
+    """Return the levels [dB SL] of a pattern at times [s] (n,), before anything of it is lost.
 
-    level_db_sl: of intensity 1; -inf for nothing. Of its transients, 40 ms each, and of what lasts
-    between them, from which each is set apart.
+    level_db_sl: of intensity 1. Transients last 40 ms each, and what lasts fades around them; -inf
+    where nothing is felt.
     """
     taps = [each for each in pattern.transients if each.intensity > 0]
     starts = np.array([each.time for each in taps])
@@ -101,10 +105,10 @@ def requested_level(pattern: Pattern, level_db_sl: float, times: FloatArray) -> 
 def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> Rendition:
     """Map a pattern to stimuli of a level [dB SL] at intensity 1, on a table's frequencies [Hz].
 
-    Intensity i is 10 + i (level - 10) dB SL, 0 is silent; sharpness is a frequency in a band of
+    Intensity i is 10 + i (level - 10) dB SL, and 0 is silent; sharpness is a frequency in a band of
     10 % on each side, or of the table's nearest three. What lasts has one band, where most of its
-    energy is; transients are clicks, of those too close together the strongest: the others are left
-    to what lasts.
+    energy is. Transients are clicks; of those too close together the strongest is one, and the
+    others are left to what lasts.
     """
     pattern = _as_tap(pattern)
     taps = _apart(pattern)
@@ -141,20 +145,20 @@ def rendered(pattern: Pattern, level_db_sl: float, frequencies: FloatArray) -> R
 
 
 def _level_of(intensity: FloatArray, level_db_sl: float) -> FloatArray:
-    """Levels [dB SL] of intensities; -inf for 0."""
+    """Return the levels [dB SL] of intensities; -inf for 0."""
     least = min(LEAST_DB_SL, level_db_sl)
     return np.where(intensity > 0, least + intensity * (level_db_sl - least), -np.inf)
 
 
 def _lasting(pattern: Pattern, level_db_sl: float, times: FloatArray) -> FloatArray:
-    """Levels [dB SL] of what lasts at times [s]."""
+    """Return the levels [dB SL] of what lasts at times [s]."""
     return _level_of(along(pattern.intensity, times, beyond=0.0), level_db_sl)
 
 
 def _with_taps(
     level: FloatArray, taps: Sequence[Transient], level_db_sl: float, times: FloatArray
 ) -> FloatArray:
-    """Levels [dB SL] at times [s], or those of taps, 40 ms each, where they are higher."""
+    """Return levels [dB SL] at times [s], or those of taps, 40 ms each, where they are higher."""
     starts = np.array([each.time for each in taps])
     levels = _level_of(np.array([each.intensity for each in taps]), level_db_sl)
     first, last = np.searchsorted(times, [starts, starts + CLICK_DURATION])
@@ -165,7 +169,7 @@ def _with_taps(
 
 
 def _band(hertz: float, frequencies: FloatArray) -> Band:
-    """A band about a frequency [Hz] that has enough frequencies of a table."""
+    """Return a band about a frequency [Hz] that has enough frequencies of a table."""
     nearest = frequencies[np.argsort(np.abs(np.log(frequencies / hertz)))[:_MIN_FREQUENCIES]]
     return (
         min((1 - _BAND) * hertz, float(nearest.min())),
@@ -174,12 +178,12 @@ def _band(hertz: float, frequencies: FloatArray) -> Band:
 
 
 def _wider(band: Band) -> Band:
-    """A band as it is beside others."""
+    """Return a band as it is beside other fingers."""
     return band[0] / _WIDER, band[1] * _WIDER
 
 
 def _as_tap(pattern: Pattern) -> Pattern:
-    """What lasts too short for a plate to follow, as a transient; any other pattern as it is."""
+    """Return a pattern too short for a plate to follow as a transient; any other as it is."""
     moments, values = np.array(pattern.intensity or ((0.0, 0.0),)).T
     sounds = np.maximum(values[1:], values[:-1]) > 0
     length = float(np.diff(moments)[sounds].sum())
@@ -197,7 +201,7 @@ def _as_tap(pattern: Pattern) -> Pattern:
 
 
 def _apart(pattern: Pattern) -> list[Transient]:
-    """The transients that are felt, ascending: the strongest first, those too close left out."""
+    """Return the transients that become clicks, ascending; of those too close the strongest."""
     kept, times = list[Transient](), list[float]()
     for tap in sorted(pattern.transients, key=lambda each: -each.intensity):
         at = bisect_left(times, tap.time)
@@ -210,7 +214,7 @@ def _apart(pattern: Pattern) -> list[Transient]:
 
 
 def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
-    """Share that is left of what lasts at times [s] beside clicks from starts [s] on."""
+    """Return the share left of what lasts at times [s] beside clicks from starts [s] on."""
     bounded = np.concatenate([[-np.inf], starts, [np.inf]])
     number = np.searchsorted(starts, times, side="right")
     away = np.minimum(times - bounded[number] - CLICK_DURATION, bounded[number + 1] - times)
@@ -218,7 +222,7 @@ def _beside(starts: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
-    """The frequency [Hz] about whose band most of the energy is: its mean there."""
+    """Return the mean frequency [Hz] in the band with most of the energy."""
     order = np.argsort(hertz, kind="stable")
     ascending, below = hertz[order], np.append(0.0, np.cumsum(energy[order]))
     tried = np.geomspace(MIN_HZ, MAX_HZ, 60)
@@ -232,7 +236,7 @@ def _carrier(hertz: FloatArray, energy: FloatArray) -> float:
 def _lost(
     hertz: FloatArray, shares: FloatArray, band: Band, clicks: Sequence[Tap]
 ) -> Iterator[str]:
-    """What of what lasts is not played as the file has it."""
+    """Yield a remark for each way in which what lasts differs from the file."""
     away = (hertz < band[0]) | (hertz > band[1])
     if (lost := np.average(away, weights=shares**2)) > _MENTIONED:
         of_file = hertz[shares > 0]
@@ -245,7 +249,7 @@ def _lost(
 
 
 def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
-    """How often a second [Hz] shares come and go, where most of what changes is that."""
+    """Return the frequency [Hz] at which shares come and go, if that is most of their change."""
     hertz = np.fft.rfftfreq(len(shares), times[1])
     power = np.abs(np.fft.rfft(shares - shares.mean())) ** 2
     is_texture = (hertz >= MIN_MODULATION) & (hertz <= MAX_MODULATION)
@@ -255,7 +259,7 @@ def _modulation(times: FloatArray, shares: FloatArray) -> float | None:
 
 
 def averaged(values: FloatArray, step: float, width: float) -> FloatArray:
-    """Values a step [s] apart, averaged by a raised cosine of a width [s] at half its height."""
+    """Average values a step [s] apart by a raised cosine of a width [s] at half its height."""
     count = max(int(np.ceil(width / step - _ROUNDING)) - 1, 0)
     kernel = np.cos(np.pi / 2 * step / width * np.arange(-count, count + 1)) ** 2
     return np.convolve(values, kernel / kernel.sum())[count : count + len(values)]

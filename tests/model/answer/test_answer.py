@@ -1,7 +1,4 @@
-"""Several contents at once, by plates solved exactly, and what is done where not all are served.
-
-Modulated contents: a carrier and two side bands, by plates solved exactly.
-"""
+"""Answers: several contents at once, fingers that give way, and modulation, by exact plates."""
 
 import json
 import tracemalloc

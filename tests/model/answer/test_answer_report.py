@@ -1,11 +1,4 @@
-"""Exposure of fingers, weighted as for the hand.
-
-Concentration of a vibration: of fields with a known answer, and of a table's patterns.
-
-Onsets, endings and transient measures of a table's patterns.
-
-Questions to the table from the command line and from Python.
-"""
+"""Measures of answers on request, their exposure, and questions as JSON and on the command line."""
 
 import errno
 import json

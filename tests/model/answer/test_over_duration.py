@@ -1,9 +1,4 @@
-"""Levels over limited durations, against the plate in time sample by sample, and their limits.
-
-Fingers of one hand, too near for contents of their own, beside somebody else on the plate.
-
-Promises by all sets of thresholds: the least of them, what it costs, and what is said of it.
-"""
+"""Levels over limited durations by the plate in time, hands, and all sets of thresholds."""
 
 import math
 from dataclasses import replace

@@ -1,9 +1,4 @@
-"""Courses: what is felt of a file, against hand calculation and the plate in time.
-
-Tones of contents: of ranked frequencies, and by the kernel in C as in numpy.
-
-Fingers and stimuli: what is refused, and what a vibration for some of them has.
-"""
+"""Fingers, stimuli and courses, and the search for tones: the kernel in C against numpy."""
 
 import math
 import pickle

@@ -1,7 +1,4 @@
-"""The kernel of knots in its memory, under sanitizers.
-
-The compiled library: found and built by a compiler, cached, and refused where it is damaged.
-"""
+"""The compiled library: built, cached, refused if damaged; its memory under sanitizers."""
 
 import ctypes
 import hashlib

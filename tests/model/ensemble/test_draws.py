@@ -1,12 +1,6 @@
-"""Drawn plates: what all channels have in common.
+"""Drawn plates with uncertain feet, second harmonics and clock errors, by Monte Carlo and by hand.
 
-Feet whose stiffness nobody knows: what is promised of a board on them, and what is drawn.
-
-What is promised, and how many plates keep it, for other `supports` that a rig states, is logged.
-
-Second harmonics of ERAs at fingers, by the direct solver at twice the frequency.
-
-Amplifiers whose clocks are off: two halves by hand, mean squares, promises by Monte Carlo.
+A test logs how many plates keep their promise for other `supports` that a rig states.
 """
 
 import logging

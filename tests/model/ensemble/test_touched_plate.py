@@ -1,6 +1,6 @@
-"""Fields at loading fingertips and their sensitivities, by differences of the direct solve.
+"""Fields under loading fingertips and their sensitivities, by differences of the direct solve.
 
-Places that are off: of ERAs by the direct solve, of exciters by the plates they stand on.
+Also errors of places: of ERAs by the direct solve, of exciters by rebuilt plates.
 """
 
 import math

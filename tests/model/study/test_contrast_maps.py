@@ -1,11 +1,4 @@
-"""What clocks that are off cost two contents, as `era config check` tells it.
-
-Export of tables to .mat and .csv files.
-
-Maps of contrast to given quiet fingers, as a command, from Python and as a frame.
-
-Summary of a table, and its map of weak cells.
-"""
+"""Maps of contrast, the summary of a table, the cost of clock errors, and export."""
 
 import csv
 import json

@@ -1,7 +1,4 @@
-"""Verification passes a true table and fails a changed one.
-
-Plates within the uncertainty, by the direct solver, and what answers promise of them.
-"""
+"""Verification passes a true table and fails a changed one; promises hold on exact plates."""
 
 import math
 from dataclasses import replace

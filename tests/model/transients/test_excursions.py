@@ -1,12 +1,6 @@
-"""How far magnets move on a plate, worked out for rigid ones.
+"""Magnets and exciters in time: by hand for rigid plates, by SciPy and in the frequency domain.
 
-Bases that move along samples, against SciPy's integration of the equations of motion.
-
-Exciters on a board in time, settled: what the frequency domain says at each frequency.
-
-Knots by the kernel in C, beside the same in numpy.
-
-Magnets that are pumped by levels that swing, worked out for coils that are held.
+Also bases that move along samples, and the kernel of knots against numpy.
 """
 
 import math

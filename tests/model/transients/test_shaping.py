@@ -1,9 +1,4 @@
-"""Shaped onsets and endings: within the stroke, robust, and better than ramps.
-
-Onsets and endings predicted, against a stepping solver and against sampling.
-
-Onsets and endings: their knots, envelopes and bounded solutions.
-"""
+"""Shaped onsets and endings, their knots and predictions, against ramps and a stepping solver."""
 
 import cmath
 import math

@@ -14,7 +14,7 @@ from registry.limits import GuardLimits
 
 
 @dataclass
-class _Opened:
+class _OpenLine:
     line: Line
     port: Port
     settings: Mapping[str, object]
@@ -39,7 +39,7 @@ class Lines:
         self._wires: dict[str, Wire] = {} if before is None else before._wires
         self.is_closing = False
         """Whether their owner is closing them: what it opens meanwhile is opened by others."""
-        self._opened: dict[str, _Opened] = {}
+        self._opened: dict[str, _OpenLine] = {}
         self._changing: dict[str, asyncio.Lock] = {}  # held while a line is opened
         self._closing: set[asyncio.Task[None]] = set()
 
@@ -84,14 +84,14 @@ class Lines:
             is_output=is_output,
         )
 
-    async def _open(self, address: WireAddress) -> _Opened:
+    async def _open(self, address: WireAddress) -> _OpenLine:
         line = Line(address.make_wire(), address.line, boot_time=address.boot_time)
         if (before := self._wires.get(address.line)) is not None:
             line.wire.follow(before)
         self._wires[address.line] = line.wire
         port = await address.open_port(line.received, line.lose)
         line.open(port)
-        return _Opened(line, port, address.settings)
+        return _OpenLine(line, port, address.settings)
 
     async def close(self) -> None:
         """Close all lines; disarm before, or vibrations last until the watchdogs trip.

@@ -65,7 +65,7 @@ from controller.play.routing import Drive
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import REPORT_LIFE, REPORTS, ReportKind
-from drivers.host.dialogue import Stopped
+from drivers.host.dialogue import StopOutcome
 from drivers.host.joint_sets import is_lost
 from drivers.host.line import LinkStatistics
 from drivers.protocol.definition import FAULTS, QUANTITIES, READINGS, STATES, has_flag, name_of
@@ -298,7 +298,7 @@ def amplifier_statuses(
     *,
     are_open: bool,
     lost: Loss | None,
-    what_may_play: Callable[[str], Stopped],
+    what_may_play: Callable[[str], StopOutcome],
     clock_errors: Mapping[str, float],
     targets: Sequence[str] = (),
 ) -> list[AmplifierStatus]:
@@ -333,7 +333,7 @@ def _amplifier_status(
     *,
     is_open: bool,
     closed_with_lost: bool,
-    what_may_play: Callable[[str], Stopped],
+    what_may_play: Callable[[str], StopOutcome],
     clock_error: float,
     targets: Sequence[str],
 ) -> AmplifierStatus:

@@ -58,7 +58,7 @@ from controller.operation.supervisor import LEASE_OVER, Supervisor
 from controller.play.intent import MAX_DB_SL
 from controller.play.loop import Controller
 from controller.sources.touch import Contact, Touch, TouchFrame
-from drivers.host.dialogue import Stopped
+from drivers.host.dialogue import StopOutcome
 from model.compiled.kernels import why_slow
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
@@ -502,7 +502,7 @@ def _armed_already(operation: Operation) -> RpcError:
     return RpcError(ErrorCode.LEASE, what, remedy="wait, or disarm first: every client may")
 
 
-async def _silence(stopping: Awaitable[Mapping[str, Stopped]], epoch: int) -> StopResult:
+async def _silence(stopping: Awaitable[Mapping[str, StopOutcome]], epoch: int) -> StopResult:
     """Await a stop of an epoch; raises NotSilent unless every amplifier is confirmed silent."""
     outcomes = await stopping
     now = threads.now()

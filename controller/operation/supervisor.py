@@ -46,7 +46,7 @@ from drivers.errors import (
     WrongAmplifier,
 )
 from drivers.host.amplifier import Amplifier
-from drivers.host.dialogue import Stopped
+from drivers.host.dialogue import StopOutcome
 from drivers.host.group import GroupState
 from drivers.protocol.definition import FAULTS, NO_CHANNEL, name_of
 from drivers.protocol.records import Values
@@ -171,7 +171,7 @@ class Supervisor:
         """Apply an event at once and carry out its actions in a task."""
         self._spawn(self._in_background(self._applied(event)))
 
-    def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, Stopped]]:
+    def stop(self, cause: str, remedy: str | None = None) -> Awaitable[Mapping[str, StopOutcome]]:
         """Quick-stop all amplifiers in any state; await the outcome of each, by name.
 
         The requests to the amplifiers are queued when this returns.
@@ -206,7 +206,7 @@ class Supervisor:
             now < self.what_may_play(name).may_play_until for name in self.controller.urls
         )
 
-    def what_may_play(self, name: str) -> Stopped:
+    def what_may_play(self, name: str) -> StopOutcome:
         """Return what an amplifier may be playing, and why no more is known."""
         lost = self.operation.lost
         is_named = lost is not None and name in (lost.names or self.controller.urls)
@@ -322,7 +322,9 @@ class Supervisor:
     async def _stop(self) -> None:
         await self._stopped(self.controller.stop())
 
-    async def _stopped(self, stopping: Awaitable[Mapping[str, Stopped]]) -> Mapping[str, Stopped]:
+    async def _stopped(
+        self, stopping: Awaitable[Mapping[str, StopOutcome]]
+    ) -> Mapping[str, StopOutcome]:
         """Await a stop; the loss of an amplifier is handled after its return."""
         stopped = await stopping
         self._spawn(self._check_links())  # which may stop all once more

@@ -29,7 +29,7 @@ from controller.play.routing import (
 )
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
+from drivers.host.joint_sets import PlayedSet
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import QUANTITIES
 from drivers.protocol.sets import is_vibrating
@@ -276,7 +276,7 @@ class Layers:
         may_end = [self._may_end_shaped(number, now) for number in self.may_play]
         return bool(may_end) and all(may_end)
 
-    def confirm(self, sets: Sets, played: Played, now: float) -> None:
+    def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
 
         A content that a ledger has shortened is not renewed: that would circumvent its limit.
@@ -619,7 +619,7 @@ def _all_left(content: Content, now: float) -> list[float]:
     return left
 
 
-def _shortest(played: Played, number: int) -> float:
+def _shortest(played: PlayedSet, number: int) -> float:
     """Return the time [s] after the commit when the first amplifier ends a layer by itself.
 
     Infinite where none does.

@@ -25,7 +25,7 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, WATCHDOG, Amplifier
-from drivers.host.dialogue import UNREACHED, Stopped
+from drivers.host.dialogue import UNREACHED, StopOutcome
 from drivers.host.group import Group, GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import HEARTBEAT, REPLY_TIMEOUT
@@ -367,7 +367,7 @@ class Controller:
         self._lines: Lines | None = None  # also after an attempt to open that has failed
         self._before: Lines | None = None  # the last ones, also once they are closed
         self._opened: dict[str, Amplifier] = {}  # last, identified or not
-        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]] = {}  # stops
+        self._owed: dict[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]] = {}  # stops
         self._serial_numbers = dict(serial_numbers or {})
         self._connected = connected
         self.watchdog = watchdog
@@ -492,11 +492,11 @@ class Controller:
         """Ramp to silence, then switch the high voltage off."""
         await self.group.disarm()
 
-    def stop(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+    def stop(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
         """Quick-stop every amplifier on an open line; latched until `clear`; see `Group.stop`."""
         return self.group.stop()
 
-    def stop_all(self) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+    def stop_all(self) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
         """Quick-stop every amplifier, those whose lines are closed as soon as they are opened.
 
         The requests on open lines are queued when this returns. Await it for what is known of each,
@@ -518,9 +518,9 @@ class Controller:
 
     async def _stopped(
         self,
-        stopping: Awaitable[Mapping[str, Stopped]],
-        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, Stopped]]]],
-    ) -> Mapping[str, Stopped]:
+        stopping: Awaitable[Mapping[str, StopOutcome]],
+        owed: Mapping[str, asyncio.Future[Awaitable[Mapping[str, StopOutcome]]]],
+    ) -> Mapping[str, StopOutcome]:
         if owed:
             await asyncio.wait(owed.values(), timeout=CONFIRM_TIMEOUT)
         outcomes = {**await stopping}
@@ -530,7 +530,7 @@ class Controller:
                 outcomes |= await opened.result()
         return {name: outcomes.get(name, self.what_may_play(name)) for name in self.urls}
 
-    def what_may_play(self, name: str, cause: str = "") -> Stopped:
+    def what_may_play(self, name: str, cause: str = "") -> StopOutcome:
         """Return what an amplifier may be playing; cause: why no more is known."""
         opened = self._opened.get(name)
         return UNREACHED if opened is None else opened.what_may_play(cause)
@@ -562,8 +562,8 @@ class Controller:
 
 
 async def _identified(
-    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, Stopped]]
-) -> Mapping[str, Stopped]:
+    amplifiers: Sequence[Amplifier], stopping: Awaitable[Mapping[str, StopOutcome]]
+) -> Mapping[str, StopOutcome]:
     """Await a stop, and identify amplifiers meanwhile: an unknown one confirms nothing."""
     for each in amplifiers:
         each.capabilities = {}

@@ -24,7 +24,7 @@ from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
-from drivers.host.joint_sets import Played
+from drivers.host.joint_sets import PlayedSet
 from drivers.protocol.definition import HEARTBEAT
 from model.answer.answer import Layer, Limits
 from model.answer.answer_report import Timing
@@ -225,7 +225,7 @@ class Planner:
         ends = {number: each for number, each in layers.items() if number not in started}
         return replace(plan, sets=Sets(ends), is_reported=False)
 
-    def confirm(self, sets: Sets, played: Played, *, now: float) -> None:
+    def confirm(self, sets: Sets, played: PlayedSet, *, now: float) -> None:
         """Note what the amplifiers play of sets by now [s].
 
         Pulses start where the last amplifier does.

@@ -16,7 +16,7 @@ from drivers.wires.can_bus import CanWire
 from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import More, Wire
+from drivers.wires.wire import Continuation, Wire
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.can_amplifiers import CanAmplifiers
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
@@ -138,7 +138,7 @@ class _Exchange:
     def _replied(self, data: bytes) -> None:
         self._note("<", data)
         for arrival in self._wire.received(data):
-            if isinstance(arrival, More):
+            if isinstance(arrival, Continuation):
                 self._send(arrival.data)
 
     def _note(self, direction: str, data: bytes) -> None:

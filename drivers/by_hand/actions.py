@@ -42,7 +42,7 @@ from drivers.host.amplifier import (
     read_measured,
     read_sensors,
 )
-from drivers.host.dialogue import Staged, Stopped
+from drivers.host.dialogue import StagedSet, StopOutcome
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import (
@@ -177,7 +177,7 @@ async def stop(url: str) -> dict[str, Any]:
                 rows = status_rows(amplifier.status)
     except LinkError as error:
         cause = f"{error}; {_UNKNOWN}"
-    stopped = Stopped(not cause, math.inf, cause)  # another host may feed it
+    stopped = StopOutcome(not cause, math.inf, cause)  # another host may feed it
     return {"url": url, **stopped.rows(threads.now()), **rows}
 
 
@@ -382,11 +382,11 @@ class BlockingAmplifier:
         """
         return self._wait(self._measured(frequencies, window))
 
-    def apply(self, layers: Sequence[AmplifierLayer]) -> Staged:
+    def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         """Play these layers from now on, all else silent; returns them as on the wire."""
         return self._wait(self._applied(layers))
 
-    def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> Staged:
+    def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> StagedSet:
         """Play these layers for a time [s], feed the watchdog and wait for the end.
 
         Raises CommandRefused if the amplifier stops by itself, or its replies contradict requests.
@@ -396,14 +396,14 @@ class BlockingAmplifier:
         self._wait(keep_alive(self._amplifier, duration, HEARTBEAT))
         return played
 
-    async def _applied(self, layers: Sequence[AmplifierLayer]) -> Staged:
+    async def _applied(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
         _require_layers(layers)
         self._token = token_after(self._token)
         every, given = range(self._amplifier.capabilities["layers"]), [n.number for n in layers]
         ended = [AmplifierLayer(number) for number in every if number not in given]
         return await self._amplifier.stage(self._token, [*layers, *ended], now=True)
 
-    async def _stopped(self) -> Stopped:
+    async def _stopped(self) -> StopOutcome:
         return await self._amplifier.stop()
 
     async def _measured(self, frequencies: Sequence[float], window: float) -> Reading:

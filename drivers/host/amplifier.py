@@ -20,7 +20,7 @@ from drivers.errors import (
     Preempted,
     WrongAmplifier,
 )
-from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue, Stopped
+from drivers.host.dialogue import MAX_CONTRADICTIONS, Dialogue, StopOutcome
 from drivers.host.ledger import Ledger
 from drivers.host.line import (
     Line,
@@ -84,7 +84,7 @@ class _Stop:
     limit: asyncio.Timeout | None = None
     requested: "asyncio.Future[Values] | None" = None
     latch: int | None = None
-    result: "asyncio.Future[Stopped]" = field(init=False)
+    result: "asyncio.Future[StopOutcome]" = field(init=False)
 
     def sent(self) -> list[Values]:
         """Return the values of the request, which goes out now."""
@@ -289,7 +289,7 @@ class Amplifier(Dialogue):
 
     def stop(
         self, ramp: float = STOP_RAMP, *, timeout: float = CONFIRM_TIMEOUT
-    ) -> "asyncio.Future[Stopped]":
+    ) -> "asyncio.Future[StopOutcome]":
         """Stop along a ramp [s], latched; its request is queued when this returns.
 
         The future ends once silence is confirmed, or a time [s] after the request has gone out.
@@ -312,7 +312,7 @@ class Amplifier(Dialogue):
         stop.latch = self.latch
         return self.line.submit(self, Priority.STOP, "Stop", stop.sent)
 
-    async def _confirm_stop(self, stop: _Stop) -> Stopped:
+    async def _confirm_stop(self, stop: _Stop) -> StopOutcome:
         """Repeat a stop until its silence is confirmed, or its time is over.
 
         By a status in a latched state whose latch is newer than every one seen before, with the
@@ -327,7 +327,7 @@ class Amplifier(Dialogue):
                         status = await (requested or self._request_stop(stop))
                         while _is_stopping(status, stop.latch):
                             if self.is_silent(status):
-                                self.known = Stopped(True, threads.now())
+                                self.known = StopOutcome(True, threads.now())
                                 return self.known
                             await asyncio.sleep(_INTERVAL)
                             status = await self.read_status(Priority.STOP)

@@ -76,7 +76,14 @@ from drivers.protocol.sets import (
     pack_layers,
     parts,
 )
-from drivers.wires.wire import WIDEST, Event, OtherHost, Several, reply_words, request_words
+from drivers.wires.wire import (
+    WIDEST,
+    DuplicateAddress,
+    Event,
+    OtherHost,
+    reply_words,
+    request_words,
+)
 
 SILENCING = 0.005 + REACTION
 """From the expiry of a watchdog until the outputs are silent, at the most [s]."""
@@ -143,7 +150,7 @@ class Feeding:
 
 
 @dataclass(frozen=True, slots=True)
-class Stopped:
+class StopOutcome:
     """What an amplifier may play: confirmed silent, or until when [s] it may play, and why.
 
     may_play_until: infinite where nothing is known to silence it.
@@ -165,7 +172,7 @@ class Stopped:
         }
 
 
-UNREACHED = Stopped(False, math.inf, "it has not replied since the start")
+UNREACHED = StopOutcome(False, math.inf, "it has not replied since the start")
 """What is known of an amplifier before its first reply."""
 
 
@@ -196,7 +203,7 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Staged:
+class StagedSet:
     """A set that an amplifier has staged, or plays at once: as the wire has it.
 
     is_exact: to the word; until: when [s] it must have been committed.
@@ -252,7 +259,7 @@ class Dialogue:
         """Stops and disarms that were sent to it."""
         self._time = line.time
         self._ledger: Ledger | None = None
-        self._admitted: Staged | None = None
+        self._admitted: StagedSet | None = None
         self._checked = _UNCHECKED  # what was checked, until when [s], and the outcome
         self._contradictions = self._misachieved = 0  # in a row: statuses, achieved layers
         self._contradicted_at = -math.inf
@@ -288,14 +295,14 @@ class Dialogue:
         now: bool = False,
         priority: Priority = Priority.SET,
         is_preempted: IsPreempted | None = None,
-    ) -> Staged:
+    ) -> StagedSet:
         """Stage a set under a token, or play it at once.
 
         It is admitted by the ledger when its turn on the line has come, unless it is preempted
         then. Raises CommandRefused with the reason; Preempted where a stop came first; FrameError
         for two replies in a row with another token.
         """
-        staged: Staged
+        staged: StagedSet
 
         def make() -> list[Values]:
             nonlocal staged
@@ -306,7 +313,7 @@ class Dialogue:
                 delay, checked = self._check(layers, moment)
             (admitted, stream), self._checked = checked, _UNCHECKED
             messages = parts(stream, session=self.session, token=token, now=now)
-            self._admitted = staged = Staged(token, admitted, True, until=moment + delay)
+            self._admitted = staged = StagedSet(token, admitted, True, until=moment + delay)
             return messages
 
         for _ in range(MAX_CONTRADICTIONS):
@@ -517,11 +524,11 @@ class Dialogue:
             if self._contradictions >= MAX_CONTRADICTIONS:
                 raise contradicted(self.name, problem)
 
-    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
+    def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
         """Note what came without a request; an event is handed on."""
         if isinstance(arrival, OtherHost):
             self._other_host_at = self._time()
-        elif isinstance(arrival, Several):
+        elif isinstance(arrival, DuplicateAddress):
             self._are_several = True
         else:
             for listener in self.listeners:
@@ -549,7 +556,7 @@ class Dialogue:
         known = self.capabilities.get("channels")
         return known == len(status["levels"]) and not any(status["levels"])
 
-    def what_may_play(self, cause: str = "") -> Stopped:
+    def what_may_play(self, cause: str = "") -> StopOutcome:
         """Return until when it may play by all that is known of it.
 
         cause: why no more is known, by default what ails its line. Over is what confirmed a stop,
@@ -568,7 +575,7 @@ class Dialogue:
             elif (is_armed or any(status["levels"])) and at >= until:
                 until = math.inf
         cause = cause or self.line.loss or self.silence_cause or ""
-        return Stopped(False, math.inf if until == -math.inf else until, cause)
+        return StopOutcome(False, math.inf if until == -math.inf else until, cause)
 
     def check_other_host(self) -> None:
         """Raise LinkError if another host drives it, which must feed within the longest time."""

@@ -27,8 +27,8 @@ from drivers.errors import (
     Preempted,
 )
 from drivers.host.amplifier import CONFIRM_TIMEOUT, DISARM_RAMP, WATCHDOG, Amplifier
-from drivers.host.dialogue import IsPreempted, Stopped, word_passed_by_all
-from drivers.host.joint_sets import Clocks, JointSets, Members, Played, is_lost, outcomes
+from drivers.host.dialogue import IsPreempted, StopOutcome, word_passed_by_all
+from drivers.host.joint_sets import Clocks, JointSets, Members, PlayedSet, is_lost, outcomes
 from drivers.host.line import GRACE, Line, Make, Priority
 from drivers.playing import AmplifierLayer
 from drivers.protocol.definition import ENABLED, HEARTBEAT, QUANTITIES, STOP_RAMP, check_watchdog
@@ -332,7 +332,7 @@ class Group:
         self,
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None = None,
-    ) -> Coroutine[Any, Any, Played]:
+    ) -> Coroutine[Any, Any, PlayedSet]:
         """Play layers on the amplifiers of these names, all from one moment on.
 
         Refused on one means committed on none, and CommandRefused; silence alone is not staged. One
@@ -413,7 +413,7 @@ class Group:
 
     def stop(
         self, ramp: float = STOP_RAMP, *, waits_for: Sequence[str] | None = None
-    ) -> Coroutine[Any, Any, Mapping[str, Stopped]]:
+    ) -> Coroutine[Any, Any, Mapping[str, StopOutcome]]:
         """Stop every amplifier along a ramp [s], lost ones too; latched until `clear`.
 
         The requests are queued when this returns. Await it for what became of each, by name: of
@@ -422,7 +422,7 @@ class Group:
         self._leave_armed()
         if self.is_open:
             self.state = GroupState.STOPPED
-        members, stops = self.members, dict[str, asyncio.Future[Stopped]]()
+        members, stops = self.members, dict[str, asyncio.Future[StopOutcome]]()
         for line in members.lines:
             if len(line.members) > 1:  # so that none waits for the reply of another
                 try:

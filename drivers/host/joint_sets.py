@@ -29,7 +29,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 from drivers.errors import CommandRefused, DriverError, LinkError, LinkTimeout, Overtaken, Preempted
 from drivers.host.amplifier import Amplifier
 from drivers.host.clock import HeldClock
-from drivers.host.dialogue import IsPreempted, Staged, Stopped, word_passed_by_all, words_of
+from drivers.host.dialogue import IsPreempted, StagedSet, StopOutcome, word_passed_by_all, words_of
 from drivers.host.ledger import is_silence
 from drivers.host.line import GRACE, Line, Priority
 from drivers.playing import AmplifierLayer
@@ -166,10 +166,10 @@ class Members:
             self._broadcasts[line] = sent
 
     async def stopped(
-        self, stops: Mapping[str, "asyncio.Future[Stopped]"]
-    ) -> Mapping[str, Stopped]:
+        self, stops: Mapping[str, "asyncio.Future[StopOutcome]"]
+    ) -> Mapping[str, StopOutcome]:
         """Await stops by name; of one that failed by itself it is said what it may play."""
-        said: dict[str, Stopped] = {}
+        said: dict[str, StopOutcome] = {}
         for name, result in zip(stops, await outcomes([*stops.values()]), strict=True):
             if isinstance(result, BaseException):
                 cause = f"{type(result).__name__}: {result}"
@@ -219,7 +219,7 @@ _SPAN = 1 << 16
 
 
 @dataclass(frozen=True)
-class Played:
+class PlayedSet:
     """What amplifiers play of a set, by name, as they have achieved it; token: of the set.
 
     starts_at [s]: at the soonest, the last of them.
@@ -265,7 +265,7 @@ class JointSets:
         self,
         layers: Mapping[str, Sequence[AmplifierLayer]],
         is_preempted: IsPreempted | None = None,
-    ) -> Played | DriverError:
+    ) -> PlayedSet | DriverError:
         """Stage and commit layers by amplifier; a refusal before the first commit is returned.
 
         Preempted where a commit that was lost is too late to be repeated: then all are silent.
@@ -327,7 +327,7 @@ class JointSets:
         if reading:
             achieved = await self._members.all([*reading.values()])
             played.update(zip(reading, achieved, strict=True))
-        return Played(token, played, starts_at)
+        return PlayedSet(token, played, starts_at)
 
     async def _silenced(
         self, refusal: CommandRefused, amplifiers: Sequence[Amplifier], began: float
@@ -347,7 +347,7 @@ class JointSets:
         await self._members.all([each.silence(ramp) for each in amplifiers])
         self.is_incomplete = False
 
-    async def _commit(self, staged: Mapping[Amplifier, Staged]) -> None:
+    async def _commit(self, staged: Mapping[Amplifier, StagedSet]) -> None:
         """Commit on every line for one moment, by one broadcast where amplifiers share it.
 
         Raises CommandRefused where one does not play its set then.
@@ -438,7 +438,7 @@ async def _check_plays(amplifier: Amplifier, status: Values, token: int) -> None
         )
 
 
-async def _achieved(amplifier: Amplifier, staged: Staged) -> tuple[LayerSet, ...]:
+async def _achieved(amplifier: Amplifier, staged: StagedSet) -> tuple[LayerSet, ...]:
     """Read the layers of a set that plays, as the amplifier has achieved them."""
     return tuple([await amplifier.read_achieved(one, staged.token) for one in staged.layers])
 

@@ -39,7 +39,17 @@ from drivers.protocol.definition import (
 )
 from drivers.protocol.records import Values
 from drivers.trace import Direction
-from drivers.wires.wire import Broken, Event, More, Nak, OtherHost, Reply, Several, Wire, Written
+from drivers.wires.wire import (
+    BrokenReply,
+    Continuation,
+    DuplicateAddress,
+    Event,
+    Nak,
+    OtherHost,
+    Reply,
+    Wire,
+    WrittenPart,
+)
 
 _NOT_ARMED = ("WRONG_STATE", "WRONG_SESSION")
 _REMEDIES = {
@@ -168,7 +178,7 @@ class Member(Protocol):
     def note_reply(self, name: str, values: Values, reply: Values, sent_at: float) -> None:
         """Note the reply to a request that was sent at a time [s]."""
 
-    def note_unasked(self, arrival: Event | OtherHost | Several) -> None:
+    def note_unasked(self, arrival: Event | OtherHost | DuplicateAddress) -> None:
         """Note what came without a request."""
 
 
@@ -383,7 +393,7 @@ class Line:
         if trace.is_active():
             trace.frame(Direction.IN, data, self.name, lambda: ", ".join(map(repr, arrivals)))
         for arrival in arrivals:
-            if isinstance(arrival, Event | OtherHost | Several):
+            if isinstance(arrival, Event | OtherHost | DuplicateAddress):
                 if self.seen is not None:
                     self.seen("event", arrival.address, type(arrival).__name__, arrival)
                 if (unasked := self.members.get(arrival.address)) is not None:
@@ -393,7 +403,7 @@ class Line:
             if job is None or (member := job.member) is None:  # no broadcast is on the line
                 continue
             self._sent_until = 0.0  # what is replied to has arrived
-            if isinstance(arrival, More):
+            if isinstance(arrival, Continuation):
                 self.late = max(self.late, min(self.time() - self._free_at, MAX_LATE))
                 if self._queue.jobs and self._must_yield(job):
                     self._not_answered(job)
@@ -401,7 +411,7 @@ class Line:
                     self._start(job, arrival.data, is_present=arrival.is_present)
                 continue
             self.current = member.silence_cause = None
-            if isinstance(arrival, Written):
+            if isinstance(arrival, WrittenPart):
                 self._go_on(job)
                 continue
             late = self.time() - job.started_at - job.takes
@@ -555,9 +565,9 @@ class Line:
         """Whether a request gives way to one that silences."""
         return not job.is_stop_class and any(other.is_stop_class for other in self._queue.jobs)
 
-    def _refused(self, job: Job, member: Member, arrival: Nak | Broken) -> None:
+    def _refused(self, job: Job, member: Member, arrival: Nak | BrokenReply) -> None:
         """End the request that was on the line with an error, or repeat it to a busy amplifier."""
-        if isinstance(arrival, Broken):
+        if isinstance(arrival, BrokenReply):
             self._fail(job, FrameError(f"{self.name}: {arrival.reason}"))
             return
         member.counts.refusals += 1

@@ -64,11 +64,11 @@ from drivers.wires.can_frames import (
 )
 from drivers.wires.wire import (
     Arrival,
-    Broken,
+    BrokenReply,
+    DuplicateAddress,
     OtherHost,
     PortAbove,
     Reply,
-    Several,
     Wire,
     WireAddress,
     read_event,
@@ -181,7 +181,7 @@ class CanWire(Wire):
             return [] if event is None else read_event(node, event.type, event.words, self.counters)
         if node == self._requested and self._replies.contradicts(data):
             self._replies.add(data, now)  # which discards the message
-            return [Several(node)]
+            return [DuplicateAddress(node)]
         if self._pending is None or (node, *data[:1]) != self._pending[:2]:
             self.counters.frames_in += 1
             self.counters.unexpected_frames += data[1:2] == b"\0"
@@ -195,11 +195,11 @@ class CanWire(Wire):
             if message.type == NAK:
                 return [read_nak(message.words)]
             if message.type != kind:
-                return [Broken(f"type of the reply must be {kind}, got {message.type}")]
+                return [BrokenReply(f"type of the reply must be {kind}, got {message.type}")]
             record = IDENTITY if kind == HELLO else BY_NUMBER[kind].reply
             return [Reply(record.read(message.words)[0])]  # what follows is ignored
         except Refusal as refusal:
-            return [Broken(str(refusal))]
+            return [BrokenReply(str(refusal))]
 
     def _other_version(self, node: int, data: bytes) -> list[Arrival]:
         """Take the versions for the reply to Hello, if it is of a node that will not reply."""

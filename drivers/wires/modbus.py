@@ -47,15 +47,15 @@ from drivers.wires.modbus_frames import (
 from drivers.wires.wire import (
     WIDEST,
     Arrival,
-    Broken,
-    More,
+    BrokenReply,
+    Continuation,
+    DuplicateAddress,
     Nak,
     PortAbove,
     Reply,
-    Several,
     Wire,
     WireAddress,
-    Written,
+    WrittenPart,
     read_nak,
     reply_words,
 )
@@ -237,15 +237,15 @@ class ModbusWire(Wire):
             elif self._request is not request:  # a second response
                 self.counters.unexpected_frames += 1
                 if self._last is request and self._replied != response:
-                    arrivals.append(Several(adu.unit))
+                    arrivals.append(DuplicateAddress(adu.unit))
             elif request.message.function_code == WRITE and not response.exception:
                 if request.has_reply:
                     self._request = self._read_of(request)
                     is_present = request.name in PRESENT
-                    arrivals.append(More(self._request.frame, is_present=is_present))
+                    arrivals.append(Continuation(self._request.frame, is_present=is_present))
                 else:
                     self._request, self._last, self._replied = None, request, response
-                    arrivals.append(Written())
+                    arrivals.append(WrittenPart())
             elif (arrival := self._arrival(request, response)) is not None:
                 arrivals.append(arrival)
         return arrivals
@@ -318,14 +318,14 @@ class ModbusWire(Wire):
         if response.exception:
             self._request = None
             if request.name == "Hello" and response.exception in _NO_SUCH_REGISTERS:
-                return Broken(
+                return BrokenReply(
                     f"unit {request.message.dev_id} is no amplifier of this protocol: its identity "
                     f"cannot be read (Modbus exception {response.exception}); check address and "
                     "unit"
                 )
             if (refusal := EXCEPTIONS.get(response.exception)) is not None:
                 return Nak(refusal, None)
-            return Broken(f"Modbus exception {response.exception}")
+            return BrokenReply(f"Modbus exception {response.exception}")
         tag, result, *words = response.registers
         if request.name != "Hello" and tag != request.tag:
             self.counters.unexpected_frames += 1
@@ -339,7 +339,7 @@ class ModbusWire(Wire):
                 return read_nak((0, *divmod(result, 256)))
             values = MESSAGES[request.name].reply.unpack(words, is_strict=False)
         except Refusal as error:
-            return Broken(str(error))
+            return BrokenReply(str(error))
         if request.name == "GetCaps":
             self._sizes[request.message.dev_id] = values["channels"], values["layers"]
         return Reply(values)

@@ -24,9 +24,9 @@ from drivers.wires.serial_frames import (
 )
 from drivers.wires.wire import (
     Arrival,
-    Broken,
+    BrokenReply,
+    DuplicateAddress,
     Reply,
-    Several,
     Wire,
     WireAddress,
     read_event,
@@ -93,7 +93,7 @@ class SerialWire(Wire):
                     words = unpack_words(frame.payload)
                     arrivals.append(Reply(BY_NUMBER[kind].reply.read(words)[0]))
             except Refusal as refusal:
-                arrivals.append(Broken(str(refusal)))
+                arrivals.append(BrokenReply(str(refusal)))
         return arrivals
 
     def _unexpected(self, frame: Frame) -> list[Arrival]:
@@ -113,7 +113,7 @@ class SerialWire(Wire):
         if last is None or frame == last or last.kind != HELLO | REPLY_BIT:
             return []
         is_same = (frame.address, frame.sequence) == (last.address, last.sequence)
-        return [Several(frame.address)] if is_same else []
+        return [DuplicateAddress(frame.address)] if is_same else []
 
     def withdraw(self) -> None:
         """Take the request off the wire: its reply will be unexpected."""

@@ -59,7 +59,7 @@ class Nak:
 
 
 @dataclass(frozen=True, slots=True)
-class Broken:
+class BrokenReply:
     """The reply to the request is none of the protocol: why."""
 
     reason: str
@@ -81,14 +81,14 @@ class OtherHost:
 
 
 @dataclass(frozen=True, slots=True)
-class Several:
+class DuplicateAddress:
     """Several amplifiers have an address: two replies to one request differ."""
 
     address: int
 
 
 @dataclass(frozen=True, slots=True)
-class More:
+class Continuation:
     """The request goes on with these bytes, as on Modbus.
 
     is_present: its reply is of the moment at which they arrive.
@@ -99,11 +99,13 @@ class More:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenPart:
     """The part of a set on the wire, which has no reply, was written, as on Modbus."""
 
 
-Arrival: TypeAlias = Reply | Nak | Broken | Event | OtherHost | Several | More | Written
+Arrival: TypeAlias = (
+    Reply | Nak | BrokenReply | Event | OtherHost | DuplicateAddress | Continuation | WrittenPart
+)
 
 
 def read_event(

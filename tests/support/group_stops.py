@@ -29,7 +29,7 @@ import sim
 from chain import Chain
 from drivers.by_hand import actions
 from drivers.errors import CommandRefused, DriverError, LinkError, Preempted
-from drivers.host.dialogue import SILENCING, Stopped
+from drivers.host.dialogue import SILENCING, StopOutcome
 from drivers.host.group import Group
 from drivers.host.line import Priority
 from drivers.playing import AmplifierLayer, AmplifierTone
@@ -288,7 +288,7 @@ class Stopping(RandomGroup):
     def _check(self, names: Iterable[str], what: str) -> None:
         self.found += [f"{what} {loud}" for name in names if (loud := self._loud(name))]
 
-    async def compare(self, outcomes: Mapping[str, Stopped], scene: str) -> None:
+    async def compare(self, outcomes: Mapping[str, StopOutcome], scene: str) -> None:
         """Compare the outcomes of a stop with the amplifiers, now and until all is silent."""
         certain = [name for name, outcome in outcomes.items() if outcome.is_confirmed]
         self._check(certain, f"{scene}: confirmed silent, but")
@@ -451,7 +451,7 @@ async def _stop_by_command(chain: Stopping, wire: str, tally: Tally, seed: int) 
     is_confirmed = rows["silence"] == "confirmed_silent"
     tally.counts[wire, "stops"] += 1
     tally.counts[wire, "confirmed" if is_confirmed else "may play"] += 1
-    await chain.compare({name: Stopped(is_confirmed, silent_from)}, f"{scene}, killed")
+    await chain.compare({name: StopOutcome(is_confirmed, silent_from)}, f"{scene}, killed")
 
 
 @contextmanager

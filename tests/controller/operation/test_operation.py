@@ -31,7 +31,7 @@ from controller.operation.operation_states import (
 from controller.play.loop import Controller
 from courses import Planted, Step, courses, follow
 from drivers.errors import CommandRefused, DriverError
-from drivers.host.dialogue import Stopped
+from drivers.host.dialogue import StopOutcome
 from drivers.protocol.definition import FAULTS
 from drivers.protocol.records import Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts, token_after
@@ -509,7 +509,7 @@ def slow_down(controller: Controller, *, stop: float) -> None:
     """Let stopping the amplifiers take so long [s]."""
     stop_now = controller.stop
 
-    async def slow_stop() -> Mapping[str, Stopped]:
+    async def slow_stop() -> Mapping[str, StopOutcome]:
         stopped = await stop_now()
         await asyncio.sleep(stop)
         return stopped

@@ -24,9 +24,8 @@ from drivers.errors import (
     LinkError,
     LinkTimeout,
 )
-from drivers.host.amplifier import Amplifier as AmplifierAmplifier
-from drivers.host.amplifier import Amplifier as Host
 from drivers.host.amplifier import (
+    Amplifier,
     AmplifierSensor,
     measure_tones,
     read_measured,
@@ -253,7 +252,7 @@ async def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) 
     """A linear amplifier where the rig has a stiff source, and the other way round."""
     end = MemoryLine(wire, "a")
     end.far["a"].capabilities = capabilities(2, is_output=not is_output)
-    host = Host(end.line, 1, VIRTUAL_LINES_LIMITS, name="a", is_output=is_output)
+    host = Amplifier(end.line, 1, VIRTUAL_LINES_LIMITS, name="a", is_output=is_output)
     with pytest.raises(LinkError, match="full level"):
         await host.open()
     end.far["a"].capabilities = capabilities(2, is_output=is_output)
@@ -544,7 +543,7 @@ async def opened_lines() -> AsyncIterator[Lines]:
         await lines.close()
 
 
-async def read_for_ever(amplifier: AmplifierAmplifier) -> None:
+async def read_for_ever(amplifier: Amplifier) -> None:
     """Read the status until an error, for a minute at most."""
     async with asyncio.timeout(60.0):
         while True:

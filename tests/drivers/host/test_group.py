@@ -22,7 +22,7 @@ from drivers.protocol.records import Values
 from drivers.protocol.sets import Envelope, LayerSet
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import Broken, Wire
+from drivers.wires.wire import BrokenReply, Wire
 from virtual_lines import (
     KINDS,
     MemoryLine,
@@ -102,7 +102,7 @@ async def test_stop_is_repeated_after_a_reply_that_is_none(
 ) -> None:
     """The first reply to it cannot be read; the second confirms it."""
     host_side = ends[0].line.wire
-    received, broken = host_side.received, iter([[Broken("cut")]])
+    received, broken = host_side.received, iter([[BrokenReply("cut")]])
     host_side.received = lambda data: next(broken, None) or received(data)
     assert (await group.stop())["a"].is_confirmed
     assert [each for _, each in ends[0].sent][-2:] == ["1:8", "1:8"]

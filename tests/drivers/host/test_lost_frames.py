@@ -25,7 +25,7 @@ import pytest
 from courses import Taken, courses, follow
 from drivers.errors import CommandRefused, DriverError, LinkDegraded, LinkTimeout, Preempted
 from drivers.host.amplifier import read_measured
-from drivers.host.dialogue import Stopped
+from drivers.host.dialogue import StopOutcome
 from drivers.host.group import Group
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, STATES
@@ -595,7 +595,7 @@ class OnLines(Taken):
 
     lines: Sequence[MemoryLine] = ()
     group: Group = field(init=False)
-    stopped: dict[str, Stopped] = field(default_factory=dict)
+    stopped: dict[str, StopOutcome] = field(default_factory=dict)
     since: float = 0.0
 
     @property

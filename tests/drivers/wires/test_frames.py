@@ -27,7 +27,17 @@ from drivers.wires.can_frames import CanFrame, pack_frames, segments, unpack_fra
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.modbus_frames import HEAD
 from drivers.wires.serial_line import SerialWire
-from drivers.wires.wire import Arrival, Broken, Event, More, Nak, OtherHost, Reply, Several, Wire
+from drivers.wires.wire import (
+    Arrival,
+    BrokenReply,
+    Continuation,
+    DuplicateAddress,
+    Event,
+    Nak,
+    OtherHost,
+    Reply,
+    Wire,
+)
 from real_wires import damage
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from sim.far_ends.modbus_amplifiers import ModbusAmplifiers
@@ -95,7 +105,7 @@ def test_part_of_a_set_and_its_reply_are_the_bytes_of_the_specification(kind: st
     assert wire.request(1, "Set", PART) == sent
     if between:
         echo, *read = between
-        assert wire.received(echo) == [*map(More, read)]
+        assert wire.received(echo) == [*map(Continuation, read)]
     assert wire.received(reply) == [Reply(TAKEN)]
 
 
@@ -162,7 +172,7 @@ def test_damaged_frames_are_counted_and_change_nothing(kind: str) -> None:
             if back and chance.random() < damaged:
                 back = damage(back, chance)
             came = wire.received(back)
-            data = next((each.data for each in came if isinstance(each, More)), b"")
+            data = next((each.data for each in came if isinstance(each, Continuation)), b"")
             arrivals += came
         wire.withdraw()
         return arrivals
@@ -172,7 +182,7 @@ def test_damaged_frames_are_counted_and_change_nothing(kind: str) -> None:
         amplifier.asked.clear()
         arrivals = ask(name, values, damaged=_DAMAGED)
         assert all(is_in_range(name, arrival) for arrival in arrivals)
-        assert sum(isinstance(each, Reply | Nak | Broken) for each in arrivals) <= 1
+        assert sum(isinstance(each, Reply | Nak | BrokenReply) for each in arrivals) <= 1
         replies += any(isinstance(each, Reply) for each in arrivals)
         for asked, numbers in amplifier.asked:
             assert MESSAGES[asked].request.pack(numbers) is not None
@@ -259,16 +269,16 @@ def test_reply_has_number_and_node_of_its_request(wire: CanWire, answer: str) ->
     if expected in ([], ANSWERS["event"][1]):
         assert len(rest) == 1
     else:
-        assert rest == ([Several(NODE)] if isinstance(expected[0], Nak) else [])
+        assert rest == ([DuplicateAddress(NODE)] if isinstance(expected[0], Nak) else [])
 
 
 def test_reply_of_another_type_is_broken(wire: CanWire) -> None:
     """As is one that is too short for its type."""
     (arrival,) = wire.received(frames(0x185, 255, GET_STATUS, 0))
-    assert isinstance(arrival, Broken)
+    assert isinstance(arrival, BrokenReply)
     wire.request(NODE, "GetStatus", {})
     (arrival,) = wire.received(frames(0x185, 1, GET_STATUS, 0))
-    assert isinstance(arrival, Broken)
+    assert isinstance(arrival, BrokenReply)
 
 
 @pytest.mark.parametrize(
@@ -340,7 +350,7 @@ def test_amplifier_that_another_host_drives_is_never_armed() -> None:
         far.handle("Disarm", {"ramp": 0}, end.loop.time())
         await asyncio.sleep(2.1)
         await group.arm()
-        assert far.session == 77
+        assert far.session == 78  # 77 is drawn, and each line has the next one
 
     beside_another_host(test)
 
@@ -387,12 +397,12 @@ class Peer:
         return b"".join(self.sent)
 
 
-def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply | Nak | Broken:
+def reply_to(wire: ModbusWire, peer: Peer, name: str, values: Values) -> Reply | Nak | BrokenReply:
     """What becomes of a request to a peer, in its two transactions."""
     (more,) = wire.received(peer.reply(wire.request(1, name, values)))
-    assert isinstance(more, More)
+    assert isinstance(more, Continuation)
     (arrival,) = wire.received(peer.reply(more.data))
-    assert isinstance(arrival, Reply | Nak | Broken)
+    assert isinstance(arrival, Reply | Nak | BrokenReply)
     return arrival
 
 
@@ -409,7 +419,7 @@ def test_as_many_registers_are_read_as_the_reply_can_have() -> None:
         for name, count in expected.items():
             values = {"layer": 0} if name == "GetAchieved" else {}
             (more,) = wire.received(peer.reply(wire.request(1, name, values)))
-            assert isinstance(more, More)
+            assert isinstance(more, Continuation)
             assert more.data[4:6] == count.to_bytes(2)
         assert isinstance(reply_to(wire, peer, "GetCaps", {}), Reply)
 
@@ -419,13 +429,13 @@ def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
     """Of an earlier read, of an earlier write, doubled, of another unit; the reply still counts."""
     wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
     (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
-    assert isinstance(more, More)
+    assert isinstance(more, Continuation)
     late = peer.reply(more.data)
     wire.withdraw()
     echo = peer.reply(wire.request(1, "GetStatus", {}))
     assert wire.received(late) == []
     (more,) = wire.received(echo + echo)
-    assert isinstance(more, More)
+    assert isinstance(more, Continuation)
     assert wire.received(late + echo) == []
     assert wire.counters.unexpected_frames == 4
     response = peer.reply(more.data)
@@ -443,7 +453,7 @@ def test_late_responses_are_credited_to_nothing(is_rtu: bool) -> None:
         (1, [Nak("UNKNOWN_TYPE", None)]),
         (2, [Nak("UNKNOWN_TYPE", None)]),
         (3, [Nak("BAD_LENGTH", None)]),
-        (4, [Broken("Modbus exception 4")]),
+        (4, [BrokenReply("Modbus exception 4")]),
         (6, [Nak("BUSY", None)]),
         (10, []),
         (11, []),
@@ -462,7 +472,7 @@ def test_device_without_an_identity_is_no_amplifier(exception: int) -> None:
     wire = ModbusWire(0, is_rtu=False, number=0)
     wire.request(7, "Hello", {})
     (arrival,) = wire.received(bytes([0, 1, 0, 0, 0, 3, 7, 0x84, exception]))
-    assert isinstance(arrival, Broken)
+    assert isinstance(arrival, BrokenReply)
     assert "unit 7 is no amplifier" in arrival.reason
 
 
@@ -472,7 +482,7 @@ def test_reply_to_another_master_is_credited_to_nothing(is_rtu: bool) -> None:
     wire, peer = ModbusWire(0, is_rtu=is_rtu, number=0), Peer(is_rtu=is_rtu)
     other = ModbusWire(0, is_rtu=is_rtu, number=500)
     (more,) = wire.received(peer.reply(wire.request(1, "GetStatus", {})))
-    assert isinstance(more, More)
+    assert isinstance(more, Continuation)
     peer.reply(other.request(1, "GetStatus", {}))
     assert wire.received(peer.reply(more.data)) == []
     assert wire.counters.unexpected_frames == 1
@@ -502,7 +512,7 @@ def test_echo_without_a_response_is_named() -> None:
     wire, peer = ModbusWire(115_200, is_rtu=True, number=0), Peer(is_rtu=True)
     frame = wire.request(1, "GetStatus", {})
     (more,) = wire.received(frame + peer.reply(frame))
-    assert isinstance(more, More)
+    assert isinstance(more, Continuation)
     assert wire.received(more.data) == []
     wire.withdraw()
     assert "request itself came back" in wire.counters.remark

@@ -16,7 +16,7 @@ from benchmarks.desk_plate.truth import Actuator, Truth, draw_truth
 from benchmarks.direct_plate import direct_responder
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import CommandRefused, LinkError
-from drivers.host.dialogue import Staged
+from drivers.host.dialogue import StagedSet
 from drivers.playing import AmplifierLayer
 from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.sound_card import SoundCard
@@ -278,12 +278,12 @@ def test_amplifier_is_disarmed_as_soon_as_the_card_ends(
     class Observed(BlockingAmplifier):
         """Notes how what it plays ends."""
 
-        def apply(self, layers: Sequence[AmplifierLayer]) -> Staged:
+        def apply(self, layers: Sequence[AmplifierLayer]) -> StagedSet:
             staged = super().apply(layers)
             playing.set()
             return staged
 
-        def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> Staged:
+        def play(self, layers: Sequence[AmplifierLayer], *, duration: float) -> StagedSet:
             try:
                 staged = super().play(layers, duration=duration)
             except CommandRefused:

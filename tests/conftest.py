@@ -107,6 +107,12 @@ def plain_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
+def rig() -> Rig:
+    """The paper's plate as its file has it."""
+    return load_rig(example_rig_path())
+
+
+@pytest.fixture(scope="session")
 def coarse_rig() -> Rig:
     """The paper's own mesh, 12x9."""
     return make_paper_rig(12, 9)

@@ -32,7 +32,6 @@ from model.identification import least_squares
 from model.identification.parameters import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
 from model.spectral.modes import SpectralMesh, stretched
 from model.structure.attachments import PointLoad
 from plates import extrapolated_slopes, make_paper_rig
@@ -234,12 +233,6 @@ USUAL = {
     "mass": 0.01,
 }
 """Form errors of a plate that was built with some care, as `FORM`."""
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate as its file has it."""
-    return load_rig(example_rig_path())
 
 
 def _longer(rig: Rig) -> Rig:

@@ -6,14 +6,6 @@ import pytest
 from benchmarks.identification.causes import FAULTS, verdict_on
 from benchmarks.identification.hidden import draw
 from model.diagnosis.diagnosis_report import as_json, verdict_rows
-from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's rig."""
-    return load_rig(example_rig_path())
 
 
 @pytest.mark.parametrize(

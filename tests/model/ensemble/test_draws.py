@@ -200,7 +200,6 @@ def test_search_counts_harmonics_as_over_the_plate() -> None:
     assert found == pytest.approx(expected, rel=0.02)
 
 
-CERTAIN = {"gain": 0.0, "phase": 0.0, "common_gain": 0.0, "harmonic": 0.0}
 IDENTIFIED = Uncertainty(0.015, 1.5, 0.002, 0.01, 1.1, 0.5, modulus=0.0, place=0.0, harmonic=0.0)
 ERAS = tuple(era.name for era in smooth_rig().eras)
 WIRING = {name: Channel("ab"[number % 2], number) for number, name in enumerate(ERAS)}

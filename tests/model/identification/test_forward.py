@@ -42,12 +42,6 @@ FINGER = RestingFinger(0.2, 0.05, Fingertip())
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate."""
-    return load_rig(example_rig_path())
-
-
-@pytest.fixture(scope="module")
 def model(rig: Rig) -> ForwardModel:
     """That plate with sensors at its ERAs and elsewhere, an additional mass and a finger."""
     sensors = [*(Sensor(era.name, era.name) for era in rig.eras), PAD]

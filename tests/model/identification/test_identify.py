@@ -45,12 +45,6 @@ ONE_ROUND = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 == 0
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate as it is written."""
-    return load_rig(example_rig_path())
-
-
-@pytest.fixture(scope="module")
 def hidden() -> Hidden:
     """A thin plate with places and a mass of its own."""
     return draw("form", 3)

@@ -15,7 +15,6 @@ from model.errors import InputError
 from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
 from model.study.verification import Plates, felt_on
@@ -175,12 +174,6 @@ def test_for_plate_handles_thin_and_small_plates(thickness):
 
 FIVE = np.array([80.0, 145.0, 220.0, 310.0, 450.0])
 POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The paper's plate."""
-    return load_rig(example_rig_path())
 
 
 @pytest.fixture(scope="module")

@@ -167,7 +167,7 @@ class _DetentsRun(EffectRun):
         return self._notches.at(self._detents.position(contact), now)
 
 
-_DIAL_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle where that is more
+_ANGLE_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle where that is more
 _DEGREES_15 = 0.26179938779914946  # rad; as the units of a file convert it
 _CENTRE_RADIUS = 0.006  # m; nearer to the centre the angle of a finger is noise
 
@@ -235,7 +235,7 @@ class _DialRun(EffectRun):
             self._notches = Notches(
                 self._angle,
                 spacing=self._dial.spacing,
-                hysteresis=max(_DIAL_HYSTERESIS, _HYSTERESIS / radius),
+                hysteresis=max(_ANGLE_HYSTERESIS, _HYSTERESIS / radius),
                 duration=self._dial.duration,
                 level_db_sl=self._level,
             )

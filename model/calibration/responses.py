@@ -85,7 +85,7 @@ _FREQUENCY_UNITS = {
 _SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
 
 PLACES = ("sensor", "x_m", "y_m")
-SENSOR_FILE_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
+SENSOR_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
 OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
 
 
@@ -558,7 +558,7 @@ class WiredSensor:
 def read_places(path: Path, plate: Plate) -> dict[str, Point]:
     """Read places [m] of sensors on a plate by name; raises InputError with file and line."""
     places: dict[str, Point] = {}
-    for line in read_lines(path, PLACES, optional=(*SENSOR_FILE_COLUMNS[len(PLACES) :], *OPTIONAL)):
+    for line in read_lines(path, PLACES, optional=(*SENSOR_COLUMNS[len(PLACES) :], *OPTIONAL)):
         name, at = _place(line, places, plate)
         places[name] = at
     return places
@@ -573,7 +573,7 @@ def read_sensors(
     Raises InputError with file and line.
     """
     sensors: list[WiredSensor] = []
-    lines = read_lines(path, SENSOR_FILE_COLUMNS, optional=tuple(OPTIONAL))
+    lines = read_lines(path, SENSOR_COLUMNS, optional=tuple(OPTIONAL))
     moves = may_move and len(lines) > 1 and len({line.number("input") for line in lines}) == 1
     for line in lines:
         sensors.append(_sensor(line, sensors, plate, mass=mass, moves=moves))

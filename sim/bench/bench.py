@@ -47,7 +47,7 @@ from model.transients.base_motion import Motion
 from registry import threads
 from sim.amplifier.readings import AmplifierClock, StraightClock
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
-from sim.plant import imperfections as second_harmonic
+from sim.plant import imperfections
 from sim.plant.fingers import (
     KEPT,
     Accelerometer,
@@ -697,7 +697,7 @@ class Bench:
         """The base motion of an ERA by the output of its channel, imperfections included."""
         stroke, delay = self.rig.eras[index].full_level, self._delays[index]
         errors = self._errors[index]
-        moving = [*playing, *second_harmonic.of_voices(playing, errors.harmonic)]
+        moving = [*playing, *imperfections.of_voices(playing, errors.harmonic)]
         return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
 
     def _frequencies(self, since: float, until: float) -> list[float]:

@@ -35,7 +35,7 @@ from model.transients.base_motion import Bases, ramped_onset, shaped
 from model.transients.shaping import ONSET_WINDOW
 from model.transients.time_response import from_rest
 from model.vibration import base_amplitudes
-from sim.plant import imperfections as second_harmonic
+from sim.plant import imperfections
 from sim.plant.fingers import FingerRecord, felt_peaks, fit_tones
 from sim.plant.imperfections import Imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, LoadedPlate, Plant
@@ -371,6 +371,6 @@ def _bases(layer: Layer, eras: Sequence[Source], harmonics: Mapping[str, complex
         shaped(each.onset, eras)
         if each.onset
         else ramped_onset(each.excitation, eras, ramp=each.ramp)
-        for each in (*layer.voices, *second_harmonic.of_layer(layer, harmonics))
+        for each in (*layer.voices, *imperfections.of_layer(layer, harmonics))
     ]
     return tuple(tuple(chain.from_iterable(each)) for each in zip(*voices, strict=True))

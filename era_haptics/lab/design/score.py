@@ -30,8 +30,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from era_haptics.lab.design import problem as design_problem
-from era_haptics.lab.design.problem import ANYWHERE, MIN_SUPPORTING, DesignProblem, area_of
+from era_haptics.lab.design.problem import (
+    ANYWHERE,
+    MIN_SUPPORTING,
+    SEARCH_FINGERS,
+    DesignProblem,
+    area_of,
+)
 from model.arrays import Complex64Array, Float32Array, FloatArray, IntArray, best_by, best_rows
 from model.ensemble.attached_plate import mounts_of
 from model.ensemble.touched_plate import expected_power, power_of
@@ -302,7 +307,7 @@ class LayoutSearch:
         self._scorer = Scorer(
             problem.rig,
             problem.searched_frequencies,
-            problem.contacts.pooled_sets(design_problem.SEARCH_FINGERS, seed=problem.seed),
+            problem.contacts.pooled_sets(SEARCH_FINGERS, seed=problem.seed),
             eras=problem.eras(np.zeros((self._k + 1, 2))),
             contents=problem.contacts.contents,
         )

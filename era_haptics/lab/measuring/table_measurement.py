@@ -6,9 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from drivers import playing as contents
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
+from drivers.playing import AmplifierLayer, AmplifierTone
 from era_haptics.lab.measuring.loopback import check_levels, is_whole
 from era_haptics.lab.measuring.sound_card import Desk, Run, SoundCard, open_card, play, ramped
 from model.answer.answer import Layer
@@ -100,7 +100,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, patte
     """Record what an amplifier plays, once."""
     seconds = _SETTLING + _WINDOW
     tones = tuple(
-        contents.AmplifierTone(
+        AmplifierTone(
             rig.wiring[name].number,
             tone.frequency,
             tone.amplitude / rig.era(name).full_level,
@@ -112,7 +112,7 @@ def _by_amplifier(card: SoundCard, amplifier: BlockingAmplifier, rig: Rig, patte
         try:
             playing = thread.submit(
                 amplifier.play,
-                [contents.AmplifierLayer(0, tones, _RAMP)],
+                [AmplifierLayer(0, tones, _RAMP)],
                 duration=seconds + _SETTLING,
             )
             run = play(

@@ -31,6 +31,7 @@ from drivers.protocol.definition import (
     VERSION,
 )
 from drivers.protocol.records import Values
+from drivers.wires import serial_frames
 from drivers.wires.can_frames import (
     CANOPEN,
     NODE_MAX,
@@ -74,7 +75,6 @@ from drivers.wires.serial_frames import (
     pack_words,
     unpack_words,
 )
-from drivers.wires.serial_frames import unpack_identity as serial_frames_unpack_identity
 from era_haptics.lab.conformance.check import driving, reading
 from era_haptics.lab.conformance.judge_client import (
     GATEWAY_TIMEOUT,
@@ -211,9 +211,13 @@ class CanClient(JudgeClient):
         return [frame.data for frame in self.frames if frame.id == can_id]
 
 
-_PLACE = "can.md#messages-as-frames"
-_PING, _SET, _STATUS = (MESSAGES[name].number for name in ("Ping", "Set", "GetStatus"))
-_COMMIT = MESSAGES["Commit"].number
+_CAN_PLACE = "can.md#messages-as-frames"
+_MODBUS_PLACE = "modbus.md#registers"
+_SERIAL_PLACE = "protocol.md#checks-in-this-order"
+_PING, _SET, _STATUS, _COMMIT, _CAPS, _ACHIEVED, _STOP = (
+    MESSAGES[name].number
+    for name in ("Ping", "Set", "GetStatus", "Commit", "GetCaps", "GetAchieved", "Stop")
+)
 _LIFE, _FORGOTTEN = 0.09, 0.12  # s; for which a number is kept, after which any begins
 _FAST = 0.015  # s; exchanges that are quick enough to see for how long a number is kept
 
@@ -223,7 +227,7 @@ def can_client(subject: Subject) -> CanClient:
     return cast(CanClient, subject.client)
 
 
-@driving(_PLACE, "can")
+@driving(_CAN_PLACE, "can")
 async def numbers(subject: Subject) -> None:
     """It takes newer numbers only, each message once, its frames in any order."""
     client = can_client(subject)
@@ -410,20 +414,7 @@ class ModbusClient(JudgeClient):
         return heard
 
 
-_MODBUS_FRAMES_PLACE = "modbus.md#registers"
 _GATEWAY = b"\x0a", b"\x0b"  # exceptions: no path to a unit, or no response of it
-(
-    _MODBUS_FRAMES_PING,
-    _MODBUS_FRAMES_STATUS,
-    _CAPS,
-    _ACHIEVED,
-    _STOP,
-    _MODBUS_FRAMES_SET,
-    _MODBUS_FRAMES_COMMIT,
-) = (
-    MESSAGES[name].number
-    for name in ("Ping", "GetStatus", "GetCaps", "GetAchieved", "Stop", "Set", "Commit")
-)
 _TOO_LONG, _BEYOND = (REFUSALS[name] << 8 | NO_CHANNEL for name in ("BAD_LENGTH", "BAD_VALUE"))
 _NO_WORDS = (0,) * (AREA - HEAD)
 
@@ -432,7 +423,7 @@ def _client(subject: Subject) -> ModbusClient:
     return cast(ModbusClient, subject.client)
 
 
-@reading(_MODBUS_FRAMES_PLACE, "rtu", "tcp")
+@reading(_MODBUS_PLACE, "rtu", "tcp")
 async def areas(subject: Subject) -> None:
     """It keeps each reply under its tag, zeros behind it, and shows the present without a write."""
     client = _client(subject)
@@ -443,31 +434,31 @@ async def areas(subject: Subject) -> None:
     async def area(number: int, count: int = AREA, at: int = 0, function: int = READ) -> list[int]:
         return [*await client.read(BOX * number + REPLY_OFFSET + at, count, function=function)]
 
-    for number in set(BY_NUMBER) - {_MODBUS_FRAMES_STATUS}:
+    for number in set(BY_NUMBER) - {_STATUS}:
         shown = await area(number)
         again = await area(number, function=READ_HOLDING)
         expect_equal(again, shown, f"reply area {number} by function 3")
     for tag in (1, 0xFFFF, 77):
-        await write(_MODBUS_FRAMES_PING, tag, 1, 0)
-        shown = await area(_MODBUS_FRAMES_PING)
+        await write(_PING, tag, 1, 0)
+        shown = await area(_PING)
         expect_equal(shown[:HEAD], [tag, 0], "tag, result")
         expect_equal(
-            await area(_MODBUS_FRAMES_PING, 3, HEAD + 3),
+            await area(_PING, 3, HEAD + 3),
             shown[HEAD + 3 : HEAD + 6],
             "part of an area",
         )
     await write(_ACHIEVED, 5, 1)  # the number of the layer is a word that must not stay
     expect_equal((await area(_ACHIEVED, 1)), [5], "tag of GetAchieved")
-    expect_equal((await area(_MODBUS_FRAMES_PING, 1)), [77], "tag of a Ping before it")
+    expect_equal((await area(_PING, 1)), [77], "tag of a Ping before it")
     await write(_ACHIEVED, 6, 15, 0)
     tag, result, *behind = await area(_ACHIEVED)
     seen = tag, result, any(behind)
     expect_equal(seen, (6, _TOO_LONG, False), "tag, result of a word too many, registers behind")
     for tag, count, result in ((7, 1, _BEYOND), (8, 3, 0)):  # parts; of session 0
-        await write(_MODBUS_FRAMES_SET, tag, 0, 1, count << 1)
+        await write(_SET, tag, 0, 1, count << 1)
         what = f"reply area after the first of {count} parts that is wrong"
-        expect_equal(await area(_MODBUS_FRAMES_SET), [tag, result, *_NO_WORDS], what)
-    for number in (_CAPS, _MODBUS_FRAMES_STATUS):
+        expect_equal(await area(_SET), [tag, result, *_NO_WORDS], what)
+    for number in (_CAPS, _STATUS):
         await write(number, 9, 0)
         expect_equal(await area(number, 2), [9, _TOO_LONG], "tag, result of a refusal")
         tag, result, first = await area(number, 3)
@@ -478,33 +469,29 @@ async def areas(subject: Subject) -> None:
     expect_equal(part, texts[2:18], "part of the identity")
 
 
-@driving(_MODBUS_FRAMES_PLACE, "rtu", "tcp")
+@driving(_MODBUS_PLACE, "rtu", "tcp")
 async def present_areas(subject: Subject) -> None:
     """It shows the status of the moment at every read, and other replies as they were."""
     client = _client(subject)
     await client.look_around()
     await subject.run([subject.arm, subject.one(), subject.ping])
-    kept = await client.read(BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET, AREA)
+    kept = await client.read(BOX * _PING + REPLY_OFFSET, AREA)
     await subject.run([subject.one(level=0.5), partial(subject.request, "GetStatus")])
-    again = await client.read(BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET, AREA)
+    again = await client.read(BOX * _PING + REPLY_OFFSET, AREA)
     expect_equal(again, kept, "reply to a Ping, read again after a set")
     first, *_ = subject.parts(subject.one(), now=0, count=3)
     await subject.send(send("Set", **first))
     tag = client.number
-    shown = await client.read(BOX * _MODBUS_FRAMES_SET + REPLY_OFFSET, AREA)
+    shown = await client.read(BOX * _SET + REPLY_OFFSET, AREA)
     expect_equal(shown, (tag, 0, *_NO_WORDS), "reply area after a part that is kept")
     if not (client.is_rtu or client.has_gateway):
         await subject.run([stage(subject.one())])
         words = MESSAGES["Commit"].request.pack(subject.filled({"token": subject.token}))
-        await client.expect_silence(
-            client.request(_MODBUS_FRAMES_COMMIT, words, to=0), "a Commit to unit 0"
-        )
+        await client.expect_silence(client.request(_COMMIT, words, to=0), "a Commit to unit 0")
         await subject.request("GetStatus")
     if client.is_rtu:
         subject.require_alone()
-        data = client.adu(
-            client.write_of(_MODBUS_FRAMES_PING, [subject.session, 0], tag=4242), unit=0
-        )
+        data = client.adu(client.write_of(_PING, [subject.session, 0], tag=4242), unit=0)
         await client.expect_silence(data, "a Ping for all")
         await subject.starve()
         await client.send(client.adu(client.write_of(_STOP, [0], tag=4242), unit=0))
@@ -514,19 +501,19 @@ async def present_areas(subject: Subject) -> None:
 
 def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, int]]:
     """Yield PDUs with the exceptions that they must raise."""
-    area = BOX * _MODBUS_FRAMES_PING + REPLY_OFFSET
+    area = BOX * _PING + REPLY_OFFSET
     last = area + AREA
     functions = (1, 2, 5, 6, 22, 43, 100)
     for function in functions:
         yield f"function {function}", bytes([function]) + b"\0\0\0\1", 1
-    yield "function 23", struct.pack(">BHHHHBH", 23, 0, 1, BOX * _MODBUS_FRAMES_PING, 1, 2, 1), 1
+    yield "function 23", struct.pack(">BHHHHBH", 23, 0, 1, BOX * _PING, 1, 2, 1), 1
     for what, first, registers, code in (
-        ("a write within a message", BOX * _MODBUS_FRAMES_PING + 1, [1, 1], 2),
+        ("a write within a message", BOX * _PING + 1, [1, 1], 2),
         ("a write of no message", BOX * 63, [1, 1], 2),
         ("a write of message 1", BOX, [1], 2),
         ("a write to a reply area", area, [1, 1], 2),
-        ("a write of 122 registers", BOX * _MODBUS_FRAMES_PING, [1] * 122, 2),
-        ("a write of 0 registers", BOX * _MODBUS_FRAMES_PING, [], 3),
+        ("a write of 122 registers", BOX * _PING, [1] * 122, 2),
+        ("a write of 0 registers", BOX * _PING, [], 3),
         ("a write of 0 registers of no message", BOX * 63, [], 3),
     ):
         yield what, write_pdu(first, registers), code
@@ -536,7 +523,7 @@ def _bad_pdus(client: ModbusClient, ping: bytes) -> Iterator[tuple[str, bytes, i
         ("a read beyond an area", last - 1, 2, 2),
         ("a read behind an area", last, 1, 2),
         ("a read of no message", BOX * 63 + REPLY_OFFSET, 1, 2),
-        ("a read of what is written", BOX * _MODBUS_FRAMES_PING, 1, 2),
+        ("a read of what is written", BOX * _PING, 1, 2),
         ("a read beyond the identity", IDENTITY_REGISTER, IDENTITY_COUNT + 1, 2),
         ("a read of 0 registers", area, 0, 3),
         ("a read of 126 registers", area, 126, 3),
@@ -553,9 +540,7 @@ async def exceptions(subject: Subject) -> None:
     await subject.arm()
     await subject.play(subject.one())
     known = READ, READ_HOLDING, WRITE
-    for what, pdu, code in _bad_pdus(
-        client, client.write_of(_MODBUS_FRAMES_PING, [subject.session, 0])
-    ):
+    for what, pdu, code in _bad_pdus(client, client.write_of(_PING, [subject.session, 0])):
         # On RTU the length of a frame follows from its function: of others it ends with a pause.
         if client.is_rtu and pdu[0] not in known and len(pdu) != 5:
             continue
@@ -572,7 +557,7 @@ async def pieces(subject: Subject) -> None:
     pause, limit = (0.012, 0.02) if client.is_rtu else (0.2, 1.0)  # s; within a frame
 
     def frame() -> bytes:
-        return client.request(_MODBUS_FRAMES_PING, [1, 0])
+        return client.request(_PING, [1, 0])
 
     whole, broken = frame(), bytearray(frame())
     broken[6] = 200  # bytes that would follow
@@ -641,7 +626,7 @@ class SerialClient(JudgeClient):
         frame = (await self._replied(HELLO, payload, version)).frame
         seen = frame.kind, frame.version
         expect_equal(seen, (HELLO | REPLY_BIT, NEUTRAL), "type, version of the reply to Hello")
-        return read_as("identity", serial_frames_unpack_identity, frame.payload)
+        return read_as("identity", serial_frames.unpack_identity, frame.payload)
 
     async def exchange(
         self, number: int, words: Sequence[int], *, behind: bytes = b"", version: int = VERSION
@@ -693,7 +678,7 @@ class SerialClient(JudgeClient):
         )
         yield from ((what, _framed(each)) for what, each in bits)
         # Without zeros, so that it is one block, whose length is wrong.
-        statuses = (self.request(_SERIAL_FRAMES_STATUS, []) for _ in range(_SEQUENCES))
+        statuses = (self.request(_STATUS, []) for _ in range(_SEQUENCES))
         plain = next(each for each in statuses if each[1] == len(each) - 2)
         yield from {
             "a block that goes on behind its end": b"\0\xff" + plain[2:],
@@ -717,13 +702,7 @@ def _framed(content: bytes) -> bytes:
     return b"\0" + stuffed + b"\0"
 
 
-_SERIAL_FRAMES_PLACE = "protocol.md#checks-in-this-order"
-_SERIAL_FRAMES_PING, _SERIAL_FRAMES_SET, _SERIAL_FRAMES_STATUS = (
-    MESSAGES[name].number for name in ("Ping", "Set", "GetStatus")
-)
-
-
-@driving(_SERIAL_FRAMES_PLACE)
+@driving(_SERIAL_PLACE)
 async def damaged_frames(subject: Subject) -> None:
     """It takes no damaged frame, nor one for others: it neither plays, replies nor is fed."""
     client = subject.client
@@ -737,20 +716,20 @@ async def damaged_frames(subject: Subject) -> None:
     await subject.arm()
     await subject.play(subject.one())
     _, words = subject.words_of(layer(0, subject.tone(0, 0.5)))
-    for number, sent in ((_SERIAL_FRAMES_PING, [subject.session, 0]), (_SERIAL_FRAMES_SET, words)):
+    for number, sent in ((_PING, [subject.session, 0]), (_SET, words)):
         for what, data in client.damaged(number, sent):
             await subject.unfed()
             await client.expect_silence(data, f"message {number} with {what}")
             await subject.request("GetStatus")
 
 
-@driving(_SERIAL_FRAMES_PLACE)
+@driving(_SERIAL_PLACE)
 async def doubled_frames(subject: Subject) -> None:
     """It carries a frame that comes twice, or late, out as one of its token, or not at all."""
     await subject.arm()
     sets = [layer(0, subject.tone(0, each), valid_for=250) for each in (0.5, 1.0)]
     made = [subject.words_of(each) for each in sets]
-    frames = [subject.client.request(_SERIAL_FRAMES_SET, words) for _, words in made]
+    frames = [subject.client.request(_SET, words) for _, words in made]
     for (part, _), data in zip(made, frames, strict=True):
         began = threads.now()
         await subject.client.reply_to(data)
@@ -769,14 +748,10 @@ async def discarded_frames(subject: Subject) -> None:
     event = pack_words(EVENT_RECORD.pack({"state": 1, "fault": 0, "channel": 255, "latch": 1}))
     await client.expect_silence(client.frame(EVENT, event), "an Event")
     await subject.run([subject.arm, subject.one()])
-    answer = await client.exchange(
-        _SERIAL_FRAMES_SET, subject.words_of(subject.one())[1], behind=b"\0"
-    )
+    answer = await client.exchange(_SET, subject.words_of(subject.one())[1], behind=b"\0")
     expect_equal(answer.code, "BAD_LENGTH", "refusal of a set with half a word")
     head = pack_words([subject.session, subject.token + 1, 2 << 1])
-    await client.expect_silence(
-        client.frame(_SERIAL_FRAMES_SET, head + b"\0"), "a part with half a word"
-    )
+    await client.expect_silence(client.frame(_SET, head + b"\0"), "a part with half a word")
     await subject.run([stage(subject.one(level=0.5))])
     for name, values in (("Commit", {"token": subject.token}), ("Stop", {"ramp": 0})):
         message = MESSAGES[name]
@@ -793,7 +768,7 @@ async def tolerated_frames(subject: Subject) -> None:
     client = cast(SerialClient, subject.client)
 
     def ping() -> bytes:
-        return client.request(_SERIAL_FRAMES_PING, [1, 0])
+        return client.request(_PING, [1, 0])
 
     whole = ping()
     for what, pieces, count in (
@@ -805,7 +780,7 @@ async def tolerated_frames(subject: Subject) -> None:
         ("300 bytes of noise before it", [b"\x77" * 300 + ping()], 1),
         (
             "the longest payload before it",
-            [client.frame(_SERIAL_FRAMES_SET, bytes(240)) + ping()],
+            [client.frame(_SET, bytes(240)) + ping()],
             2,
         ),
         ("its delimiter shared", [ping()[:-1] + ping()], 2),
@@ -820,5 +795,5 @@ async def tolerated_frames(subject: Subject) -> None:
         await subject.request("Ping", session=1)
     client.invalid.clear()
     for _ in range(3):
-        await client.exchange(_SERIAL_FRAMES_PING, [1, 0])
+        await client.exchange(_PING, [1, 0])
     expect_equal(client.invalid, [], "damaged replies")

@@ -60,7 +60,7 @@ test-long: .venv/installed-test
 
 # A short form of the whole suite on a machine that has no time: what talks to wires, processes and
 # clients, beside six processes that compute without pause.
-BUSY := tests/drivers/by_hand tests/drivers/host tests/drivers/ports tests/drivers/wires tests/firmware \
+BUSY := tests/drivers tests/firmware \
 	tests/controller/daemon tests/controller/gateway tests/controller/api tests/integration
 test-busy: .venv/installed-test
 	$(BIN)/python tests/support/busy_machine.py $(BIN)/pytest -m 'not long' --numprocesses 2 \
@@ -74,7 +74,7 @@ test-kernels: .venv/installed-test
 # What reads and writes Modbus, with the lowest and the newest pymodbus that the bounds allow, each in
 # a folder of its own. Others: make test-pymodbus PYMODBUS=3.12.1
 PYMODBUS := 3.8.* 3.*
-MODBUS := tests/drivers/wires tests/drivers/judge tests/sim/far_ends tests/test_link_faults.py
+MODBUS := tests/drivers/wires tests/era_haptics/lab/conformance tests/era_haptics/lab/witness tests/sim/far_ends tests/test_link_faults.py
 test-pymodbus: .venv/installed-test
 	@set -f; for version in $(PYMODBUS); do \
 		folder="$(CURDIR)/out/pymodbus-$$version"; rm -rf "$$folder"; export PYTHONPATH="$$folder"; \

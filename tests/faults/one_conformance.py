@@ -1,7 +1,7 @@
 """One conformance check of an amplifier on one wire, in virtual time.
 
 Run by the judge of planted faults only: the suite has all checks in turn in
-`tests/drivers/judge/asking`. Faults of a simulated amplifier are found on it; those of
+`tests/era_haptics/lab/conformance`. Faults of a simulated amplifier are found on it; those of
 `drivers.playing`, which conformance asks what must be played, on the firmware, which does
 not.
 """

@@ -398,7 +398,7 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
                 raise end
             return Report(url, 0.0, (), 1)
 
-        monkeypatch.setattr("era_haptics.lab.conformance.judge_client", judged)
+        monkeypatch.setattr("era_haptics.lab.conformance.contract.judge", judged)
         result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")
         assert result.exit_code != 0
         assert f"{far.url(1)} is left in SWITCH_ON_DISABLED" in result.stderr

@@ -25,7 +25,6 @@ from drivers.trace import tracing
 from drivers.wires.can_frames import pack_frames, unpack_frames
 from drivers.wires.modbus_frames import framed
 from drivers.wires.serial_frames import FrameReader, encode_frame
-from era_haptics.lab.conformance import judge_client
 from era_haptics.lab.conformance.check import (
     Check,
     CheckResult,
@@ -34,7 +33,7 @@ from era_haptics.lab.conformance.check import (
     run_checks,
 )
 from era_haptics.lab.conformance.checks import state_checks
-from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
+from era_haptics.lab.conformance.contract import CHECKS, Result, judge, of_kind
 from era_haptics.lab.conformance.judge_client import ContractViolation, Judge, TooLate, When, layer
 from era_haptics.lab.conformance.subject import Subject
 from long_form import shortly
@@ -502,7 +501,7 @@ async def test_verdict_over_a_real_port(tmp_path: Path) -> None:
     loop.add_reader(far, lambda: end.receive(os.read(far, 4096), threads.now()))
     url = f"serial://{os.ttyname(near)}"
     with tracing(tmp_path / "trace"):
-        report = await judge_client(url, drives=False)
+        report = await judge(url, drives=False)
     lines = (tmp_path / "trace").read_text().splitlines()
     assert {">", "<"} <= {word for line in lines for word in line.split()}
     loop.remove_reader(far)

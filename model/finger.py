@@ -28,12 +28,6 @@ from model.arrays import FloatArray, lattice
 from model.errors import InputError, is_whole
 from model.structure.plate import Plate
 
-MAX_CONTACTS = 20
-"""Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
-
-MAX_CONTENTS = 6
-"""Most contents at the same time; with more, no plate has any contrast left."""
-
 GAUSS_LEGENDRE = np.column_stack(np.polynomial.legendre.leggauss(8))
 """Points and weights (8, 2) over -1..1."""
 

@@ -1,7 +1,13 @@
-"""Limits of commands, which a rig file states and the guard of each amplifier enforces."""
+"""Limits of fingers at once, and of commands, which rigs state and amplifiers' guards enforce."""
 
 import math
 from dataclasses import dataclass
+
+MAX_CONTACTS = 20
+"""Most fingers: two people with ten each, or four with five; more are a forearm or a spill."""
+
+MAX_CONTENTS = 6
+"""Most contents at the same time; with more, no plate has any contrast left."""
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def sim(
     from sim.process.early_exit import exit_on_signal
 
     with exit_on_signal():
-        from model.config.fields import parse_point
+        from model.config.units import parse_point
         from model.rig.rig_file import load_rig
         from sim.far_ends.wire_assignment import SimulatedWire, assign_wires, choose_lines, links_of
         from sim.faults import FaultFile, load_faults
@@ -209,7 +209,7 @@ def _check_rate(rate: float, *, frequency_max: float) -> None:
 
 
 def _sensor(text: str) -> "Accelerometer":
-    from model.config.fields import parse_point
+    from model.config.units import parse_point
     from sim.plant.fingers import Accelerometer
 
     name, equals, position = text.partition("=")

@@ -22,7 +22,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import ValidationError
 
 from model.config.document import read_document
-from model.config.fields import RATIO, TIME, Quantity, Section, Validation
+from model.config.fields import Quantity, Section, Validation
+from model.config.units import RATIO, TIME
 from model.errors import InputError
 from registry.wording import first_problem
 

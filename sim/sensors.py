@@ -19,7 +19,7 @@ import numpy as np
 from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.files.array_file import begins_with
+from model.files.output_paths import begins_with
 from model.files.uff import ACCELERATION, TIME, TIME_RESPONSE, Function, Universal, write_universal
 from registry.files import regular_file
 from sim.bench.bench import Bench

@@ -1,7 +1,7 @@
 """`era daemon`, the commands that are its clients, and how they show status and events.
 
 Clients: `status`, `arm`, `disarm`, `stop`, `clear`, `forget`, `reload`, `strength`, `touch`,
-`watch`, `layout use`. `show_status` and `show_event` format what the daemon reports for people.
+`watch`, `layout use`.
 """
 
 import json
@@ -9,7 +9,6 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,15 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from controller.api.link import Notification
-from controller.api.methods import StatusResult
-from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
-from drivers.by_hand.cli import EXIT_STATUS, in_words
+from drivers.by_hand.cli import EXIT_STATUS
 from drivers.errors import CommandRefused, LinkError
-from drivers.protocol.definition import READINGS
 from model.commands.options import JsonOption, print_report
 from model.errors import InputError
-from model.quantities import counted
 from registry.plugins import did_you_mean
 
 if TYPE_CHECKING:
@@ -104,6 +98,8 @@ def status(socket: Socket = None, as_json: JsonOption = False) -> None:
 
     with connected(socket) as era:
         status = era.status()
+    from controller.cli.status_text import show_status
+
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
@@ -189,7 +185,7 @@ def touch(
     import asyncio
 
     from controller.sources.tuio import read_capture, replay_capture
-    from model.config.fields import parse_point
+    from model.config.units import parse_point
 
     if (at is None) == (replay is None):
         raise InputError("era touch must have either fingers, such as 0.10,0.05, or --replay FILE")
@@ -204,6 +200,8 @@ def touch(
         status = era.status()  # right after a touch, whose contact lasts for 150 ms
         _hold(era, positions, started_at + duration)
         era.touch([], source="era touch")
+    from controller.cli.status_text import show_status
+
     typer.echo(status.model_dump_json() if as_json else show_status(status))
 
 
@@ -254,6 +252,8 @@ def watch(
                 head = {"topic": event.topic, "time_s": event.time, "lost": event.lost}
                 typer.echo(json.dumps({**head, "data": event.data}))
             else:
+                from controller.cli.status_text import show_event
+
                 typer.echo(show_event(event, ahead=now.unix_time_s - now.time_s))
 
 
@@ -298,7 +298,7 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
 
 def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") -> None:
     """Refuse fingers beyond the plate, which the daemon would only reject and count."""
-    from model.config.fields import in_metres
+    from model.config.units import in_metres
 
     for x, y in positions:
         if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
@@ -334,143 +334,3 @@ def use(
         used = era.layout(name)
     names = ", ".join(used.layouts)
     print_report([f"layout {used.layout} of {names}"], used.model_dump(), as_json=as_json)
-
-
-def show_event(event: Notification, *, ahead: float) -> str:
-    """Format an event; ahead: offset of the wall clock to the daemon's [s]."""
-    at = datetime.fromtimestamp(event.time + ahead).isoformat(timespec="milliseconds")[11:]
-    lost = f"  ({event.lost} lost)" if event.lost else ""
-    return f"{at}  {event.topic:10s} {in_words(event.data)}{lost}"
-
-
-def show_status(status: StatusResult) -> str:
-    """Format a status."""
-    left = status.lease_left_s
-    armed = None if left is None else f"{status.armed_by}, {left:.1f} s left"
-    lines = [
-        *(
-            f"touch {each.name}: {each.state}: {each.problem}"
-            for each in status.inputs
-            if each.problem
-        ),
-        headline(status.state, status.cause),
-        *_given(("  remedy: {}", status.remedy), ("  {}", _loss(status))),
-        *_given(("  slow: {}", status.slow_reason)),
-        *_given(("  armed by {}", armed)),
-        *_given(("  layout {}", status.layout and _layout(status))),
-        *map(_contact, status.contacts),
-        *[f"  strength {name}: {gain:g} dB" for name, gain in status.strengths.items() if gain],
-        *_given(("  silent: {}", status.silence_reason if status.contacts else None)),
-        *([] if status.learning is None else _learning(status.learning)),
-    ]
-    lines += [
-        f"  ERA {era}: {tone.frequency_hz:g} Hz, level {tone.level:.3f}, {tone.phase_deg:g} deg"
-        for drive in status.layers.values()
-        for era, tone in drive.items()
-    ]
-    for amplifier in status.amplifiers:
-        reports = [f"    {each.cause}; {each.remedy}" for each in amplifier.reports]
-        lines += [_amplifier(amplifier), *reports]
-    latency = status.latency_ms
-    if latency.median is not None:
-        lines.append(
-            f"  latency of {counted(latency.count, 'touch', plural='touches')}: "
-            f"median {latency.median:.2f} ms, 99 % {latency.p99:.2f} ms, "
-            f"99.9 % {latency.p999:.2f} ms"
-        )
-    for reason, count in status.rejected_touches.items():
-        example = status.rejected_examples.get(reason)
-        newest = f" ({example})" if example else ""
-        lines.append(f"  rejected touches, {reason.replace('_', ' ')}: {count}{newest}")
-    lines += _given(
-        ("  clicks that came too late: {}", status.clicks_too_late or None),
-        ("  lost events: {}", sum(status.lost_events.values()) or None),
-    )
-    return "\n".join([*lines, f"  state {status.state}, up for {status.uptime_s:.0f} s"])
-
-
-def _layout(status: StatusResult) -> str:
-    """Return the layout in use, and which there are if there are several."""
-    others = f" (of {', '.join(status.layouts)})" if len(status.layouts) > 1 else ""
-    return f"{status.layout}{others}"
-
-
-def _given(*texts: tuple[str, object]) -> list[str]:
-    """Texts with their values, but for those whose value is None or False."""
-    return [text.format(value) for text, value in texts if value is not None and value is not False]
-
-
-def _loss(status: StatusResult) -> str | None:
-    """What is to be assumed of amplifiers that are lost, if any are."""
-    if status.lost_for_s is None:
-        return None
-    watchdog = f"its watchdog silences it after {status.watchdog_s:g} s without heartbeats"
-    if status.assume_energised:
-        silences = [each.silence for each in status.amplifiers if each.silence is not None]
-        if any(each.silence == "may_play" and each.may_play_for_s is None for each in silences):
-            watchdog = "nothing that is known silences it: switch it off"
-        return f"ASSUME ENERGISED: a lost amplifier may still be playing; {watchdog}"
-    return f"unreachable for {status.lost_for_s:.1f} s: {watchdog}, unconfirmed"
-
-
-def _contact(contact: ContactStatus) -> str:
-    """Format a finger and what it feels."""
-    from model.answer.answer import OWN, verdict_shown
-
-    verdict = verdict_shown(contact.verdict, is_foreign_felt=contact.is_foreign_felt)
-    details = _given(
-        (" {:.1f} dB SL", contact.level_db_sl),
-        (", at least {:.1f} dB over the others", contact.promised_contrast_db),
-        (", {:g} Hz", contact.frequency_hz),
-        (", effect {}", contact.effect),
-        (", feels {}", None if contact.feels == contact.effect else contact.feels),
-        (", others at most {:.1f} dB SL", contact.foreign_level_db_sl),
-        (", {}", None if verdict == OWN else verdict),
-        (": {}", contact.held_back),
-        (", load {:.1f}", None if contact.load == 1 else contact.load),
-    )
-    return (
-        f"  finger {contact.source} {contact.id} at {contact.x_m:.3f}, {contact.y_m:.3f} m: "
-        f"{contact.role or 'not driven'}{''.join(details)}"
-    )
-
-
-def _learning(learning: LearningSummary) -> list[str]:
-    """Format what is learned of the plate."""
-    state = learning.state.replace("_", " ")
-    last, took = learning.last_estimate_s, learning.latency_ms.median
-    within = "".join(_given((", median {:.0f} ms after a measurement", took)))
-    ago = "".join(_given((", last estimated {:.0f} s ago", last)))
-    measured = (
-        f"{counted(learning.readings, 'pattern')} measured{ago}; "
-        f"{counted(learning.corrections, 'correction')} of answers{within}"
-    )
-    return [
-        f"  plate {state.upper() if learning.cautious else state}: {learning.cause}",
-        *_given(("    answers promise what a plate that is not known gives", learning.cautious)),
-        *_given(("    remedy: {}", learning.remedy)),
-        *_given(("    {}", measured if learning.readings else None)),
-    ]
-
-
-def _amplifier(amplifier: AmplifierStatus) -> str:
-    """Format an amplifier's last status."""
-    details = _given(
-        ("{}", amplifier.state),
-        ("does not reply", amplifier.degraded),
-        ("LOST", amplifier.lost),
-        ("closed because another was lost", amplifier.closed_with_lost),
-        ("{}", amplifier.silence and amplifier.silence.words),
-        ("fault {}", None if amplifier.fault == "NONE" else amplifier.fault),
-        *(
-            (
-                f"{each.label} {{:.{each.decimals}f}} {each.quantity.unit}".rstrip(),
-                getattr(amplifier, each.key),
-            )
-            for each in READINGS
-            if "status" in each.views
-        ),
-        ("last reply {:.2f} s ago", amplifier.reply_age_s),
-        ("no reply yet", amplifier.reply_age_s is None),
-    )
-    return f"  amplifier {amplifier.name} ({amplifier.url}): {', '.join(details)}"

@@ -124,7 +124,7 @@ def identify(
     import time
 
     from controller.plate_measurement import observation_of
-    from model.config.fields import parse_frequencies
+    from model.config.units import parse_frequencies
     from model.diagnosis.verdict import check_meaning
     from model.identification import identify as identification_report
     from model.identification.identify import expected_contrast

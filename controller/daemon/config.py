@@ -26,8 +26,9 @@ from controller.sources.touch import TouchCalibration, TouchSource, fitted, open
 from drivers.by_hand.reaching import check_links
 from model.arrays import FloatArray
 from model.config.document import ConfigError, Document, read_document
-from model.config.fields import LENGTH, LEVEL, Quantity, Section, Validation
+from model.config.fields import Quantity, Section, Validation
 from model.config.file_kinds import CheckedFile, ConfigKind
+from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
 from model.finger import STRONG_DB_SL

@@ -12,7 +12,8 @@ from controller.play.intent import Band, Pulse, Target
 from controller.sources.touch import Contact, ContactKey
 from model.answer.stimulus import MAX_LEVEL_DB_SL, MAX_MODULATION, MIN_MODULATION, Course
 from model.arrays import FloatArray
-from model.config.fields import FREQUENCY, LEVEL, Quantity, Section, Shape
+from model.config.fields import Quantity, Section, Shape
+from model.config.units import FREQUENCY, LEVEL
 from model.finger import STRONG_DB_SL
 
 ON_PRESS, ON_MOVE, ON_RELEASE = USES = ("on_press", "on_move", "on_release")

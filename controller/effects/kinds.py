@@ -33,7 +33,8 @@ from controller.effects.effect import (
 from controller.play.intent import MAX_DB_SL, Pulse
 from controller.sources.touch import Contact
 from model.arrays import FloatArray
-from model.config.fields import ANGLE, LENGTH, LEVEL, SPEED, TIME, Quantity
+from model.config.fields import Quantity
+from model.config.units import ANGLE, LENGTH, LEVEL, SPEED, TIME
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from registry.plugins import PluginRegistry

@@ -28,8 +28,9 @@ from controller.play.intent import band_problem
 from model.answer.stimulus import MAX_LEVEL_DB_SL
 from model.arrays import FloatArray
 from model.config.document import Document, KeyPath, read_document
-from model.config.fields import LEVEL, Quantity, Section, ShapedSection, Validation
+from model.config.fields import Quantity, Section, ShapedSection, Validation
 from model.config.file_kinds import CheckedFile, ConfigKind
+from model.config.units import LEVEL
 from model.errors import InputError
 from model.finger import STRONG_DB_SL
 from model.rig.actuator_keys import Identifier

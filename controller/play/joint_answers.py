@@ -49,11 +49,12 @@ from model.answer.promise import with_tones
 from model.answer.stimulus import ANY, BY_NAME, MUST, NEVER, ONSET_RAMP, Finger, Placement, Stimulus
 from model.arrays import NEARLY, Complex64Array, FloatArray, Point
 from model.drive_modes import UNRESTRICTED
-from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS
+from model.finger import FINGERTIP_RADIUS
 from model.structure.attachments import MIN_LOAD
 from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.vibration import Excitation, base_amplitudes
+from registry.limits import MAX_CONTACTS
 
 STRETCH = 0.008
 """Way [m] that a moving finger is answered for; once it has gone that far it is asked anew."""

@@ -26,9 +26,9 @@ from typing import NamedTuple, TypeAlias
 from urllib.parse import parse_qsl
 
 from model.errors import InputError
-from model.finger import MAX_CONTACTS
 from model.structure.plate import Plate
 from registry import threads
+from registry.limits import MAX_CONTACTS
 from registry.plugins import PluginRegistry
 
 LOG_INTERVAL = 1.0  # s

@@ -8,8 +8,8 @@ from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import MeasureCommand, measure, outputs
-from era_haptics.lab.paper_figures import figure_app
-from era_haptics.lab.report import report
+from era_haptics.lab.paper_figures_cli import figure_app
+from era_haptics.lab.report_cli import report
 from era_haptics.lab.witness.witness_cli import witness
 
 amp = typer.Typer()

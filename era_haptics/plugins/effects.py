@@ -4,7 +4,8 @@ from controller.effects.effect import Effect, EffectRun, EffectStimulus, Level, 
 from controller.effects.kinds import effect_kind
 from controller.play.intent import Pulse
 from controller.sources.touch import Contact, ContactKey
-from model.config.fields import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME, Quantity
+from model.config.fields import Quantity
+from model.config.units import ANGLE, FREQUENCY, LENGTH, RATIO, SPEED, TIME
 
 __all__ = [
     "ANGLE",

@@ -18,14 +18,15 @@ import numpy as np
 from scipy import fft
 
 from model.arrays import FloatArray, Point
-from model.config.fields import in_metres
+from model.config.units import in_metres
 from model.errors import InputError, expect_number, shown
-from model.finger import FINGERTIP_RADIUS, MAX_CONTACTS, STRONG_DB_SL
+from model.finger import FINGERTIP_RADIUS, STRONG_DB_SL
 from model.structure.attachments import check_loads
 from model.structure.plate import Plate
 from model.transients.base_motion import rise
 from model.transients.excursions import CLICKS_APART, DECAYED, Swing
 from model.transients.knots import RISE
+from registry.limits import MAX_CONTACTS
 
 MIN_LEVEL_DB_SL, MAX_LEVEL_DB_SL = -100.0, 60.0
 """Bounds of a stimulus's level [dB SL].

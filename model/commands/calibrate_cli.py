@@ -20,7 +20,7 @@ from model.commands.options import (
     progress_bar,
 )
 from model.errors import InputError
-from model.files.array_file import check_ending, check_picture, check_place, check_replaceable
+from model.files.output_paths import check_ending, check_picture, check_place, check_replaceable
 from model.quantities import counted
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import typer
 
 from model.commands.options import JsonOption, next_line, print_report
 from model.errors import InputError
-from model.files.array_file import check_ending
+from model.files.output_paths import check_ending
 
 config_app = typer.Typer(help="Create and check configuration files.", no_args_is_help=True)
 

@@ -1,24 +1,21 @@
 """Options, parsed values and reports that several commands share."""
 
 import json
-import math
 import os
-import re
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from model.errors import InputError, expect_between
-from model.processes import Progress
-from model.rig.rig import Rig
-from model.vibration import Excitation, Tone
-from registry.plugins import did_you_mean
+from model.errors import InputError
+
+if TYPE_CHECKING:
+    from model.processes import Progress
 
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file, e.g. RIG.yaml.")]
 TableArgument = Annotated[Path, typer.Argument(metavar="TABLE", help="Table file, e.g. T.npz.")]
@@ -65,14 +62,6 @@ SeedOption = Annotated[
 ]
 
 _LINE_INTERVAL = 2.0  # s
-_NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d{1,2})?"
-_DRIVE = re.compile(
-    rf"(?P<era>[^=]+)=\s*(?P<frequency>{_NUMBER})\s*"
-    rf"(@\s*(?P<level>{_NUMBER})\s*(:\s*(?P<phase>{_NUMBER}))?)?",
-    re.IGNORECASE,
-)
-_NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
-"""Groups of `_DRIVE` that are numbers, and their defaults."""
 
 
 class Stopwatch:
@@ -90,7 +79,7 @@ class Stopwatch:
 
 
 @contextmanager
-def progress_bar(unit: str) -> Iterator[Progress]:
+def progress_bar(unit: str) -> "Iterator[Progress]":
     """Show a progress bar on standard error, or lines of text if that is not a terminal.
 
     Yields update(done, total). unit: plural of the things counted.
@@ -109,7 +98,7 @@ def progress_bar(unit: str) -> Iterator[Progress]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _lines(unit: str) -> Progress:
+def _lines(unit: str) -> "Progress":
     """Return an update(done, total) that prints a line every two seconds."""
     printed = time.monotonic()
 
@@ -162,53 +151,3 @@ def figure_size(text: str | None) -> tuple[float, float] | None:
     if not (2 <= width <= 200 and 2 <= height <= 200):  # False for NaN
         raise InputError(f"--size must be WxH in cm, 2 to 200 each, such as 16x10, got {text!r}")
     return width / 2.54, height / 2.54
-
-
-def parse_drives(texts: Sequence[str], rig: Rig) -> Excitation:
-    """Parse drives such as `SW=110`, `NE=250@0.5` or `NE=250@0.5:90` to an excitation.
-
-    The level is 1, full stroke, and the phase 0 where they are left out. Raises InputError.
-    """
-    excitation: dict[str, Tone] = {}
-    names = [era.name for era in rig.eras]
-    for text in texts:
-        match = _DRIVE.fullmatch(text.strip())
-        if match is None:
-            raise InputError(
-                f"--drive must be ERA=HZ[@LEVEL[:PHASE_DEG]], in hertz, share of full stroke and "
-                f"degrees without a unit, got {text!r}; for instance {names[0]}=110 or "
-                f"{names[0]}=110@0.5:90"
-            )
-        name = match["era"]
-        if name not in names:
-            raise InputError(
-                f"--drive {text!r}: the rig has no ERA {name!r}; "
-                f"{did_you_mean(name, names)}it has {', '.join(names)}"
-            )
-        if name in excitation:
-            raise InputError(f"--drive {text!r}: ERA {name} must have one tone, got two")
-        frequency, level, phase = (
-            float(match[key] or default) for key, default in _NUMBERS.items()
-        )
-        expect_between(level, 0, 1, what=f"--drive {text!r}: level")
-        if frequency <= 0:
-            raise InputError(f"--drive {text!r}: frequency must be positive, got {frequency:g} Hz")
-        stroke = rig.full_levels[name]
-        excitation[name] = Tone(frequency, level * stroke, math.radians(phase))
-    return excitation
-
-
-def beyond_limits(excitation: Excitation, rig: Rig) -> str | None:
-    """Return a warning if tones are outside the rig's frequency limits, else None."""
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    beyond = [
-        f"{era} at {tone.frequency:g} Hz"
-        for era, tone in excitation.items()
-        if not low <= tone.frequency <= high
-    ]
-    if not beyond:
-        return None
-    return (
-        f"{', '.join(beyond)}: outside the rig's limits.frequency of {low:g} to {high:g} Hz; the "
-        "guard enforces this range"
-    )

@@ -19,9 +19,9 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.config.fields import parse_frequencies, parse_pair
+from model.config.units import parse_frequencies, parse_pair
 from model.errors import InputError
-from model.files.array_file import check_picture
+from model.files.output_paths import check_picture
 from model.quantities import counted
 
 plate_app = typer.Typer(help="Compute modes and vibration maps of a plate.")
@@ -104,7 +104,7 @@ def plate_map(
     import numpy as np
 
     from model.arrays import best_of
-    from model.commands.options import beyond_limits, parse_drives
+    from model.commands.drive_option import beyond_limits, parse_drives
     from model.rig.rig_file import load_rig
     from model.structure.attachments import support_problem
     from model.vibration import G

@@ -24,9 +24,9 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.config.fields import parse_frequencies, parse_pair, parse_point
+from model.config.units import parse_frequencies, parse_pair, parse_point
 from model.errors import InputError
-from model.files.array_file import (
+from model.files.output_paths import (
     begins_with,
     check_ending,
     check_picture,

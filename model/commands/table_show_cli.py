@@ -18,7 +18,7 @@ from model.commands.options import (
     progress_bar,
 )
 from model.errors import InputError
-from model.files.array_file import begins_with, check_picture
+from model.files.output_paths import begins_with, check_picture
 from model.quantities import counted
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ command line gives positions, counts and frequency ranges as text. Shapes are re
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from decimal import Decimal
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from types import UnionType
 from typing import (
@@ -38,178 +37,13 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, core_schema
 
 from model.config.document import MAX_PROBLEMS, ConfigError, ConfigProblem, Document, KeyPath, Value
-from model.errors import InputError
+from model.config.units import LENGTH, Dimension, quantity, shown
 from model.quantities import counted
 from registry.plugins import did_you_mean
 from registry.wording import reworded
 
 if TYPE_CHECKING:
-    import pint
-
-    from model.arrays import FloatArray
-
-
-@dataclass(frozen=True)
-class Dimension:
-    """A kind of value, such as a length.
-
-    Units with a zero of their own, such as degC, are refused unless its SI unit has one, too.
-    """
-
-    name: str
-    """Its name with article."""
-
-    unit: str
-    """Its SI unit; a bare number of degC counts from 0 degC."""
-
-    example: str
-    """An example to write."""
-
-    factors: Mapping[str, str] = field(default_factory=dict, compare=False)
-    """Factors of common units, as pint has them: loading pint doubles a command's start.
-
-    Any other unit of the dimension is found by pint.
-    """
-
-    def key(self, name: str) -> str:
-        """The name of such a value with its unit, as in JSON: `stiffness_n_m`."""
-        unit = self.unit.lower().replace(" ", "").replace("/", "_").replace("^", "")
-        return f"{name}_{unit}".removesuffix("_")
-
-
-LENGTH = Dimension(
-    "a length",
-    "m",
-    "1.5 mm",
-    {"m": "1", "cm": "0.01", "mm": "0.001", "um": "0.000001", "in": "0.0254"},
-)
-MODULUS = Dimension("a modulus", "Pa", "70 GPa", {"Pa": "1", "MPa": "1000000", "GPa": "1000000000"})
-DENSITY = Dimension("a density", "kg/m^3", "2700 kg/m^3", {"kg/m^3": "1"})
-STIFFNESS = Dimension("a stiffness", "N/m", "17 kN/m", {"N/m": "1", "kN/m": "1000", "N/mm": "1000"})
-LINE_STIFFNESS = Dimension("a stiffness per length", "N/m^2", "5 kN/m^2")
-DAMPING = Dimension("a damping", "N s/m", "2 N s/m", {"N s/m": "1"})
-MASS = Dimension("a mass", "kg", "5 g", {"kg": "1", "g": "0.001"})
-FORCE_FACTOR = Dimension("a force factor", "N/A", "3.6 N/A", {"N/A": "1", "T m": "1"})
-RESISTANCE = Dimension("a resistance", "ohm", "4 ohm", {"ohm": "1"})
-INDUCTANCE = Dimension("an inductance", "H", "0.1 mH", {"H": "1", "mH": "0.001"})
-POWER = Dimension("a power", "W", "3 W", {"W": "1", "mW": "0.001"})
-VOLTAGE = Dimension("a voltage", "V", "5 V", {"V": "1", "mV": "0.001"})
-LINE_MASS = Dimension("a mass per length", "kg/m", "0.05 kg/m", {"kg/m": "1", "g/m": "0.001"})
-FREQUENCY = Dimension("a frequency", "Hz", "250 Hz", {"Hz": "1", "kHz": "1000"})
-TIME = Dimension("a time", "s", "50 ms", {"s": "1", "ms": "0.001"})
-SPEED = Dimension("a speed", "m/s", "5 cm/s", {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"})
-ANGLE = Dimension(
-    "an angle", "rad", "15 deg", {"rad": "1", "deg": "0.01745329251994329576923690768"}
-)
-RATE = Dimension("a rate", "1/s", "50 Hz", {"Hz": "1", "%/ms": "10"})
-SLEW = Dimension("a rise of the level", "1/s", "2 %/ms", RATE.factors)
-TEMPERATURE = Dimension("a temperature", "degC", "23 °C or 296 K", {"degC": "1", "°C": "1"})
-LEVEL = Dimension("a level", "dB", "14 dB", {"dB": "1"})
-RATIO = Dimension("a plain number", "", "0.05 or 5 %", {"%": "0.01"})
-
-# The number is split from its unit here and texts are short, so that nothing is evaluated: pint
-# by itself would compute `9**9**9 m`.
-_MAX_LENGTH = 40
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,2})?"
-_FACTOR = r"[A-Za-zµμΩ%°]+(?:(?:\^|\*\*)-?\d|[²³])?"
-_UNIT = rf"{_FACTOR}(?:(?:\s*[*/·]\s*|\s+){_FACTOR}){{0,4}}"
-_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})?\s*", re.ASCII)
-
-
-def quantity(value: object, dimension: Dimension) -> float:
-    """The value in the dimension's SI unit; a bare number is one already.
-
-    `12 in` is exactly 0.3048. Raises InputError for another dimension, an unknown unit, anything
-    but a number, and NaN or infinity.
-    """
-    if isinstance(value, str):
-        # Word processors write other blanks, and a minus sign of their own.
-        result = _parse(" ".join(value.split()).replace("\N{MINUS SIGN}", "-"), dimension)
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        result = _to_float(value, dimension)
-    else:
-        raise _refusal(value, dimension, f"is not {dimension.name}")
-    if not math.isfinite(result):
-        raise _refusal(value, dimension, "is not a finite number")
-    return result
-
-
-def _parse(text: str, dimension: Dimension) -> float:
-    """The value of a text `NUMBER [UNIT]`."""
-    match = _QUANTITY.fullmatch(text) if len(text) <= _MAX_LENGTH else None
-    if match is None:
-        raise _refusal(text, dimension, "is not a number with a unit")
-    number, unit = match.groups()
-    if unit is None:
-        return _to_float(number, dimension)
-    known = dimension.factors.get(unit)
-    factor, zero = (Decimal(known), 0) if known else unit_scale(text, unit, dimension)
-    return _to_float(Decimal(number) * factor + zero, dimension)
-
-
-def unit_scale(text: str, unit: str, dimension: Dimension) -> tuple[Decimal, Decimal]:
-    """The factor from a unit to the SI unit of a dimension, and what its 0 is there, by pint.
-
-    The base units must be the same, not just the dimension: revolutions per minute and rad/s have
-    the dimension of Hz. A unit whose 0 is not 0 of the SI unit, as of degC and K, is refused where
-    that has no zero of its own, and a logarithmic one, which has no factor, everywhere.
-    """
-    import pint
-
-    registry = _registry()
-    try:
-        given, own = (
-            registry.parse_units(each.replace("·", "*")) for each in (unit, dimension.unit)
-        )
-        factor, base = registry.get_base_units(given)
-        _, expected = registry.get_base_units(own)
-        zero, start = (
-            Decimal(str(registry.Quantity(Decimal(0), each).to_base_units().magnitude))
-            for each in (given, own)
-        )
-    except pint.UndefinedUnitError as error:
-        raise _refusal(text, dimension, f"has the unknown unit {unit}") from error
-    except TypeError as error:  # of Decimal, for a logarithm
-        raise _refusal(text, dimension, f"is not {dimension.name}") from error
-    except (pint.PintError, ArithmeticError, AttributeError, ValueError) as error:
-        raise _refusal(text, dimension, f"has the invalid unit {unit}") from error
-    if base != expected or (zero and not start):
-        raise _refusal(text, dimension, f"is not {dimension.name}")
-    return Decimal(str(factor)), zero - start
-
-
-@cache
-def _registry() -> "pint.UnitRegistry[Decimal]":
-    """Pint's units with decimal factors, so that 12 in is 0.3048 m and not 0.30479999999999996.
-
-    Made for the first unit that is not common, since it takes a tenth of a second.
-    """
-    import pint
-
-    return pint.UnitRegistry(non_int_type=Decimal)
-
-
-def _to_float(value: float | str | Decimal, dimension: Dimension) -> float:
-    """The nearest double; raises InputError for an integer that is too large."""
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise _refusal(value, dimension, "is not a finite number") from error
-
-
-def _refusal(value: object, dimension: Dimension, why: str) -> InputError:
-    """The error for a value, with what to write instead."""
-    text = shown(value)
-    text = text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
-    bare = f"a bare number in {dimension.unit}" if dimension.unit else "a bare number"
-    return InputError(f"{text} {why}; write {bare}, or for example {dimension.example}")
-
-
-def shown(value: object) -> str:
-    """A value as it is written in a file."""
-    if value is None:
-        return "nothing"
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+    pass
 
 
 class Section(BaseModel):
@@ -482,76 +316,6 @@ def _section_at(root: type[Section], path: KeyPath, document: Document) -> type[
                 kind = section_by_kind(get_args(kind), document.value(path[:number]))
     section: type[Section] = kind
     return section
-
-
-# More is a typing error.
-MAX_FREQUENCIES = 2000
-
-
-def parse_point(text: str, *, what: str) -> tuple[float, float]:
-    """Position [m] from `X,Y`; what: the option, for the error."""
-    parts = text.split(",")
-    try:
-        x, y = (float(part) for part in parts)
-    except ValueError:
-        raise InputError(
-            f"{what} must be X,Y in metres without a unit, such as {what} 0.10,0.08, got {text!r}"
-        ) from None
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InputError(f"{what}: both coordinates must be finite, got {text!r}")
-    return x, y
-
-
-def in_metres(x: float, y: float, *, length: float, width: float) -> str:
-    """Remedy for a place off the plate that would be on it in cm or mm, else "".
-
-    length, width [m]: of the plate. Coordinates below 1 are not taken for another unit.
-    """
-    for unit, count in (("cm", 100), ("mm", 1000)):
-        sides = ((x, length), (y, width))
-        if all(at == 0 or 1 <= at <= count * side for at, side in sides):
-            return (
-                f"; positions are in metres: for {x:g} {unit}, {y:g} {unit} give "
-                f"{x / count:g},{y / count:g}"
-            )
-    return ""
-
-
-def parse_pair(text: str, *, what: str) -> tuple[int, int]:
-    """Two counts from `12x9`."""
-    match = re.fullmatch(r"\s*(\d{1,6})\s*[x×]\s*(\d{1,6})\s*", text)
-    if match is None:
-        raise InputError(f"{what} must be two numbers such as 12x9, got {text!r}")
-    return int(match[1]), int(match[2])
-
-
-def parse_frequencies(text: str) -> "FloatArray":
-    """Frequencies (f,) [Hz] from `LO:HI:STEP`, both ends included, or from a list `60,110,250`.
-
-    Raises InputError for anything else, and for a frequency given twice.
-    """
-    import numpy as np  # which other commands do without
-
-    try:
-        if ":" in text:
-            low, high, step = (float(part) for part in text.split(":"))
-            count = int((high - low) / step + 1e-9) + 1
-            if not (0 < low <= high and step > 0 and count <= MAX_FREQUENCIES):
-                raise ValueError
-            return np.asarray(low + step * np.arange(count))
-        values = np.array([float(part) for part in text.split(",")])
-    except (ValueError, OverflowError, ZeroDivisionError):
-        raise InputError(
-            f"--frequencies must be LO:HI:STEP in Hz with LO above zero and at most HI, such as "
-            f"60:320:10, and at most {MAX_FREQUENCIES} frequencies, got {text!r}"
-        ) from None
-    distinct, counts = np.unique(values, return_counts=True)
-    if len(distinct) < len(values):
-        raise InputError(
-            f"--frequencies must be distinct, got {distinct[counts.argmax()]:g} Hz twice in "
-            f"{text[:40]!r}"
-        )
-    return values
 
 
 Point: TypeAlias = tuple[float, float]

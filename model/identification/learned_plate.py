@@ -26,7 +26,8 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.files.array_file import UNREADABLE, begins_with, read_arrays, write_arrays
+from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.files.output_paths import begins_with
 from model.identification.forward import ForwardModel, Sensor
 from model.identification.identify import solved_for
 from model.identification.parameters import KINDS, MODE_SHIFTS, Values, rig_with, space_of

@@ -19,7 +19,8 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict, Field, Strict
 
-from model.config.fields import (
+from model.config.fields import ByKind, Quantity, Section
+from model.config.units import (
     DAMPING,
     FORCE_FACTOR,
     FREQUENCY,
@@ -31,9 +32,6 @@ from model.config.fields import (
     RESISTANCE,
     STIFFNESS,
     VOLTAGE,
-    ByKind,
-    Quantity,
-    Section,
 )
 from model.finger import THRESHOLDS
 from model.structure.attachments import Era, Gain, damping_from_ratio

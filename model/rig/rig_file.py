@@ -11,16 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from model.config.document import Document, KeyPath, key_name, parse_document, read_document
-from model.config.fields import (
-    LENGTH,
-    RATIO,
-    Quantity,
-    Section,
-    Validation,
-    quantity,
-    section_by_kind,
-)
+from model.config.fields import Quantity, Section, Validation, section_by_kind
 from model.config.file_kinds import check_is_rig
+from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError, expect_path, shown
 from model.fem import MITC4, Mesh, element_of
 from model.rig.actuator_keys import KINDS, stiff_mount_problems

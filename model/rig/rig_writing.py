@@ -16,9 +16,11 @@ from pydantic_core import to_jsonable_python
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from model.config.document import Document, KeyPath, data_text, edited_text, parse_document
-from model.config.fields import LENGTH, Section, Validation, quantity
+from model.config.fields import Section, Validation
+from model.config.units import LENGTH, quantity
 from model.errors import InputError, expect, expect_path
-from model.files.array_file import check_ending, whole_or_nothing
+from model.files.array_file import whole_or_nothing
+from model.files.output_paths import check_ending
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of

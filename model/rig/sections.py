@@ -22,7 +22,8 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from model.config.document import KeyPath
-from model.config.fields import (
+from model.config.fields import Quantity, Section
+from model.config.units import (
     DAMPING,
     DENSITY,
     LENGTH,
@@ -36,8 +37,6 @@ from model.config.fields import (
     STIFFNESS,
     TIME,
     Dimension,
-    Quantity,
-    Section,
 )
 from model.finger import DEFAULT_THRESHOLD, THRESHOLDS
 from model.rig.actuator_keys import (

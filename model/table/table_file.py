@@ -34,14 +34,8 @@ from model.arrays import FloatArray
 from model.caching import NUMERICS_VERSION, cache_folder, code_version
 from model.drive_modes import checked_mode
 from model.errors import InputError, expect, expect_path
-from model.files.array_file import (
-    UNREADABLE,
-    Arrays,
-    begins_with,
-    digest_of,
-    read_arrays,
-    write_arrays,
-)
+from model.files.array_file import UNREADABLE, Arrays, digest_of, read_arrays, write_arrays
+from model.files.output_paths import begins_with
 from model.finger import Grid, check_has_threshold
 from model.processes import Progress, on_processes, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate

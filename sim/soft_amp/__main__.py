@@ -20,16 +20,10 @@ from types import FrameType
 
 from drivers.errors import LinkError
 from model.errors import InputError
-from sim.soft_amp.engine import (
-    Counters,
-    SoftAmplifierSettings,
-    counters_in,
-    library,
-    start_engine,
-    take_over,
-)
+from sim.soft_amp.engine import Counters, counters_in, library, start_engine, take_over
 from sim.soft_amp.jack import NoSound
 from sim.soft_amp.output import Output, open_output
+from sim.soft_amp.settings import SoftAmplifierSettings
 
 REFUSED, LOST, OTHER_RATE = 2, 75, 76
 _DEFAULT_RATE = 48_000  # Hz; until the device says its own

@@ -11,9 +11,10 @@ from typing import Any, TypeAlias
 from drivers.errors import LinkError
 from model.errors import InputError
 from registry.plugins import did_you_mean
-from sim.soft_amp.engine import JackCalls, SoftAmplifierSettings, address_of, check_rate
+from sim.soft_amp.engine import JackCalls, address_of
 from sim.soft_amp.engine import library as engine
 from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, NoSound, jack_name, libjack
+from sim.soft_amp.settings import SoftAmplifierSettings, check_rate
 
 CLIENT = "era-soft-amp"
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from model.errors import InputError
-from sim.soft_amp.engine import Law, Protocol, SoftAmplifierSettings
+from sim.soft_amp.settings import Law, Protocol, SoftAmplifierSettings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from sim.soft_amp.engine import SoftAmplifierLine
+    from sim.soft_amp.settings import SoftAmplifierLine
 
 
 def port_option(served: str) -> Any:
@@ -143,7 +143,7 @@ def _serial_number(given: str | None, *, device: str) -> str:
 def _place(
     *, serial: bool, tcp: int | None, modbus_tcp: int | None, link: Path | None
 ) -> "AbstractContextManager[SoftAmplifierLine]":
-    from sim.soft_amp.engine import tcp_place, terminal_place
+    from sim.soft_amp.settings import tcp_place, terminal_place
 
     ports = {
         "--serial": 0 if serial else None,

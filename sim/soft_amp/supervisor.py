@@ -19,13 +19,8 @@ from typing import Any
 from drivers.errors import LinkError
 from model.errors import InputError
 from sim.soft_amp.__main__ import LOST, OTHER_RATE
-from sim.soft_amp.engine import (
-    Counters,
-    SoftAmplifierLine,
-    SoftAmplifierSettings,
-    counters_in,
-    new_file,
-)
+from sim.soft_amp.engine import Counters, counters_in, new_file
+from sim.soft_amp.settings import SoftAmplifierLine, SoftAmplifierSettings
 
 STALL = 0.1
 """Time [s] without a rendered block, after which the process that plays is killed."""

@@ -29,8 +29,8 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import STATES
 from era_haptics.lab.cli import app
 from era_haptics.lab.witness.capture import read_capture
+from era_haptics.lab.witness.relay import parse_endpoint, relays
 from era_haptics.lab.witness.witness import Witness
-from era_haptics.lab.witness.witness_cli import parse_endpoint, relays
 from firmware_machine import play
 from model.errors import InputError
 from model.rig.rig import Rig
@@ -458,7 +458,7 @@ def test_witness_without_frames_has_checked_nothing(monkeypatch: pytest.MonkeyPa
         os.kill(os.getpid(), signal.SIGTERM)
         yield ["serial:///dev/pts/9"]
 
-    monkeypatch.setattr("era_haptics.lab.witness.witness_cli.relays", ended_at_once)
+    monkeypatch.setattr("era_haptics.lab.witness.relay.relays", ended_at_once)
     result = CliRunner().invoke(app, ["witness", URL])
     assert isinstance(result.exception, InputError | CommandError)
     assert "nothing was checked" in str(result.exception)

@@ -41,7 +41,7 @@ from drivers.opening import Lines
 from drivers.protocol.records import Values
 from drivers.protocol.sets import LayerSet, is_vibrating, unpack_layers
 from era_haptics.lab.witness.capture import RuleViolation
-from era_haptics.lab.witness.witness_cli import parse_endpoint
+from era_haptics.lab.witness.relay import parse_endpoint
 from model.answer.answer_report import Timing
 from model.arrays import ComplexArray, FloatArray
 from model.rig.rig import Rig

@@ -45,8 +45,8 @@ from era_haptics.lab.witness.host_rules import (
     AmplifierSession,
     HostRules,
 )
+from era_haptics.lab.witness.relay import parse_endpoint
 from era_haptics.lab.witness.witness import RECOVERY, Witness
-from era_haptics.lab.witness.witness_cli import parse_endpoint
 from real_wires import FarSide, after_each
 from registry import threads
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier

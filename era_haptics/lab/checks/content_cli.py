@@ -9,7 +9,7 @@ import typer
 
 from controller.cli.daemon_cli import Socket, connected
 from model.commands.options import JsonOption, QuietOption, print_report
-from model.config.fields import parse_point
+from model.config.units import parse_point
 from model.errors import InputError
 from model.quantities import counted, percent
 
@@ -103,7 +103,7 @@ def _simulate(
     from scipy.signal import resample
 
     from era_haptics.lab.checks.content_check import play_content
-    from model.files.array_file import begins_with, check_ending, check_place, check_replaceable
+    from model.files.output_paths import begins_with, check_ending, check_place, check_replaceable
     from model.finger import STRONG_DB_SL, fingertip_weights
     from model.table.table_file import load_table
 
@@ -183,7 +183,7 @@ def check(
     from era_haptics.lab.checks.content_check import check_content, least_promise
     from model.answer.answer import MIN_CONTRAST_DB
     from model.commands.options import Stopwatch
-    from model.files.array_file import check_picture
+    from model.files.output_paths import check_picture
     from model.table.table_file import load_table
 
     if picture is not None:

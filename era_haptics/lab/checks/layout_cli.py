@@ -43,7 +43,7 @@ def check(
     from era_haptics.lab.checks.layout_check import check_layout
     from era_haptics.lab.checks.layout_picture import check_together, close_pairs, matrix_of
     from model.commands.options import progress_bar
-    from model.files.array_file import check_picture_name
+    from model.files.output_paths import check_picture_name
     from model.table.table_file import load_table
 
     if picture is not None:

@@ -18,10 +18,10 @@ from model.commands.options import (
     print_report,
     progress_bar,
 )
-from model.config.fields import LENGTH, STIFFNESS, Dimension, quantity
+from model.config.units import LENGTH, STIFFNESS, Dimension, quantity
 from model.errors import InputError
-from model.finger import MAX_CONTENTS
 from model.quantities import counted
+from registry.limits import MAX_CONTENTS
 
 design_app = typer.Typer()
 

@@ -22,7 +22,6 @@ from pydantic import ConfigDict, Field, Strict
 from model.arrays import FloatArray, IntArray, best_of, least_gap
 from model.config.document import read_bytes, read_document
 from model.config.fields import (
-    LENGTH,
     Point,
     PointSection,
     Polygon,
@@ -35,14 +34,15 @@ from model.config.fields import (
     Validation,
     box_of,
 )
+from model.config.units import LENGTH
 from model.errors import InputError
-from model.finger import MAX_CONTACTS, MAX_CONTENTS
 from model.rig.actuator_keys import Identifier
 from model.rig.rig import Rig, named_layouts
 from model.structure.attachments import rigid_body_frequencies, static_loads
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 from model.table.table import default_drive_frequencies
+from registry.limits import MAX_CONTACTS, MAX_CONTENTS
 
 EDGE, ANYWHERE = "edge", "anywhere"
 """Names of the areas that need no file."""

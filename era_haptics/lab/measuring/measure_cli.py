@@ -115,8 +115,8 @@ def measure(
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
     from era_haptics.lab.measuring.sound_card import Desk
     from model.calibration.responses import are_places, read_sensors
-    from model.config.fields import parse_frequencies
-    from model.files.array_file import check_ending, check_place
+    from model.config.units import parse_frequencies
+    from model.files.output_paths import check_ending, check_place
     from model.rig.rig_file import load_rig
 
     check_place(output, example="measured.uff")
@@ -269,7 +269,7 @@ def impedance(
         write_impedance,
     )
     from era_haptics.lab.measuring.sound_card import open_card
-    from model.files.array_file import check_ending, check_place
+    from model.files.output_paths import check_ending, check_place
 
     circuits = {
         name: fitted(*read_impedance(path), what=f"--{name} {path}")

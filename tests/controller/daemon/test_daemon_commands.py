@@ -16,8 +16,8 @@ from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import TOPICS
 from controller.cli.commands import app
-from controller.cli.daemon_cli import show_event, show_status
 from controller.cli.main import run
+from controller.cli.status_text import show_event, show_status
 from controller.daemon.children import gateway_options
 from controller.daemon.daemon import run_daemon
 from controller.effects.layout import default_effects

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from controller.api.methods import InputsEvent
-from controller.cli.daemon_cli import show_status
+from controller.cli.status_text import show_status
 from controller.daemon.config import TouchInput
 from controller.daemon.layouts import TouchInputs
 from controller.gateway.metrics import exposition

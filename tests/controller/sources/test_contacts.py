@@ -23,8 +23,8 @@ from controller.sources.touch import (
     TouchFrame,
     turned,
 )
-from model.finger import MAX_CONTACTS
 from model.structure.plate import Material, Plate
+from registry.limits import MAX_CONTACTS
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
 

@@ -16,7 +16,8 @@ from ruamel.yaml.comments import CommentedMap
 from model.config import document as reading
 from model.config import fields
 from model.config.document import ConfigError, data_text, edited_text, parse_document, read_document
-from model.config.fields import (
+from model.config.fields import Quantity, Section, Validation
+from model.config.units import (
     DAMPING,
     DENSITY,
     FREQUENCY,
@@ -27,9 +28,6 @@ from model.config.fields import (
     STIFFNESS,
     TEMPERATURE,
     Dimension,
-    Quantity,
-    Section,
-    Validation,
     in_metres,
     parse_frequencies,
     quantity,

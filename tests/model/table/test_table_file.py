@@ -20,7 +20,8 @@ from pydantic.fields import FieldInfo
 import rig_page
 from key_tables import quantities
 from model import caching
-from model.config.fields import Section, parse_frequencies
+from model.config.fields import Section
+from model.config.units import parse_frequencies
 from model.errors import InputError
 from model.files.array_file import digest_of
 from model.finger import Grid

@@ -36,18 +36,20 @@ from model.errors import InputError
 from sim.soft_amp.engine import (
     Counters,
     JackCalls,
-    Law,
-    Protocol,
-    SoftAmplifierLine,
-    SoftAmplifierSettings,
     compile_engine,
     library,
     start_engine,
     take_over,
-    terminal_place,
 )
 from sim.soft_amp.jack import NoSound
 from sim.soft_amp.output import PortAudioOutput, open_output, portaudio_stream
+from sim.soft_amp.settings import (
+    Law,
+    Protocol,
+    SoftAmplifierLine,
+    SoftAmplifierSettings,
+    terminal_place,
+)
 from sound_cards import BLOCK as SOUND_CARDS_BLOCK
 from sound_cards import RATE as SOUND_CARDS_RATE
 from sound_cards import SoftAmp, capture_on, host, jack_server

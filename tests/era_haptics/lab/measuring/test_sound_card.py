@@ -46,8 +46,8 @@ from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration
 from model.structure.attachments import PointLoad, fingertip_loads
-from sim.soft_amp.engine import Protocol, SoftAmplifierSettings
 from sim.soft_amp.output import open_output
+from sim.soft_amp.settings import Protocol, SoftAmplifierSettings
 from sound_cards import DeskCard, JackServer, capture_on, jack_server
 from typed_page import ERA
 

@@ -229,13 +229,13 @@ def test_unresolved_name_does_not_delay_the_end_of_the_program() -> None:
     """Even if the name server does not reply."""
     program = """
 import asyncio, socket, threading
-from drivers.ports import tcp
+from drivers import ports
 from drivers.errors import LinkError
 
 socket.getaddrinfo = lambda *args, **kwargs: threading.Event().wait()
-tcp._CONNECT_TIMEOUT = 0.05
+ports._CONNECT_TIMEOUT = 0.05
 try:
-    asyncio.run(tcp.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
+    asyncio.run(ports.open_connection("amplifier.test", 502, lambda _: None, lambda _: None))
 except LinkError as problem:
     print(problem)
 """

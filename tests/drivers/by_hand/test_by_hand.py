@@ -26,7 +26,7 @@ from drivers.protocol.definition import FEATURES, READINGS, STATUS_FLAGS
 from drivers.trace import tracing
 from drivers.urls import with_address
 from era_haptics.lab.cli import app as lab_app
-from era_haptics.lab.conformance.contract import Report
+from era_haptics.lab.conformance.check import ConformanceReport
 from model.rig.rig_file import example_rig_path
 from real_wires import WORD_WIRES, WordWiresFarSide
 from registry.limits import GuardLimits
@@ -390,13 +390,13 @@ async def test_conformance_that_is_ended_leaves_it_silent_and_says_how(
     """By Ctrl-C, or a line that was lost and is there again: stopped, cleared, its state told."""
     async with WORD_WIRES["serial"](1) as far:
 
-        async def judged(url: str, *, drives: bool, **others: Any) -> Report:
+        async def judged(url: str, *, drives: bool, **others: Any) -> ConformanceReport:
             if drives:
                 far.amplifiers[1].handle(
                     "Arm", {"session": 5, "watchdog": 2000, "shift": 0}, monotonic()
                 )
                 raise end
-            return Report(url, 0.0, (), 1)
+            return ConformanceReport(url, 0.0, (), 1)
 
         monkeypatch.setattr("era_haptics.lab.conformance.contract.judge", judged)
         result = await asyncio.to_thread(invoke, "conformance", far.url(1), "--write")

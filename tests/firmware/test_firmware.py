@@ -478,8 +478,8 @@ def check_samples(pair: Pair, draw: random.Random, wait: int) -> None:
 
 
 SKIPPED = {"sensors", "steps_as_stated", "readings", "measured", "limited"}
-OF_WIRE = {"rtu": {"events", "clock_rate"}, "tcp": {"events"}}
-"""Skipped too: on RTU two silent intervals of 1.75 ms make exchanges too long for two."""
+OF_WIRE = {"rtu": {"events"}, "tcp": {"events"}}
+"""Skipped, too, by the wire."""
 
 
 @pytest.mark.parametrize("kind", shortly(FIRMWARE_MACHINE_LINES, ["can", "rtu"]))

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,7 +43,8 @@ def test_workers_end_with_a_program_that_is_killed() -> None:
         "from model.processes import on_processes; from test_processes import *\n"
         "if __name__ == '__main__': list(on_processes(2, die_with_the_program, 1, {0: 1}))"
     )
-    environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}  # noqa: PTH120
+    folders = (Path(__file__).parent, Path(__file__).parents[1] / "support")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, env=environment, timeout=60
     )

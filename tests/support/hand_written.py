@@ -54,7 +54,7 @@ def identity(*, serial: str = "7") -> bytes:
     return struct.pack("<H", 1 << 4) + texts
 
 
-def status(
+def status_words(
     state: int = ENABLED,
     *,
     fault: int = 0,
@@ -245,12 +245,12 @@ class Talk:
             raw_frame(kind, identity(), sequence=self.sequence, address=address, version=0)
         )
         self.exchange(GET_CAPS, (), capabilities(), address=address)
-        return self.exchange(GET_STATUS, (), status(state, latch=latch), address=address)
+        return self.exchange(GET_STATUS, (), status_words(state, latch=latch), address=address)
 
     def armed(self, *, address: int = 1) -> "Talk":
         """Let it be identified and armed: session 9, watchdog 250 ms."""
         self.identified(address=address)
-        return self.exchange(ARM, (9, 250, 0), status(), address=address)
+        return self.exchange(ARM, (9, 250, 0), status_words(), address=address)
 
     def staged(self, token: int, *layers: Sequence[int], address: int = 1) -> "Talk":
         """Let a set be staged."""
@@ -258,7 +258,7 @@ class Talk:
 
     def committed(self, token: int, *, address: int = 1, **status: Any) -> "Talk":
         """Let a set be committed; status: as in the reply."""
-        reply = status(token=token, **status)
+        reply = status_words(token=token, **status)
         return self.exchange(COMMIT, (9, token, 0), reply, address=address)
 
     def playing(self, token: int = 5, level: float = 0.5) -> "Talk":
@@ -276,7 +276,7 @@ class Talk:
     def says(self, state: int = ENABLED, *, kind: int = PING, **status: Any) -> "Talk":
         """Let it be asked, by Ping unless told otherwise, and say how it is."""
         words = (9, 0) if kind == PING else ()
-        return self.exchange(kind, words, status(state, **status))
+        return self.exchange(kind, words, status_words(state, **status))
 
 
 Broken: TypeAlias = dict[str, tuple[str, Callable[[], Talk]]]

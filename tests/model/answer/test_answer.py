@@ -299,7 +299,7 @@ TWENTY = [(0.025 + 0.06 * x, 0.03 + 0.055 * y) for x in range(5) for y in range(
         (lambda n: {"name": "abcde"[n % 5], "priority": n % 3}, 62),
         (lambda n: {"max_foreign_db_sl": -50.0, "is_protected": n % 2 == 0}, 43),
         (lambda n: {"level_db_sl": 60.0, "min_contrast_db": 12.0}, 25),
-        (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 25),
+        (lambda n: {"modulation_hz": 20.0, "band_hz": (40.0, 300.0 + n)}, 31),  # and side bands
     ],
 )
 def test_twenty_fingers_take_few_searches(given, most, monkeypatch):

@@ -74,7 +74,9 @@ def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch
     """A conversation written by hand breaks no rule, with a word more of the amplifier or not."""
     status = hand.status_words
     words = [] if age == "older" else [*_UNSTATED, WORD]
-    monkeypatch.setattr(hand, "status", lambda *given, **more: [*status(*given, **more), *words])
+    monkeypatch.setattr(
+        hand, "status_words", lambda *given, **more: [*status(*given, **more), *words]
+    )
     assert Talk().armed().fed(2).playing().says(**HALF).found == []
 
 

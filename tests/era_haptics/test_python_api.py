@@ -51,9 +51,9 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "python-api.md"
     [
         "Raises InputError for a missing, damaged or foreign file, with",  # errors of a function
         "slew [1/s]: highest rise of a level;",  # units of a class's fields
-        "peak acceleration [m/s²] at raster points x (nx,), y (ny,) [m]",  # shapes
+        "Frequencies (f,) [Hz] and peak acceleration at points (p, 2) [m]",  # shapes
         "- `disarm() -> None`: Fall silent, then switch the high voltage off.",  # a method
-        "- `is_reached: bool`: Whether all vibrations have their levels",  # a property
+        "- `is_reached: bool`: Whether all vibrations have their nominal levels",  # a property
         "- `async events() -> AsyncIterator[Notification]`: Yield notifications",  # a coroutine
         "`stop(*, client: str | None=None) -> StopResult`",  # a method of the stub
         "`SolvedPlate(rig: Rig, *, seed: int | None=None)`: A rig's plate",  # a constructor

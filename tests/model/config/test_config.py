@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ruamel.yaml.comments import CommentedMap
 
 from model.config import document as reading
-from model.config import fields
+from model.config import units
 from model.config.document import ConfigError, data_text, edited_text, parse_document, read_document
 from model.config.fields import Quantity, Section, Validation
 from model.config.units import (
@@ -289,7 +289,7 @@ def test_quantity_raises_input_error_only(text: str) -> None:
 def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
     """A rig of bare numbers does not pay for loading the unit library."""
     script = (
-        "import sys; from model.config.fields import LENGTH, quantity; "
+        "import sys; from model.config.units import LENGTH, quantity; "
         "quantity('0.3', LENGTH); quantity(2, LENGTH); print('pint' in sys.modules)"
     )
     done = subprocess.run(
@@ -302,7 +302,7 @@ def test_quantity_of_bare_numbers_does_not_load_pint() -> None:
     ("dimension", "unit"),
     [
         (each, unit)
-        for each in vars(fields).values()
+        for each in vars(units).values()
         if isinstance(each, Dimension)
         for unit in each.factors
         if unit != each.unit
@@ -331,10 +331,10 @@ def test_temperature_counts_from_the_zero_of_its_unit(text: str, celsius: float)
         ("5 degC", Dimension("a temperature difference", "K", "5 K")),
         ("9 degF", Dimension("a temperature difference", "K", "5 K")),
         ("3 degC", LENGTH),
-        ("30 dBm", fields.POWER),
-        ("3 dB", fields.RATIO),
-        ("3 Np", fields.LEVEL),
-        ("2 %", fields.LEVEL),
+        ("30 dBm", units.POWER),
+        ("3 dB", units.RATIO),
+        ("3 Np", units.LEVEL),
+        ("2 %", units.LEVEL),
         ("20 dB", TEMPERATURE),
     ],
 )

@@ -359,7 +359,7 @@ def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:
 
 
 @pytest.fixture(scope="module")
-def known() -> PlateEstimate:
+def drawn() -> PlateEstimate:
     """The paper's plate by its drawing."""
     rig = load_rig(example_rig_path())
     return PlateEstimate.of_rig(rig, [Sensor(era.name, era.name) for era in rig.eras])
@@ -378,53 +378,53 @@ def turned(pattern: SettledPattern, phase: float, *, has_phase: bool) -> Settled
     return replace(pattern, values=np.exp(1j * phase) * pattern.values, has_phase=has_phase)
 
 
-def state_after(known: PlateEstimate, pattern: SettledPattern) -> FloatArray:
+def state_after(drawn: PlateEstimate, pattern: SettledPattern) -> FloatArray:
     """Parameters after the pattern."""
-    live = LivePlate(known)
+    live = LivePlate(drawn)
     live.take(pattern)
     return live.known.state.x
 
 
 def test_update_does_not_depend_on_a_phase_that_is_unknown(
-    known: PlateEstimate, pattern: SettledPattern
+    drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """A turn of all readings together changes nothing; where their phase counts, it does."""
-    before = state_after(known, turned(pattern, 0.0, has_phase=False))
-    after = state_after(known, turned(pattern, 2.0, has_phase=False))
+    before = state_after(drawn, turned(pattern, 0.0, has_phase=False))
+    after = state_after(drawn, turned(pattern, 2.0, has_phase=False))
     np.testing.assert_allclose(after, before, atol=1e-9)
-    counted = state_after(known, turned(pattern, 2.0, has_phase=True))
+    counted = state_after(drawn, turned(pattern, 2.0, has_phase=True))
     assert np.abs(counted - before).max() > 0.1
 
 
 def test_update_within_bounds_explains_a_pattern(
-    known: PlateEstimate, pattern: SettledPattern
+    drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """Of a plate that was not measured, whose ERAs at corners can be off inwards alone.
 
     A hundred parameters are free for eight numbers: at the most likely state these are explained to
     their errors, by no more changes than eight directions of the prior are likely to make.
     """
-    model = PatternModel.of(known.model, pattern, 0.5)
-    found = update(known.state, [model], evaluations=20)
+    model = PatternModel.of(drawn.model, pattern, 0.5)
+    found = update(drawn.state, [model], evaluations=20)
     predicted, _ = model.predicted(found.state.x, found.fingers)
     residuals = (predicted - pattern.numbers) / model.std
     assert residuals @ residuals < found.count
     assert found.cost < 3 * found.count
-    space = known.model.space
+    space = drawn.model.space
     assert (found.state.x >= space.lower).all()
     assert (found.state.x <= space.upper).all()
 
 
 def test_numbers_change_as_their_derivatives_say(
-    known: PlateEstimate, pattern: SettledPattern
+    drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
     """Central differences of the numbers without a phase; none lies along a common turn."""
     without = turned(pattern, 1.0, has_phase=False)
-    model = PatternModel.of(known.model, without, 0.5)
-    x, fingers = np.zeros(known.model.space.size), np.zeros(4 * len(pattern.fingers))
+    model = PatternModel.of(drawn.model, without, 0.5)
+    x, fingers = np.zeros(drawn.model.space.size), np.zeros(4 * len(pattern.fingers))
     _, J = model.predicted(x, fingers)
     step = 1e-5
-    for number in known.model.space.indices("stiffness"):
+    for number in drawn.model.space.indices("stiffness"):
         moved = x.copy()
         moved[number] = step
         ahead, _ = model.predicted(moved, fingers)

@@ -256,9 +256,9 @@ class Talk:
         """Let a set be staged."""
         return self.exchange(SET, part(token, *layers), taken(token), address=address)
 
-    def committed(self, token: int, *, address: int = 1, **status: Any) -> "Talk":
-        """Let a set be committed; status: as in the reply."""
-        reply = status(token=token, **status)
+    def committed(self, token: int, *, address: int = 1, **fields: Any) -> "Talk":
+        """Let a set be committed; fields: of the status in the reply."""
+        reply = status(token=token, **fields)
         return self.exchange(COMMIT, (9, token, 0), reply, address=address)
 
     def playing(self, token: int = 5, level: float = 0.5) -> "Talk":
@@ -273,10 +273,10 @@ class Talk:
             self.rest(0.2).says()
         return self
 
-    def says(self, state: int = ENABLED, *, kind: int = PING, **status: Any) -> "Talk":
+    def says(self, state: int = ENABLED, *, kind: int = PING, **fields: Any) -> "Talk":
         """Let it be asked, by Ping unless told otherwise, and say how it is."""
         words = (9, 0) if kind == PING else ()
-        return self.exchange(kind, words, status(state, **status))
+        return self.exchange(kind, words, status(state, **fields))
 
 
 Broken: TypeAlias = dict[str, tuple[str, Callable[[], Talk]]]

@@ -72,11 +72,9 @@ def test_conformance_takes_another_edition(kind: str, age: str) -> None:
 
 def test_witness_takes_another_edition(age: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A conversation written by hand breaks no rule, with a word more of the amplifier or not."""
-    status = hand.status_words
+    status = hand.status
     words = [] if age == "older" else [*_UNSTATED, WORD]
-    monkeypatch.setattr(
-        hand, "status_words", lambda *given, **more: [*status(*given, **more), *words]
-    )
+    monkeypatch.setattr(hand, "status", lambda *given, **more: [*status(*given, **more), *words])
     assert Talk().armed().fed(2).playing().says(**HALF).found == []
 
 

@@ -278,7 +278,7 @@ NAMES = [
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""
-SHORT = "bring-your-own-method"
+SHORT = "add-a-material"
 """Executed by every run of the tests; the others by `make test-long`, and when they change."""
 
 

@@ -54,7 +54,7 @@ def identity(*, serial: str = "7") -> bytes:
     return struct.pack("<H", 1 << 4) + texts
 
 
-def status_words(
+def status(
     state: int = ENABLED,
     *,
     fault: int = 0,
@@ -245,20 +245,20 @@ class Talk:
             raw_frame(kind, identity(), sequence=self.sequence, address=address, version=0)
         )
         self.exchange(GET_CAPS, (), capabilities(), address=address)
-        return self.exchange(GET_STATUS, (), status_words(state, latch=latch), address=address)
+        return self.exchange(GET_STATUS, (), status(state, latch=latch), address=address)
 
     def armed(self, *, address: int = 1) -> "Talk":
         """Let it be identified and armed: session 9, watchdog 250 ms."""
         self.identified(address=address)
-        return self.exchange(ARM, (9, 250, 0), status_words(), address=address)
+        return self.exchange(ARM, (9, 250, 0), status(), address=address)
 
     def staged(self, token: int, *layers: Sequence[int], address: int = 1) -> "Talk":
         """Let a set be staged."""
         return self.exchange(SET, part(token, *layers), taken(token), address=address)
 
-    def committed(self, token: int, *, address: int = 1, **status: Any) -> "Talk":
-        """Let a set be committed; status: as in the reply."""
-        reply = status_words(token=token, **status)
+    def committed(self, token: int, *, address: int = 1, **fields: Any) -> "Talk":
+        """Let a set be committed; fields: of the status in the reply."""
+        reply = status(token=token, **fields)
         return self.exchange(COMMIT, (9, token, 0), reply, address=address)
 
     def playing(self, token: int = 5, level: float = 0.5) -> "Talk":
@@ -273,10 +273,10 @@ class Talk:
             self.rest(0.2).says()
         return self
 
-    def says(self, state: int = ENABLED, *, kind: int = PING, **status: Any) -> "Talk":
+    def says(self, state: int = ENABLED, *, kind: int = PING, **fields: Any) -> "Talk":
         """Let it be asked, by Ping unless told otherwise, and say how it is."""
         words = (9, 0) if kind == PING else ()
-        return self.exchange(kind, words, status_words(state, **status))
+        return self.exchange(kind, words, status(state, **fields))
 
 
 Broken: TypeAlias = dict[str, tuple[str, Callable[[], Talk]]]

@@ -29,7 +29,7 @@ BROKEN: Broken = {
     ),
     "another_session_feeds": (
         "session",
-        lambda: Talk().armed().exchange(hand.PING, (8, 0), hand.status_words()),
+        lambda: Talk().armed().exchange(hand.PING, (8, 0), hand.status()),
     ),
     "reports_another_set": ("token", lambda: Talk().armed().playing().says(**HALF | {"token": 4})),
     "reports_another_set_of_a_layer": (
@@ -52,14 +52,14 @@ BROKEN: Broken = {
     ),
     "stop_without_a_latch": (
         "latched",
-        lambda: Talk().armed().exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED)),
+        lambda: Talk().armed().exchange(hand.STOP, (5,), hand.status(hand.STOPPED)),
     ),
     "latch_that_changes_by_itself": ("latched", lambda: Talk().armed().says(latch=1)),
     "switched_on_by_itself": ("state", lambda: Talk().armed().says(hand.SWITCHED_ON)),
     "fault_without_a_cause": ("state", lambda: Talk().armed().says(hand.FAULT, latch=1)),
     "address_set_while_armed": (
         "state",
-        lambda: Talk().armed().exchange(hand.SET_ADDRESS, (2, 1, 0x3700), hand.status_words()),
+        lambda: Talk().armed().exchange(hand.SET_ADDRESS, (2, 1, 0x3700), hand.status()),
     ),
     "another_level": (
         "plays",
@@ -130,7 +130,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .staged(5, LOUD)
-            .exchange(hand.COMMIT, (9, 5, 1000), hand.status_words(token=5))
+            .exchange(hand.COMMIT, (9, 5, 1000), hand.status(token=5))
             .rest(0.1)
             .says(token=5, levels=(5000, 0))
         ),
@@ -141,7 +141,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .staged(5, LOUD)
-            .exchange(hand.COMMIT, (9, 5, 100), hand.status_words(token=5))
+            .exchange(hand.COMMIT, (9, 5, 100), hand.status(token=5))
             .rest(0.2)
             .says(token=5, tokens=(5, 0, 0, 0))
         ),
@@ -226,7 +226,7 @@ BROKEN: Broken = {
     ),
     "reply_twice": (
         "credit",
-        lambda: Talk().armed().says().replies(hand.PING, hand.status_words()),
+        lambda: Talk().armed().says().replies(hand.PING, hand.status()),
     ),
     "no_reply": ("answer", lambda: Talk().armed().sends(hand.GET_STATUS).rest(0.04)),
     "watchdog_too_early": (
@@ -243,7 +243,7 @@ BROKEN: Broken = {
         lambda: (
             Talk()
             .armed()
-            .exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
             .rest(0.1)
             .says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=1)
         ),
@@ -253,9 +253,9 @@ BROKEN: Broken = {
         lambda: (
             Talk()
             .armed()
-            .exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
             .rest(0.1)
-            .exchange(hand.CLEAR, (7,), hand.status_words(hand.SWITCHED_OFF, latch=1))
+            .exchange(hand.CLEAR, (7,), hand.status(hand.SWITCHED_OFF, latch=1))
         ),
     ),
     "armed_in_a_fault": (
@@ -264,7 +264,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .says(hand.FAULT, fault=hand.ARC, latch=1)
-            .exchange(hand.ARM, (8, 250, 0), hand.status_words(latch=1))
+            .exchange(hand.ARM, (8, 250, 0), hand.status(latch=1))
         ),
     ),
     "without_a_ramp": (
@@ -305,7 +305,7 @@ BROKEN: Broken = {
             .armed()
             .playing(level=0.7)
             .staged(6, hand.layer(1, hand.tone(0, 150, 0.7)))
-            .exchange(hand.COMMIT, (9, 6, 0), hand.status_words(levels=(7000, 0), **ABOVE))
+            .exchange(hand.COMMIT, (9, 6, 0), hand.status(levels=(7000, 0), **ABOVE))
             .rest(0.03)
             .says(levels=(10000, 0), **ABOVE)
             .rest(0.11)
@@ -318,7 +318,7 @@ BROKEN: Broken = {
             Talk()
             .armed()
             .playing()
-            .exchange(hand.SILENCE, (9, 10), hand.status_words(token=5, levels=(5000, 0)))
+            .exchange(hand.SILENCE, (9, 10), hand.status(token=5, levels=(5000, 0)))
             .rest(0.02)
             .says(token=5, levels=(5000, 0))
         ),
@@ -350,7 +350,7 @@ BROKEN: Broken = {
             .numbered(77)
             .host_bytes(hand.frame(hand.PING, (9, 0), sequence=77), flipped=-3)
             .rest(0.001)
-            .replies(hand.PING, hand.status_words())
+            .replies(hand.PING, hand.status())
         ),
     ),
 }
@@ -431,7 +431,7 @@ HOST_VIOLATIONS_BROKEN: Broken = {
             .told("contacts", [1])
             .playing()
             .told("contacts", [])
-            .exchange(hand.SILENCE, (9, 100), hand.status_words(**HALF | {"tokens": (0,) * 4}))
+            .exchange(hand.SILENCE, (9, 100), hand.status(**HALF | {"tokens": (0,) * 4}))
         ),
     ),
     "touch_without_a_pattern": (
@@ -462,7 +462,7 @@ HOST_VIOLATIONS_BROKEN: Broken = {
             .told("operator_command", "stop")
             .rest(0.007)
             .says(kind=hand.GET_STATUS)
-            .exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
         ),
     ),
     "stop_not_sent": ("stop", lambda: Talk().armed().told("operator_command", "stop").rest(0.03)),
@@ -473,7 +473,7 @@ HOST_VIOLATIONS_BROKEN: Broken = {
             .armed()
             .playing()
             .exchange(
-                hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1, levels=(5000, 0), token=5)
+                hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, levels=(5000, 0), token=5)
             )
             .rest(0.15)
         ),
@@ -483,7 +483,7 @@ HOST_VIOLATIONS_BROKEN: Broken = {
         lambda: (
             Talk()
             .armed()
-            .exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+            .exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
             .rest(0.01)
             .says(hand.STOPPED, latch=1)
         ),
@@ -502,7 +502,7 @@ HOST_VIOLATIONS_BROKEN: Broken = {
     ),
     "armed_without_identification": (
         "identified",
-        lambda: Talk().told_of("opened").exchange(hand.ARM, (9, 250, 0), hand.status_words()),
+        lambda: Talk().told_of("opened").exchange(hand.ARM, (9, 250, 0), hand.status()),
     ),
     "request_before_a_reply": (
         "credit",
@@ -514,9 +514,9 @@ HOST_VIOLATIONS_BROKEN: Broken = {
             .rest(0.005)
             .sends(hand.GET_STATUS, address=2)
             .rest(0.001)
-            .replies(hand.GET_STATUS, hand.status_words(left=241), address=2)
+            .replies(hand.GET_STATUS, hand.status(left=241), address=2)
             .numbered(9)  # Hello, GetCaps, GetStatus and Arm of both came before
-            .replies(hand.GET_STATUS, hand.status_words(left=235))
+            .replies(hand.GET_STATUS, hand.status(left=235))
         ),
     ),
 }

@@ -250,7 +250,7 @@ def test_config_commands_create_and_check_daemon_files(
         ("{'a': -3}", "is not JSON"),
         ('{"a": -3, "b', "is not JSON"),
         ('{"a": ' + "1" * 10**5 + "}", "must have strengths of -40 to 0 dB by name"),
-        (" " * (1 << 21) + "{}", "must be up to 2 MiB long"),
+        (" " * (1 << 21) + "{}", "must be up to 2 MiB"),
         ("[" * 100_000, "is not JSON"),
     ],
 )

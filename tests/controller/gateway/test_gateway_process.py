@@ -345,16 +345,16 @@ MAX_GROWTH = 400.0  # MB; a storm of TLS connections is garbage for a while
 
 
 @pytest.fixture(scope="module")
-def daemon_socket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def attacked_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The socket of a real daemon for all attacks."""
     with real_daemon(tmp_path_factory.mktemp("daemon")) as path:
         yield path
 
 
 @pytest.fixture
-def attacked(daemon_socket: Path, tmp_path: Path) -> Iterator[tuple[GatewayProcess, Path]]:
+def attacked(attacked_daemon: Path, tmp_path: Path) -> Iterator[tuple[GatewayProcess, Path]]:
     """A gateway over TLS, which logs nothing, and its certificate."""
-    with attacked_gateway(tmp_path, daemon_socket) as (gateway, certificate):
+    with attacked_gateway(tmp_path, attacked_daemon) as (gateway, certificate):
         yield gateway, certificate
         assert gateway.log() == ""
 

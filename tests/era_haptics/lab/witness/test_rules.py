@@ -42,7 +42,7 @@ def test_request_may_have_waited_in_a_transport(after: float, broken: list[str])
     talk.sequence -= 1
     talk.rest(0.0005).replies(hand.SET, hand.taken(5))
     talk.sequence += 1
-    talk.replies(hand.GET_STATUS, hand.status_words())
+    talk.replies(hand.GET_STATUS, hand.status())
     assert talk.found == broken
 
 
@@ -61,7 +61,7 @@ def test_reply_is_not_late_by_the_delay_of_the_witness(delay: float, broken: lis
     talk.rest(0.1)
     if delay:
         talk.witness.delayed(talk.time, delay)
-    talk.replies(hand.GET_STATUS, hand.status_words(left=199))
+    talk.replies(hand.GET_STATUS, hand.status(left=199))
     assert talk.found == broken
 
 
@@ -79,7 +79,7 @@ def test_reply_that_is_delayed_beyond_newer_ones_says_nothing_of_now() -> None:
 def test_watchdog_may_be_sooner_than_what_is_on_its_way(kind: int, latch: int) -> None:
     """It expires 250 ms after Arm, in the 4 ms that the request and its reply take."""
     talk = Talk().armed().rest(0.246).sends(kind, (5,)).rest(0.004)
-    talk.replies(kind, hand.status_words(hand.FAULT, fault=hand.WATCHDOG, latch=latch))
+    talk.replies(kind, hand.status(hand.FAULT, fault=hand.WATCHDOG, latch=latch))
     assert talk.found == []
 
 
@@ -89,10 +89,10 @@ def test_watchdog_of_unknown_time_may_be_sooner_than_what_is_on_its_way(
 ) -> None:
     """Its Arm was not heard: half of the fade of 5 ms is left as it is told to fall silent."""
     talk = Talk().identified(hand.ENABLED)
-    talk.exchange(hand.SILENCE, (9, 5), hand.status_words()).rest(0.02).playing()
+    talk.exchange(hand.SILENCE, (9, 5), hand.status()).rest(0.02).playing()
     talk.rest(0.2).sends(kind, (5,)).rest(0.0005)
     fading: dict[str, Any] = {"fault": hand.WATCHDOG, "latch": latch, "token": 5}
-    talk.replies(kind, hand.status_words(hand.REACTING, levels=(2500, 0), **fading))
+    talk.replies(kind, hand.status(hand.REACTING, levels=(2500, 0), **fading))
     assert talk.found == []
 
 
@@ -118,7 +118,7 @@ def test_layer_may_have_ended_by_itself_just_before_a_set(
     talk = Talk().armed()
     talk.staged(5, hand.layer(0, hand.tone(0, 100, 0.5), ramp=40, valid_for=60))
     talk.sends(hand.COMMIT, (9, 5, 0)).rest(0.012)
-    talk.replies(hand.COMMIT, hand.status_words(token=5, tokens=(5, 0, 0, 0)))
+    talk.replies(hand.COMMIT, hand.status(token=5, tokens=(5, 0, 0, 0)))
     talk.rest(0.049).staged(6, hand.layer(0, ramp=40)).committed(6, levels=(4878, 0))
     assert talk.rest(after).says(token=6, levels=(level, 0)).found == broken
 
@@ -161,16 +161,16 @@ def test_fault_that_came_before_the_watchdog_may_show_afterwards() -> None:
 def test_disarm_after_the_last_lift_releases_only_what_plays() -> None:
     """An amplifier that was silent under the finger has nothing to end in time."""
     idle = Talk().armed().told("contacts", [1]).rest(0.01).told("contacts", []).rest(0.01)
-    idle.exchange(hand.DISARM, (100,), hand.status_words(hand.SWITCHED_ON))
+    idle.exchange(hand.DISARM, (100,), hand.status(hand.SWITCHED_ON))
     assert idle.found == []
 
 
 def test_arm_may_be_withdrawn_before_its_reply() -> None:
     """It was carried out, so that the set committed last is none."""
     talk = Talk().armed().playing()
-    talk.exchange(hand.DISARM, (5,), hand.status_words(hand.SWITCHED_ON, **FADING)).rest(0.01)
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, **FADING)).rest(0.01)
     talk.sends(hand.ARM, (8, 250, 0))
-    talk.exchange(hand.DISARM, (5,), hand.status_words(hand.SWITCHED_ON, token=0))
+    talk.exchange(hand.DISARM, (5,), hand.status(hand.SWITCHED_ON, token=0))
     assert "token" not in talk.found
 
 
@@ -179,7 +179,7 @@ def test_status_behind_a_broadcast_may_precede_a_stop() -> None:
     talk = Talk().armed().playing().told("operator_command", "stop").rest(0.005)
     playing: dict[str, Any] = {"token": 5, "levels": (5000, 0)}
     talk.says(kind=hand.GET_STATUS, left=213, tokens=(5, 0, 0, 0), **playing)
-    talk.exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1, **playing))
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1, **playing))
     assert talk.found == []
 
 
@@ -188,14 +188,14 @@ def test_stop_is_not_awaited_again_while_its_reply_is(later: float) -> None:
     """The host had begun to stop by itself, of which its operator's stop takes part."""
     talk = Talk().armed().playing().sends(hand.STOP, (5,))
     talk.rest(later).told("operator_command", "stop")
-    talk.rest(0.028).replies(hand.STOP, hand.status_words(hand.STOPPED, latch=1, token=5))
+    talk.rest(0.028).replies(hand.STOP, hand.status(hand.STOPPED, latch=1, token=5))
     assert talk.found == []
 
 
 def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None:
     """A broadcast for another amplifier of the line reaches it too."""
     talk = Talk().armed()
-    talk.exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
     talk.sends(hand.STOP, (5,), address=0)
     assert talk.rest(0.3).found == []
 
@@ -204,9 +204,9 @@ def test_stop_of_what_a_stop_has_silenced_needs_no_second_confirmation() -> None
 def test_stop_is_over_where_the_amplifier_has_restarted(latch: int, broken: bool) -> None:
     """It has latched nothing since, and is armed; one that merely unlatched by itself is not."""
     talk = Talk().armed()
-    talk.exchange(hand.STOP, (5,), hand.status_words(hand.STOPPED, latch=1))
+    talk.exchange(hand.STOP, (5,), hand.status(hand.STOPPED, latch=1))
     talk.says(hand.SWITCHED_OFF, kind=hand.GET_STATUS, latch=latch)
-    talk.exchange(hand.ARM, (10, 250, 0), hand.status_words(latch=latch))
+    talk.exchange(hand.ARM, (10, 250, 0), hand.status(latch=latch))
     assert ("stop" in talk.found) is broken
 
 
@@ -220,7 +220,7 @@ def test_stop_that_was_not_heard_is_over_for_a_host_that_opens_the_wire_again(
     talk = Talk().armed().told("faults", "a", are_on=True)
     talk.sends(hand.STOP, (5,)).rest(0.3).told("faults", "a", are_on=False)
     talk.told_of("closed").rest(0.6).told_of("opened").identified(state, latch=1)
-    talk.exchange(hand.ARM, (10, 250, 0), hand.status_words(latch=1))
+    talk.exchange(hand.ARM, (10, 250, 0), hand.status(latch=1))
     assert sorted({*talk.found}) == broken
 
 
@@ -238,12 +238,10 @@ def test_amplifier_is_followed_to_its_new_address(to: int) -> None:
     talk = Talk().identified()
     words = (3, 1, 0x3700)
     if to:
-        talk.exchange(hand.SET_ADDRESS, words, hand.status_words(hand.SWITCHED_OFF))
+        talk.exchange(hand.SET_ADDRESS, words, hand.status(hand.SWITCHED_OFF))
     else:
         talk.sends(hand.SET_ADDRESS, words, address=0)
-    talk.exchange(
-        hand.GET_STATUS, (), hand.status_words(hand.SWITCHED_OFF, limited=True), address=3
-    )
+    talk.exchange(hand.GET_STATUS, (), hand.status(hand.SWITCHED_OFF, limited=True), address=3)
     talk.sends(hand.GET_STATUS, address=3)
     assert talk.rest(0.04).found == ["plays", "answer"]
 
@@ -252,7 +250,7 @@ def test_ramp_of_a_stop_is_clipped() -> None:
     """65.535 s are those 1000 ms that an amplifier has: half of the level after half a second."""
     talk = Talk().armed().playing()
     latched: dict[str, Any] = {"latch": 1, "token": 5}
-    talk.exchange(hand.STOP, (65535,), hand.status_words(hand.STOPPED, levels=(5000, 0), **latched))
+    talk.exchange(hand.STOP, (65535,), hand.status(hand.STOPPED, levels=(5000, 0), **latched))
     talk.rest(0.497).says(hand.STOPPED, kind=hand.GET_STATUS, levels=(2500, 0), **latched)
     talk.rest(0.6).says(hand.STOPPED, kind=hand.GET_STATUS, **latched)
     assert [each for each in talk.found if each != "stop"] == []
@@ -266,7 +264,7 @@ def _committed_at(at: int) -> Talk:
     talk = Talk().armed().playing(4, 0.2).staged(5, hand.layer(0, hand.tone(0, 100, 0.5)))
     before: dict[str, Any] = {"tokens": (4, 0, 0, 0), "levels": (2000, 0)}
     talk.says(clock=0, token=4, **before)
-    return talk.exchange(hand.COMMIT, (9, 5, at), hand.status_words(token=5, **before))
+    return talk.exchange(hand.COMMIT, (9, 5, at), hand.status(token=5, **before))
 
 
 @pytest.mark.parametrize(("token", "level"), [(4, 2000), (5, 5000)])
@@ -277,7 +275,7 @@ def test_status_of_a_moment_may_be_of_before_or_after_it(token: int, level: int)
     """
     talk = _committed_at(100).rest(0.007).sends(hand.GET_STATUS).rest(0.026)
     talk.told("contacts", ()).rest(0.001)
-    status = hand.status_words(token=5, tokens=(token, 0, 0, 0), levels=(level, 0))
+    status = hand.status(token=5, tokens=(token, 0, 0, 0), levels=(level, 0))
     assert talk.replies(hand.GET_STATUS, status).found == []
 
 
@@ -288,7 +286,7 @@ def test_silence_at_the_moment_of_a_set_fades_either(
     level: int, later: int, broken: list[str]
 ) -> None:
     """It is carried out before the moment or behind it; 40 ms later all is silent."""
-    fading = hand.status_words(token=5, levels=(level, 0))
+    fading = hand.status(token=5, levels=(level, 0))
     talk = _committed_at(12).exchange(hand.SILENCE, (9, 20), fading)
     assert talk.rest(0.04).says(token=5, levels=(later, 0)).found == broken
 
@@ -335,16 +333,14 @@ def test_request_with_the_bytes_of_an_old_one_is_no_copy(beats: int, broken: lis
     number = talk.sequence - 1
     talk.fed(beats - 2).told("faults", "a", are_on=True).told("faults", "a", are_on=False)
     last = talk.fed(2).rest(0.09).sequence
-    talk.numbered(number).sends(hand.GET_STATUS).rest(0.009).replies(
-        hand.GET_STATUS, hand.status_words()
-    )
+    talk.numbered(number).sends(hand.GET_STATUS).rest(0.009).replies(hand.GET_STATUS, hand.status())
     assert talk.numbered(last).found == broken
 
 
 def test_clock_goes_on_from_where_an_arm_has_shifted_it() -> None:
     """By 16384 steps, 5 s; the status before it was not heard, so that of Arm may show a Mark."""
     talk = Talk().identified().sends(hand.GET_STATUS).rest(0.1)
-    talk.exchange(hand.ARM, (9, 250, 16384), hand.status_words(clock=round(5.1 / 20 * 2**32)))
+    talk.exchange(hand.ARM, (9, 250, 16384), hand.status(clock=round(5.1 / 20 * 2**32)))
     talk.rest(0.1).sends(hand.MARK, address=0)
     talk.rest(0.01).says(clock=round(5.2 / 20 * 2**32))
     assert "clock" not in talk.found

@@ -73,7 +73,7 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> No
     assert "daemon" in daemon
     found = json.loads(report.files["versions.json"])
     assert found["packages"]["numpy"][0].isdigit()
-    assert "SimulatedAddress" in found["plug-ins"]["wires"]["sim"]
+    assert set(found) >= {"packages", "plug-ins"}
 
 
 def test_versions_list_packages_of_plug_ins(

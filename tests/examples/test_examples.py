@@ -51,8 +51,7 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
-from era_haptics.lab.conformance import judge_client
-from era_haptics.lab.conformance.contract import of_kind
+from era_haptics.lab.conformance.contract import judge, of_kind
 from model.rig.rig_file import load_rig
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
@@ -149,7 +148,7 @@ async def served(kind: str) -> AsyncIterator[str]:
 async def test_conformance_finds_what_the_server_cannot_do(kind: str, drives: bool) -> None:
     """Every check of the wire has a verdict, and those fail that the page names, no others."""
     async with served(kind) as url:
-        report = await judge_client(url, drives=drives)
+        report = await judge(url, drives=drives)
     checks = [(number, check) for number, check in of_kind(kind) if drives or not check.drives]
     assert [(each.number, each.check) for each in report.results] == checks
     failed = {each.check.name: each.reason for each in report.results if each.result == "failed"}

@@ -31,11 +31,11 @@ from drivers.host.group import Group
 from drivers.opening import Lines
 from drivers.protocol.definition import HEARTBEAT, QUANTITIES
 from model.arrays import ComplexArray, FloatArray, best_first, best_of
-from model.calibration.responses import Responses
 from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
-from model.identification.forward import Sensor
-from model.identification.least_squares import MeasuredPlate, Measurement, Repeat
+from model.estimate.forward import Sensor
+from model.estimate.least_squares import MeasuredPlate, Measurement, Repeat
+from model.estimate.measurement import Responses
 from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Channel, Rig

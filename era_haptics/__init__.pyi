@@ -37,8 +37,8 @@ from model.answer.answer_report import Measures as Measures
 from model.answer.stimulus import Course as Course
 from model.answer.stimulus import Finger as Finger
 from model.answer.stimulus import Stimulus as Stimulus
-from model.calibration.calibrate import Calibration as Calibration
 from model.errors import InputError as InputError
+from model.estimate.calibrate import Calibration as Calibration
 from model.finger import Grid as Grid
 from model.reduction.reduced_plate import SupportedModes as SupportedModes
 from model.rig.rig import Rig as Rig

@@ -8,11 +8,11 @@ from controller.play.routing import route
 from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, layers_of
-from model.calibration.calibrate import Calibration
-from model.calibration.calibrate import calibrate as fit
-from model.calibration.responses import read_measured, responses_of
-from model.diagnosis.verdict import check_consistency
 from model.errors import InputError, expect_path, shown
+from model.estimate.calibrate import Calibration
+from model.estimate.calibrate import calibrate as fit
+from model.estimate.measurement import read_measured, responses_of
+from model.estimate.verdict import check_consistency
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig

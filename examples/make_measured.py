@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import FloatArray
-from model.calibration.responses import Responses, write_responses_csv, write_responses_uff
+from model.estimate.measurement import Responses, write_responses_csv, write_responses_uff
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

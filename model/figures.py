@@ -33,9 +33,9 @@ from model.answer.answer import OWN_CONTRAST_DB, Answer, Layer, Sensation, verdi
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import FloatArray, Point, lattice
-from model.calibration.calibrate import Calibration
 from model.config.units import LENGTH, quantity
 from model.errors import InputError
+from model.estimate.calibrate import Calibration
 from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_picture_name
 from model.finger import FELT_DB_SL, FINGERTIP_RADIUS, Grid, sensation_level

@@ -22,8 +22,8 @@ import numpy as np
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.fit import project_gains, row_rms, sensed_plate
-from model.calibration.responses import Responses, write_responses_csv
+from model.estimate.calibration_fit import project_gains, row_rms, sensed_plate
+from model.estimate.measurement import Responses, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -171,7 +171,7 @@ def measure(
 
 
 def true_values(rig: Rig) -> list[float]:
-    """The fitted values in the order of `model.calibration.fit.SensedPlate.rows`."""
+    """The fitted values in the order of `model.estimate.calibration_fit.SensedPlate.rows`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
     return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 

@@ -17,10 +17,10 @@ import numpy as np
 from benchmarks.calibration.hidden_plates import CHOSEN, field_deviations, sensors_of
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
-from model.calibration.calibrate import calibrate
-from model.calibration.responses import Responses, read_measured, responses_of
-from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
+from model.estimate.calibrate import calibrate
+from model.estimate.measurement import Responses, read_measured, responses_of
+from model.estimate.verdict import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

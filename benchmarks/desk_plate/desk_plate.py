@@ -11,8 +11,8 @@ from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
 from era_haptics.lab.measuring.sound_card import Desk
 from model.arrays import FloatArray
-from model.calibration.responses import WiredSensor, are_places
 from model.errors import InputError
+from model.estimate.measurement import WiredSensor, are_places
 from model.finger import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import signal
 
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import WiredSensor
+from model.estimate.measurement import WiredSensor
 
 _ORDER = 4
 _CORNER = 0.42  # of the sample rate; anti-aliasing filters of converters pass all of the audio band

@@ -19,8 +19,8 @@ from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
-from model.calibration.responses import Responses
-from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
+from model.estimate.measurement import Responses
+from model.estimate.verdict import Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted, Reals
-from model.identification.derivatives import jacobian
-from model.identification.forward import Sensor
-from model.identification.identify import Identification
-from model.identification.parameters import KINDS
-from model.identification.stages import Setting, relevant
+from model.estimate.derivatives import jacobian
+from model.estimate.forward import Sensor
+from model.estimate.identify import Identification
+from model.estimate.space import KINDS
+from model.estimate.stages import Setting, relevant
 
 _WITHIN = 1.96
 _REGION = 5.991  # of two normal numbers

@@ -23,8 +23,8 @@ from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses
-from model.diagnosis.verdict import Verdict, diagnose, judged_by_promises
+from model.estimate.measurement import Responses
+from model.estimate.verdict import Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

@@ -11,10 +11,10 @@ from benchmarks.identification.hidden import FAMILY, INSIDE, LOAD_STD, Hidden
 from benchmarks.identification.thin_plate import Complexes, Reals
 from benchmarks.setting import random_contacts
 from model.errors import InputError
+from model.estimate.forward import Sensor
+from model.estimate.identify import Identification, identify
+from model.estimate.least_squares import Measurement
 from model.finger import fingertip_points, fingertip_weights
-from model.identification.forward import Sensor
-from model.identification.identify import Identification, identify
-from model.identification.least_squares import Measurement
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 

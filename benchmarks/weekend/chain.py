@@ -30,10 +30,10 @@ from benchmarks.setting import random_contacts, use_one_thread
 from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
 from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.calibrate import calibrate
-from model.calibration.responses import Responses, WiredSensor, read_sensors, write_responses
-from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
+from model.estimate.calibrate import calibrate
+from model.estimate.measurement import Responses, WiredSensor, read_sensors, write_responses
+from model.estimate.verdict import check_consistency
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty

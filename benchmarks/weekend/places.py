@@ -20,9 +20,9 @@ from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.boards import ROOT
 from benchmarks.weekend.chain import FOLDER, measured
-from model.calibration.calibrate import calibrate
-from model.diagnosis.verdict import check_consistency
 from model.errors import InputError
+from model.estimate.calibrate import calibrate
+from model.estimate.verdict import check_consistency
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import load_rig
 

@@ -48,7 +48,7 @@ from controller.api.client import Client
 from controller.api.link import LeaseLost
 from controller.api.methods import StatusResult
 from model.arrays import FloatArray
-from model.calibration.responses import WiredSensor
+from model.estimate.measurement import WiredSensor
 from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_writing import rewritten_text

@@ -20,9 +20,9 @@ from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.calibration.responses import Responses
     from model.config.document import Document
-    from model.identification.least_squares import MeasuredPlate
+    from model.estimate.least_squares import MeasuredPlate
+    from model.estimate.measurement import Responses
     from model.rig.rig import Rig
 
 _NOT_EXPLAINED = (
@@ -125,11 +125,11 @@ def identify(
 
     from controller.plate_measurement import observation_of
     from model.config.units import parse_frequencies
-    from model.diagnosis.verdict import check_meaning
-    from model.identification import identify as identification_report
-    from model.identification.identify import expected_contrast
-    from model.identification.identify import identify as fit
-    from model.identification.least_squares import DeviceSettings, measure_by_device
+    from model.estimate import identify as identification_report
+    from model.estimate.identify import expected_contrast
+    from model.estimate.identify import identify as fit
+    from model.estimate.least_squares import DeviceSettings, measure_by_device
+    from model.estimate.verdict import check_meaning
     from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
@@ -212,9 +212,9 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Responses of a file, where they are what they claim to be; raises InputError."""
     import numpy as np
 
-    from model.calibration.responses import read_measured, responses_of
-    from model.diagnosis.verdict import check_consistency
-    from model.identification.least_squares import MeasuredPlate
+    from model.estimate.least_squares import MeasuredPlate
+    from model.estimate.measurement import read_measured, responses_of
+    from model.estimate.verdict import check_consistency
 
     responses = responses_of(read_measured(path), rig)
     screened = check_consistency(rig, responses)
@@ -391,8 +391,8 @@ def check(
     import time
     from dataclasses import replace
 
-    from model.diagnosis import diagnosis_report
-    from model.diagnosis.verdict import diagnose, judged_by_promises
+    from model.estimate import diagnosis_report
+    from model.estimate.verdict import diagnose, judged_by_promises
 
     if (measured is None) == (url is None):
         raise InputError("give --url, of an amplifier with sensors, or --measured, a file")
@@ -450,7 +450,7 @@ def _measured(
 
 def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Responses]":
     """Read what was measured from a file."""
-    from model.calibration.responses import read_measured, responses_of
+    from model.estimate.measurement import read_measured, responses_of
     from model.rig.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)

@@ -30,9 +30,9 @@ from controller.learning.estimator_process import (
 from controller.plate_measurement import settling
 from model.answer.plan import prepare_answers
 from model.errors import InputError
+from model.estimate.learned_plate import LearnedTable, PlateEstimate
+from model.estimate.settled_patterns import SettledPattern
 from model.files.array_file import remove_partial
-from model.identification.learned_plate import LearnedTable, PlateEstimate
-from model.identification.settled_patterns import SettledPattern
 from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following

@@ -27,8 +27,8 @@ from controller.play.loop import Controller
 from controller.process.child import child_command, ended
 from model.answer.answer_report import Timing
 from model.errors import InputError
-from model.identification.forward import Sensor
-from model.identification.settled_patterns import SettledPattern
+from model.estimate.forward import Sensor
+from model.estimate.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads

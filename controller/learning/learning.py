@@ -43,8 +43,8 @@ from controller.sources.touch import Change, Contact
 from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier import Amplifier, Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
-from model.identification.forward import RestingFinger
-from model.identification.settled_patterns import SettledPattern
+from model.estimate.forward import RestingFinger
+from model.estimate.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads

@@ -133,17 +133,17 @@ def calibrate(
 
     Write a new rig, and print its values with their uncertainties.
     """
-    from model.calibration.calibrate import calibrate as fit
-    from model.calibration.calibrate import (
+    from model.config.document import read_document
+    from model.estimate.calibrate import calibrate as fit
+    from model.estimate.calibrate import (
         calibration_json,
         change_rows,
         check_rows,
         finding_rows,
         gain_rows,
     )
-    from model.calibration.responses import LEAST_SENSORS, read_measured, responses_of
-    from model.config.document import read_document
-    from model.diagnosis.verdict import check_consistency
+    from model.estimate.measurement import LEAST_SENSORS, read_measured, responses_of
+    from model.estimate.verdict import check_consistency
     from model.rig.rig_file import rig_of
 
     check_rig_output(output, rig_file, measured_file)

@@ -472,7 +472,7 @@ def template(
 
     Print at 100 %: the ruler on it must measure 100 mm.
     """
-    from model.calibration.responses import read_places
+    from model.estimate.measurement import read_places
     from model.figures import Template, write_template
     from model.rig.rig_file import load_rig
 

@@ -23,9 +23,9 @@ from drivers.opening import Lines
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.errors import InputError
-from model.identification.forward import Sensor
-from model.identification.identify import identify
-from model.identification.least_squares import MeasuredPlate
+from model.estimate.forward import Sensor
+from model.estimate.identify import identify
+from model.estimate.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

@@ -37,11 +37,11 @@ from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotation
 from error_cases import RIG as ERROR_CASES_RIG
 from interrupted import full_disk, interrupted
 from long_form import shortly
-from model.calibration import calibrate
-from model.calibration.responses import WiredSensor, read_measured, read_places, read_sensors
 from model.errors import InputError
+from model.estimate import calibrate
+from model.estimate.learned_plate import load_learned
+from model.estimate.measurement import WiredSensor, read_measured, read_places, read_sensors
 from model.files.array_file import UNREADABLE, read_arrays
-from model.identification.learned_plate import load_learned
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import load_table
 
@@ -102,7 +102,7 @@ WRITING = {
     "table export table.npz --format csv -o out.csv": "model.study.overview.export_csv",
     "table export table.npz --format mat -o out.mat": "model.study.overview.export_mat",
     "plate map rig.yaml --drive SW=110 -o out.png": "model.vibration.plate_map",
-    "calibrate rig.yaml measured.csv -o out.yaml": "model.calibration.calibrate.calibrate",
+    "calibrate rig.yaml measured.csv -o out.yaml": "model.estimate.calibrate.calibrate",
     "figure 10 rig.yaml -o figures": "era_haptics.lab.paper_figures.paper_figures",
     "design rig.yaml -o design --layouts random:2": (
         "era_haptics.lab.design.design_run.rank_layouts"
@@ -122,7 +122,7 @@ LONG = {
     "table show table.npz": "model.study.overview.find_overview",
     "table verify table.npz rig.yaml": "model.study.verification.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",
-    "rig check rig.yaml --measured measured.csv": "model.diagnosis.verdict.diagnose",
+    "rig check rig.yaml --measured measured.csv": "model.estimate.verdict.diagnose",
     "demo --wire sim": "model.table.table_file.cached_table",
 }
 """Other slow commands, with their slow function."""

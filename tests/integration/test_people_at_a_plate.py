@@ -91,9 +91,9 @@ from examples.make_measured import record_responses, scanning_grid
 from floods import flood
 from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
 from long_form import shortly
-from model.calibration.responses import read_measured, responses_of, write_responses_csv
 from model.cli import app
 from model.errors import InputError
+from model.estimate.measurement import read_measured, responses_of, write_responses_csv
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import build_table

@@ -49,9 +49,9 @@ from gateway_bench import (
     wait_for,
     wait_for_state,
 )
-from model.calibration.responses import write_responses_csv, write_responses_uff
 from model.errors import InputError
-from model.identification.learned_plate import load_learned
+from model.estimate.learned_plate import load_learned
+from model.estimate.measurement import write_responses_csv, write_responses_uff
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.plate import Plate
@@ -185,7 +185,7 @@ def test_plate_that_changes_while_it_is_measured_is_refused(
     typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first tones, played last again, differ."""
-    monkeypatch.setattr("model.identification.least_squares.DRIFTED", 1e-9)
+    monkeypatch.setattr("model.estimate.least_squares.DRIFTED", 1e-9)
     with pytest.raises(InputError, match="at the end"):
         typed("check", "--url", PORT, "--yes", on=plate)
 
@@ -236,7 +236,7 @@ def test_plate_that_is_not_explained_is_refused_and_nothing_written(
     """Exit status 1, nothing promised, and what was at the output stays."""
     new = tmp_path / "rig2.yaml"
     new.write_text(before := "# Fitted by `era rig identify`:\n")
-    monkeypatch.setattr("model.identification.identify.MAX_CHI2", 1e-3)
+    monkeypatch.setattr("model.estimate.identify.MAX_CHI2", 1e-3)
     options = ("--url", PORT, "-o", str(new), "--yes", "--quick", "--json")
     result = typed("identify", *options, on=truth)
     told = json.loads(result.stdout)

@@ -29,7 +29,7 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
 from gateway_bench import real_daemon, wait_for
-from model.calibration.responses import read_measured, responses_of, write_responses_csv
+from model.estimate.measurement import read_measured, responses_of, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
 from plates import DISTORTIONS, every
 

@@ -45,12 +45,12 @@ from benchmarks.setting import random_contacts
 from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import Responses
 from model.drive_modes import Drive, Forms
+from model.estimate.forward import RestingFinger
+from model.estimate.measurement import Responses
+from model.estimate.settled_patterns import SettledPattern
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid
-from model.identification.forward import RestingFinger
-from model.identification.settled_patterns import SettledPattern
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, parse_rig

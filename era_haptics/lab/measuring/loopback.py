@@ -30,7 +30,8 @@ from scipy import signal
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.sound_card import PERIOD, Desk, Multisine, ResponseEstimate
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import (
+from model.errors import InputError
+from model.estimate.measurement import (
     MeasuredValue,
     Responses,
     WiredSensor,
@@ -38,7 +39,6 @@ from model.calibration.responses import (
     responses_of,
     write_responses,
 )
-from model.errors import InputError
 from model.files.csv_file import read_lines
 from model.files.uff import read_bytes
 from model.files.wav_file import samples_of

@@ -39,16 +39,16 @@ from era_haptics.lab.measuring.sound_card import (
     run_time,
 )
 from model.arrays import ComplexArray, FloatArray, best_first
-from model.calibration.responses import (
+from model.commands.options import Stopwatch, progress_bar
+from model.estimate.forward import Sensor
+from model.estimate.least_squares import DeviceSettings, MeasuredPlate, Measurement, Repeat
+from model.estimate.measurement import (
     Responses,
     WiredSensor,
     are_places,
     read_sensors,
     write_responses,
 )
-from model.commands.options import Stopwatch, progress_bar
-from model.identification.forward import Sensor
-from model.identification.least_squares import DeviceSettings, MeasuredPlate, Measurement, Repeat
 from model.processes import Progress
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig

@@ -19,15 +19,15 @@ from drivers.errors import LinkError
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
 from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard
 from model.arrays import ComplexArray, FloatArray
-from model.calibration.responses import (
+from model.commands.options import Stopwatch
+from model.errors import InputError
+from model.estimate.measurement import (
     Responses,
     WiredSensor,
     read_measured,
     responses_of,
     write_responses,
 )
-from model.commands.options import Stopwatch
-from model.errors import InputError
 
 _SAME = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0

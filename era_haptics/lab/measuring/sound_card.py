@@ -22,8 +22,8 @@ import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
-from model.calibration.responses import Responses, WiredSensor
 from model.errors import InputError
+from model.estimate.measurement import Responses, WiredSensor
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of

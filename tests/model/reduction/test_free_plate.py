@@ -15,13 +15,13 @@ from scipy.sparse.linalg import splu
 
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
-from model.calibration.fit import sensed_plate
 from model.config.document import ConfigError
 from model.errors import InputError
+from model.estimate.calibration_fit import sensed_plate
+from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.space import space_of
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.finger import Grid
-from model.identification.forward import ForwardModel, Sensor
-from model.identification.parameters import space_of
 from model.reduction import free_plate
 from model.reduction.free_plate import (
     FreePlate,

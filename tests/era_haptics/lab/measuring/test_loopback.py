@@ -21,9 +21,9 @@ from era_haptics.lab.measuring.loopback import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
 from era_haptics.lab.measuring.sound_card import Desk
 from model.arrays import ComplexArray, Float32Array, FloatArray
-from model.calibration.responses import Responses, WiredSensor, responses_of
 from model.config.document import read_document
 from model.errors import InputError
+from model.estimate.measurement import Responses, WiredSensor, responses_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

@@ -29,8 +29,8 @@ from era_haptics.lab.measuring.sound_card import (
     default_frequencies,
 )
 from examples.make_measured import record_responses
-from model.calibration.responses import WiredSensor, read_measured, responses_of
 from model.errors import InputError
+from model.estimate.measurement import WiredSensor, read_measured, responses_of
 from model.processes import unseen
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig

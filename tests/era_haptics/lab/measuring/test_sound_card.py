@@ -36,12 +36,12 @@ from era_haptics.lab.measuring.moved_sensor import PositionsFile, measure_positi
 from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard, open_card
 from gateway_bench import wait_for
 from model.arrays import ComplexArray, Float32Array, FloatArray
-from model.calibration.fit import sensed_plate
-from model.calibration.responses import WiredSensor, read_measured, read_sensors, responses_of
 from model.errors import InputError
+from model.estimate.calibration_fit import sensed_plate
+from model.estimate.identify import identify
+from model.estimate.least_squares import MeasuredPlate
+from model.estimate.measurement import WiredSensor, read_measured, read_sensors, responses_of
 from model.finger import fingertips_on
-from model.identification.identify import identify
-from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
 from model.spectral.direct_solution import direct_spectral_acceleration

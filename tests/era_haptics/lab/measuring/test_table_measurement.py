@@ -21,9 +21,9 @@ from drivers.playing import AmplifierLayer
 from era_haptics.lab.measuring import table_measurement
 from era_haptics.lab.measuring.sound_card import SoundCard
 from model.arrays import Float32Array, FloatArray
-from model.calibration.responses import read_sensors
 from model.cli import app
 from model.errors import InputError
+from model.estimate.measurement import read_sensors
 from model.finger import detection_threshold
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from model.answer.plan import query
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
-from model.calibration.calibrate import wrong_size
-from model.calibration.fit import SensedPlate, plate_of, project_gains, row_rms
-from model.calibration.responses import LEAST_SENSORS, Responses, Screening, check_enough_sensors
-from model.diagnosis.causes import (
+from model.errors import InputError
+from model.estimate.calibrate import wrong_size
+from model.estimate.calibration_fit import SensedPlate, plate_of, project_gains, row_rms
+from model.estimate.causes import (
     MAX_FORM_ERROR,
     BadSensor,
     BeyondTolerances,
@@ -48,7 +48,8 @@ from model.diagnosis.causes import (
     turned_grain,
     usable_sensors,
 )
-from model.diagnosis.plate_match import (
+from model.estimate.measurement import LEAST_SENSORS, Responses, Screening, check_enough_sensors
+from model.estimate.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
     MODEL_ERROR,
@@ -61,7 +62,6 @@ from model.diagnosis.plate_match import (
     phases_of_drive,
     plate_changes,
 )
-from model.errors import InputError
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_summary import exciters_of, sections_of
 from model.structure.attachments import Era, PointLoad

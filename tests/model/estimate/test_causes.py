@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.identification.causes import FAULTS, verdict_on
 from benchmarks.identification.hidden import draw
-from model.diagnosis.diagnosis_report import as_json, verdict_rows
+from model.estimate.diagnosis_report import as_json, verdict_rows
 
 
 @pytest.mark.parametrize(

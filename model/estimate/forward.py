@@ -25,7 +25,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.parameters import (
+from model.estimate.space import (
     AttachmentPoints,
     Modes,
     ReducedModes,

@@ -24,11 +24,11 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
+from model.estimate.derivatives import by_mass_at, jacobian
+from model.estimate.forward import ForwardModel, PlateAt, RestingFinger
+from model.estimate.least_squares import search, single_changes
+from model.estimate.space import FINGER_PARTS, Space
 from model.finger import Grid
-from model.identification.derivatives import by_mass_at, jacobian
-from model.identification.forward import ForwardModel, PlateAt, RestingFinger
-from model.identification.least_squares import search, single_changes
-from model.identification.parameters import FINGER_PARTS, Space
 
 _PART_SHARE = 0.5  # deviation of each part of a finger, in that of the whole
 _NOISE, _FLOOR = 0.01, 0.1

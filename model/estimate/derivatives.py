@@ -2,7 +2,7 @@
 
 With L = 1 - T Z, a change dA of the free receptance and dZ of what is attached change the
 receptance T of the plate on its attachments by L dA L^T - T dZ T. For a mode, a place or an
-attachment that is a change of rank one or two (symbols as in `model.identification.forward`). A
+attachment that is a change of rank one or two (symbols as in `model.estimate.forward`). A
 sensor of mass m that is on the plate while it measures adds l² w² m T_sj dT_ss to l dT_sj."""
 
 from collections.abc import Callable
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.identification.forward import MIN_LOSS_FACTOR, PlateAt
-from model.identification.parameters import EXCITER_KINDS
+from model.estimate.forward import MIN_LOSS_FACTOR, PlateAt
+from model.estimate.space import EXCITER_KINDS
 from model.reduction.free_plate import TERMS, combined
 from model.structure.plate import LOSS_FREQUENCY
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtr
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
-from model.calibration.fit import (
+from model.estimate.calibration_fit import (
     STARTS,
     SensedPlate,
     fit_with_gains,
@@ -29,7 +29,7 @@ from model.calibration.fit import (
     row_rms,
     without_outliers,
 )
-from model.calibration.responses import Responses, typical
+from model.estimate.measurement import Responses, typical
 from model.rig.rig import Rig
 
 _GAIN_TOLERANCE = 0.08  # standard deviation over frequency, of itself

@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
+from model.estimate.forward import Sensor
+from model.estimate.least_squares import Measurement
 from model.files.csv_file import Column, CsvLine, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
@@ -40,8 +42,6 @@ from model.files.uff import (
     text_of,
     write_universal,
 )
-from model.identification.forward import Sensor
-from model.identification.least_squares import Measurement
 from model.rig.rig import Rig
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
@@ -552,7 +552,7 @@ class WiredSensor:
     sensitivity: float
     """Samples, in full scale, by acceleration [1/(m/s²)]."""
     mass: float = 0.0
-    """Mass [kg] of one that is moved, as `model.identification.forward.Sensor.mass`."""
+    """Mass [kg] of one that is moved, as `model.estimate.forward.Sensor.mass`."""
 
 
 def read_places(path: Path, plate: Plate) -> dict[str, Point]:

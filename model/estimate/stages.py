@@ -36,16 +36,16 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import NEARLY, ComplexArray, FloatArray, best_by, best_of, ranked_by
-from model.finger import Grid
-from model.identification.derivatives import by_mass_at, jacobian
-from model.identification.forward import ForwardModel, Sensor
-from model.identification.least_squares import (
+from model.estimate.derivatives import by_mass_at, jacobian
+from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.least_squares import (
     IdentificationProblem,
     Linearization,
     Measurement,
     solve,
 )
-from model.identification.parameters import KINDS, MODE_SHIFTS, Space, inwards, plate_with, space_of
+from model.estimate.space import KINDS, MODE_SHIFTS, Space, inwards, plate_with, space_of
+from model.finger import Grid
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty

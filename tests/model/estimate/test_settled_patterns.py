@@ -25,11 +25,11 @@ from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.identification import learned_plate
-from model.identification.forward import Sensor
-from model.identification.learned_plate import LearnedTable, LivePlate, PlateEstimate
-from model.identification.least_squares import Measurement
-from model.identification.settled_patterns import (
+from model.estimate import learned_plate
+from model.estimate.forward import Sensor
+from model.estimate.learned_plate import LearnedTable, LivePlate, PlateEstimate
+from model.estimate.least_squares import Measurement
+from model.estimate.settled_patterns import (
     WINDOW,
     Alarm,
     NoiseLevel,
@@ -40,7 +40,7 @@ from model.identification.settled_patterns import (
     StateUpdate,
     update,
 )
-from model.identification.stages import (
+from model.estimate.stages import (
     FittedModel,
     Setting,
     chi2,

@@ -23,13 +23,12 @@ from benchmarks.calibration.hidden_plates import (
     true_values,
 )
 from model.arrays import ComplexArray, FloatArray
-from model.calibration import fit
-from model.calibration.calibrate import calibrate
-from model.calibration.fit import SensedPlate, sensed_plate
-from model.diagnosis import plate_match
-from model.diagnosis.verdict import check_consistency
-from model.identification import least_squares
-from model.identification.parameters import KINDS, MASS_CELLS, reduced_modes
+from model.estimate import calibration_fit as fit
+from model.estimate import least_squares, plate_match
+from model.estimate.calibrate import calibrate
+from model.estimate.calibration_fit import SensedPlate, sensed_plate
+from model.estimate.space import KINDS, MASS_CELLS, reduced_modes
+from model.estimate.verdict import check_consistency
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.spectral.modes import SpectralMesh, stretched

@@ -17,8 +17,8 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.errors import InputError
-from model.identification.derivatives import jacobian
-from model.identification.forward import ForwardModel, Sensor
+from model.estimate.derivatives import jacobian
+from model.estimate.forward import ForwardModel, Sensor
 from model.processes import Progress
 from model.rig.rig import Rig
 

@@ -5,7 +5,7 @@ rig is fitted within its priors. Not tried: two values at once, plates that are 
 further supports, and density, which cannot be distinguished from the others.
 
 Beyond tolerances (`match_with_form`): the plate is matched once more with form errors, each held by
-its tolerance (`KINDS` in `model.identification.parameters`). They explain what builders and rulers
+its tolerance (`KINDS` in `model.estimate.space`). They explain what builders and rulers
 do, but not a mass in one place near an edge. Loads are therefore sought where each would explain
 most, and named if they are beyond a tolerance. Of the rest, each kind of form error is judged by
 its sum of squares at an equal share of the false alarms. A plate that is thinner at one end moves
@@ -13,7 +13,7 @@ more there, so that scales of sensors rise along it: that is its taper.
 
 The wrong side: sensors at each other's places or noted from another side, and a grain along the
 other side, are other plates, for which no fit of values makes up. Both sides are fitted as coarsely
-as wiring is first looked at (`model.diagnosis.plate_match.match_shapes`): shapes of boards as
+as wiring is first looked at (`model.estimate.plate_match.match_shapes`): shapes of boards as
 bought leave a quarter of the response unexplained with the right side, half to nine tenths with the
 other.
 
@@ -40,7 +40,8 @@ from scipy.optimize import linear_sum_assignment, minimize_scalar
 from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray, best_by, ranked_by
-from model.calibration.fit import (
+from model.errors import InputError
+from model.estimate.calibration_fit import (
     Parameter,
     SensedPlate,
     modal_assurance,
@@ -51,8 +52,11 @@ from model.calibration.fit import (
     row_rms,
     sensed_plate,
 )
-from model.calibration.responses import Responses, check_enough_sensors, silent_sensors
-from model.diagnosis.plate_match import (
+from model.estimate.derivatives import by_mass_at
+from model.estimate.identify import solved_for
+from model.estimate.least_squares import Linearization
+from model.estimate.measurement import Responses, check_enough_sensors, silent_sensors
+from model.estimate.plate_match import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
     Match,
@@ -60,12 +64,8 @@ from model.diagnosis.plate_match import (
     match_plate,
     match_shapes,
 )
-from model.errors import InputError
+from model.estimate.space import VALUE_UNITS
 from model.finger import Grid
-from model.identification.derivatives import by_mass_at
-from model.identification.identify import solved_for
-from model.identification.least_squares import Linearization
-from model.identification.parameters import VALUE_UNITS
 from model.quantities import percent
 from model.rig.rig import Rig
 from model.spectral.modes import stretched

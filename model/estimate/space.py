@@ -159,7 +159,7 @@ KINDS = {
     "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
     "poisson": Kind(0.015, "", "", 1.0),
-    # From hysteretic losses, 0, to viscous ones, 1 (`model.identification.forward`).
+    # From hysteretic losses, 0, to viscous ones, 1 (`model.estimate.forward`).
     "loss_law": Kind(1.0, "", "", 1.0),
 }
 """Kinds of parameters; for some a rig's `uncertainty` states the standard deviation instead.

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from model.arrays import best_of
-from model.diagnosis.causes import (
+from model.estimate.causes import (
     BeyondTolerances,
     ExchangedSensors,
     Explanation,
     ReversedAxes,
     TurnedGrain,
 )
-from model.diagnosis.plate_match import FALSE_ALARM, MAX_FIT_ERROR
-from model.diagnosis.verdict import ChannelState, ChannelVerdict, MisreadResonance, Verdict
-from model.identification.identify import value_rows
+from model.estimate.identify import value_rows
+from model.estimate.plate_match import FALSE_ALARM, MAX_FIT_ERROR
+from model.estimate.verdict import ChannelState, ChannelVerdict, MisreadResonance, Verdict
 from model.quantities import counted, in_display_unit, percent
 from model.structure.attachments import FingertipLoad, PointLoad
 from model.study.verification import MIN_KEPT_SHARE

@@ -16,16 +16,16 @@ import plates as calibration_plates
 from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, true_values
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
-from model.calibration.calibrate import (
+from model.errors import InputError
+from model.estimate.calibrate import (
     Calibration,
     calibrate,
     calibration_json,
     change_rows,
     finding_rows,
 )
-from model.calibration.responses import Responses
-from model.diagnosis.verdict import check_consistency
-from model.errors import InputError
+from model.estimate.measurement import Responses
+from model.estimate.verdict import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

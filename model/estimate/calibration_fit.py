@@ -7,7 +7,7 @@ scales read them, g a complex gain of every frequency and ERA. Gains enter linea
 follow from any model, so that only z is searched, with the derivatives of gains and residual by it
 (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973). z has the rig's values,
 without a prior, and what tolerances hold: scales of sensors, form errors, and what data sheets know
-better. The free plate is solved once (`model.identification.forward`).
+better. The free plate is solved once (`model.estimate.forward`).
 
 Noise has a constant part and a part in proportion to the response, both estimated from residuals.
 Outliers are found at the plate of the preceding check, the worst of a row first, since each pulls
@@ -31,11 +31,11 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.calibration.responses import Responses
-from model.identification.derivatives import jacobian
-from model.identification.forward import ForwardModel, Sensor, viscous_difference
-from model.identification.least_squares import Minimum, search
-from model.identification.parameters import (
+from model.estimate.derivatives import jacobian
+from model.estimate.forward import ForwardModel, Sensor, viscous_difference
+from model.estimate.least_squares import Minimum, search
+from model.estimate.measurement import Responses
+from model.estimate.space import (
     FORM,
     KINDS,
     MAX_GUESSED,

@@ -18,9 +18,8 @@ from long_form import shortly
 from model.arrays import FloatArray
 from model.config.document import parse_document, read_document
 from model.errors import InputError
-from model.files.array_file import whole_or_nothing
-from model.identification.forward import ForwardModel, Sensor
-from model.identification.identify import (
+from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.identify import (
     MAX_CHI2,
     Identification,
     as_json,
@@ -30,8 +29,9 @@ from model.identification.identify import (
     fit_rows,
     identify,
 )
-from model.identification.least_squares import Measurement, Repeat
-from model.identification.parameters import space_of
+from model.estimate.least_squares import Measurement, Repeat
+from model.estimate.space import space_of
+from model.files.array_file import whole_or_nothing
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, load_rig, rig_of

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.hidden import Hidden, draw
-from model.identification.forward import Sensor
-from model.identification.identify import Identification, identify
-from model.identification.learned_plate import PlateEstimate
-from model.identification.least_squares import Measurement
+from model.estimate.forward import Sensor
+from model.estimate.identify import Identification, identify
+from model.estimate.learned_plate import PlateEstimate
+from model.estimate.least_squares import Measurement
 from model.rig.rig_file import example_rig_path, load_rig
 from plates import SETTLED_PATTERNS_FREQUENCIES
 

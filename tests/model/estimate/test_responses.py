@@ -15,20 +15,20 @@ from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
-from model.calibration.calibrate import calibrate
-from model.calibration.fit import sensed_plate
-from model.calibration.responses import (
+from model.errors import InputError
+from model.estimate.calibrate import calibrate
+from model.estimate.calibration_fit import sensed_plate
+from model.estimate.derivatives import jacobian
+from model.estimate.forward import viscous_difference
+from model.estimate.measurement import (
     Responses,
     read_measured,
     responses_of,
     write_responses_csv,
     write_responses_uff,
 )
-from model.diagnosis.verdict import check_consistency
-from model.errors import InputError
+from model.estimate.verdict import check_consistency
 from model.fem import Mesh, assemble
-from model.identification.derivatives import jacobian
-from model.identification.forward import viscous_difference
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.structure.exciter import Exciter

@@ -28,22 +28,22 @@ from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
 from long_form import shortly
 from model.arrays import FloatArray
-from model.calibration.calibrate import MAX_OUTLIERS, calibrate
-from model.calibration.fit import sensed_plate, without_outliers
-from model.calibration.responses import Responses, read_measured, responses_of, write_responses
-from model.diagnosis import causes
-from model.diagnosis.diagnosis_report import as_json, channel_table, verdict_rows
-from model.diagnosis.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate, phases_of_drive
-from model.diagnosis.verdict import (
+from model.errors import InputError
+from model.estimate import causes
+from model.estimate.calibrate import MAX_OUTLIERS, calibrate
+from model.estimate.calibration_fit import sensed_plate, without_outliers
+from model.estimate.diagnosis_report import as_json, channel_table, verdict_rows
+from model.estimate.least_squares import MeasuredPlate
+from model.estimate.measurement import Responses, read_measured, responses_of, write_responses
+from model.estimate.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate, phases_of_drive
+from model.estimate.verdict import (
     Verdict,
     check_consistency,
     check_meaning,
     diagnose,
     judged_by_promises,
 )
-from model.errors import InputError
 from model.fem import Mesh
-from model.identification.least_squares import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.spectral.direct_solution import direct_spectral_acceleration

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray, best_of
-from model.calibration.fit import (
+from model.errors import InputError
+from model.estimate.calibration_fit import (
     CalibrationProblem,
     Fit,
     Parameter,
@@ -27,12 +28,11 @@ from model.calibration.fit import (
     start_at,
     without_form,
 )
-from model.calibration.responses import LEAST_SENSORS, Responses, Screening, check_enough_sensors
-from model.errors import InputError
+from model.estimate.identify import quality_rows, value_rows
+from model.estimate.measurement import LEAST_SENSORS, Responses, Screening, check_enough_sensors
+from model.estimate.space import KINDS, MASS_CELLS
+from model.estimate.stages import HELD_OUT_FOLDS, relative_rms
 from model.files.csv_file import as_frame
-from model.identification.identify import quality_rows, value_rows
-from model.identification.parameters import KINDS, MASS_CELLS
-from model.identification.stages import HELD_OUT_FOLDS, relative_rms
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
 from model.rig.rig import Rig, Uncertainty

@@ -1,7 +1,7 @@
 """A table in service that learns its plate: settled patterns in, corrected answers out.
 
 The parameters of an identification drift. Each settled pattern updates them, together with the
-loads of its fingers, which are dropped afterwards (`model.identification.settled_patterns`). An
+loads of its fingers, which are dropped afterwards (`model.estimate.settled_patterns`). An
 update would smear a sudden change over all parameters: when innovations become unlikely, the state
 goes back to where they began and is held, until the patterns since then are explained by one
 change, which is then followed. Without an explanation, as for a crack or a hand that rests on the
@@ -26,12 +26,9 @@ import numpy as np
 
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.files.array_file import UNREADABLE, read_arrays, write_arrays
-from model.files.output_paths import begins_with
-from model.identification.forward import ForwardModel, Sensor
-from model.identification.identify import solved_for
-from model.identification.parameters import KINDS, MODE_SHIFTS, Values, rig_with, space_of
-from model.identification.settled_patterns import (
+from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.identify import solved_for
+from model.estimate.settled_patterns import (
     PLACES,
     Alarm,
     NoiseLevel,
@@ -43,6 +40,9 @@ from model.identification.settled_patterns import (
     explain,
     update,
 )
+from model.estimate.space import KINDS, MODE_SHIFTS, Values, rig_with, space_of
+from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.files.output_paths import begins_with
 from model.rig.rig import Rig, Uncertainty
 from model.structure.modal_elasticity import lowest_elastic
 from model.table.table import LocalizationTable

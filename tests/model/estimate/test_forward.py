@@ -11,12 +11,11 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
-from model.fem import ELEMENTS, Mesh, assemble
-from model.identification.derivatives import by_mass_at, jacobian
-from model.identification.forward import SENSOR_FOOT, ForwardModel, RestingFinger, Sensor
-from model.identification.identify import identify, parameter_rows
-from model.identification.least_squares import Measurement
-from model.identification.parameters import (
+from model.estimate.derivatives import by_mass_at, jacobian
+from model.estimate.forward import SENSOR_FOOT, ForwardModel, RestingFinger, Sensor
+from model.estimate.identify import identify, parameter_rows
+from model.estimate.least_squares import Measurement
+from model.estimate.space import (
     FINGER_PARTS,
     Space,
     Values,
@@ -25,6 +24,7 @@ from model.identification.parameters import (
     space_by_sheets,
     space_of,
 )
+from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig, mesh_of, rig_of

@@ -1,1 +1,0 @@
-"""Diagnosis of a rig by the responses of sensors to its channels."""

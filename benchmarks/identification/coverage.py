@@ -6,8 +6,7 @@ import numpy as np
 
 from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted, Reals
-from model.estimate.derivatives import jacobian
-from model.estimate.forward import Sensor
+from model.estimate.forward import Sensor, jacobian
 from model.estimate.identify import Identification
 from model.estimate.space import KINDS
 from model.estimate.stages import Setting, relevant

@@ -31,8 +31,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.estimate.derivatives import jacobian
-from model.estimate.forward import ForwardModel, Sensor, viscous_difference
+from model.estimate.forward import ForwardModel, Sensor, jacobian, viscous_difference
 from model.estimate.least_squares import Minimum, search
 from model.estimate.measurement import Responses
 from model.estimate.space import (

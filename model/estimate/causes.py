@@ -52,7 +52,7 @@ from model.estimate.calibration_fit import (
     row_rms,
     sensed_plate,
 )
-from model.estimate.derivatives import by_mass_at
+from model.estimate.forward import by_mass_at
 from model.estimate.identify import solved_for
 from model.estimate.least_squares import Linearization
 from model.estimate.measurement import Responses, check_enough_sensors, silent_sensors

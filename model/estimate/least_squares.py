@@ -17,8 +17,7 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.errors import InputError
-from model.estimate.derivatives import jacobian
-from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.processes import Progress
 from model.rig.rig import Rig
 

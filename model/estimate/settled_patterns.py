@@ -24,8 +24,7 @@ from scipy import linalg
 from scipy.special import chdtrc
 
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
-from model.estimate.derivatives import by_mass_at, jacobian
-from model.estimate.forward import ForwardModel, PlateAt, RestingFinger
+from model.estimate.forward import ForwardModel, PlateAt, RestingFinger, by_mass_at, jacobian
 from model.estimate.least_squares import search, single_changes
 from model.estimate.space import FINGER_PARTS, Space
 from model.finger import Grid

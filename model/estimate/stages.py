@@ -36,8 +36,7 @@ import numpy as np
 from scipy import linalg
 
 from model.arrays import NEARLY, ComplexArray, FloatArray, best_by, best_of, ranked_by
-from model.estimate.derivatives import by_mass_at, jacobian
-from model.estimate.forward import ForwardModel, Sensor
+from model.estimate.forward import ForwardModel, Sensor, by_mass_at, jacobian
 from model.estimate.least_squares import (
     IdentificationProblem,
     Linearization,

@@ -11,8 +11,14 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
-from model.estimate.derivatives import by_mass_at, jacobian
-from model.estimate.forward import SENSOR_FOOT, ForwardModel, RestingFinger, Sensor
+from model.estimate.forward import (
+    SENSOR_FOOT,
+    ForwardModel,
+    RestingFinger,
+    Sensor,
+    by_mass_at,
+    jacobian,
+)
 from model.estimate.identify import identify, parameter_rows
 from model.estimate.least_squares import Measurement
 from model.estimate.space import (

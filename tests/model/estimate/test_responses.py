@@ -18,8 +18,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
 from model.estimate.calibration_fit import sensed_plate
-from model.estimate.derivatives import jacobian
-from model.estimate.forward import viscous_difference
+from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
     Responses,
     read_measured,

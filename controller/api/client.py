@@ -11,7 +11,7 @@
             print(event.data)
 
 `Client` runs an `AsyncClient` in an event loop on a thread of its own. Methods that are one request
-each are written by `make pages` from their registration in `controller/daemon/methods.py`.
+each are written by `make pages` from their registration in `controller/daemon/handlers.py`.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
 """The methods and topics of the API: their messages, and how requests and events are treated.
 
-A method is registered by `api_method` where it is handled (`controller/daemon/methods.py`). From
+A method is registered by `api_method` where it is handled (`controller/daemon/handlers.py`). From
 its registration `make pages` writes what clients, gateway and pages read without loading the
 daemon: `METHODS` below, the methods of the clients, `summaries.py` and docs/reference/api.md.
 A topic is a row of `TOPICS`.

@@ -23,9 +23,9 @@ from controller.api.schema import headline
 from controller.api.server import ApiServer
 from controller.daemon.children import gateway_options, keep_gateway
 from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_address
+from controller.daemon.handlers import ApiService
 from controller.daemon.layouts import LayoutChoice, TouchInputs, read_again
 from controller.daemon.messages import EventPublisher, amplifier_statuses
-from controller.daemon.methods import ApiService
 from controller.gateway.settings import require_gateway
 from controller.learning.learning import Learning
 from controller.operation.fault_dumps import FaultDumps

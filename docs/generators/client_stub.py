@@ -1,6 +1,6 @@
 """Parts of `controller/api` that follow from where methods are handled and readings are defined.
 
-Methods are registered in `controller/daemon/methods.py`, which clients and gateway do not load.
+Methods are registered in `controller/daemon/handlers.py`, which clients and gateway do not load.
 """
 
 import textwrap
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from controller.api.methods import BY_PLACE, Method
 from controller.api.schema import Empty
-from controller.daemon.methods import ApiService
+from controller.daemon.handlers import ApiService
 from drivers.protocol.definition import READINGS
 
 _WIDTH = 100  # of a line, as ruff has it

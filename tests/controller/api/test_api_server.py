@@ -26,7 +26,7 @@ from controller.api.methods import METHODS, ArmParams, StatusResult, SubscribePa
 from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer
 from controller.api.summaries import SUMMARIES
-from controller.daemon.methods import ApiService
+from controller.daemon.handlers import ApiService
 from daemons import PATIENCE, ServedApi, feed, request, serving
 
 ARM = '{"owner":"me","lease_s":5}'

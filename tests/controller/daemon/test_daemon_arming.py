@@ -14,7 +14,7 @@ import serial
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.methods import ArmParams
 from controller.daemon.daemon import Daemon
-from controller.daemon.methods import check_lease
+from controller.daemon.handlers import check_lease
 from controller.operation.operation_states import (
     ENERGISED,
     DaemonEvent,

@@ -54,7 +54,7 @@ def gateway(
     """
     import asyncio
 
-    from controller.gateway.settings import GatewaySettings, read_token, require_gateway
+    from controller.gateway.gateway_settings import GatewaySettings, read_token, require_gateway
 
     require_gateway()
     from controller.api.link import find_socket

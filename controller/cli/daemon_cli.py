@@ -87,7 +87,7 @@ def daemon(
         typer.echo(check_daemon(config))
         return
     if dashboard is not None:
-        from controller.gateway.settings import require_gateway
+        from controller.gateway.gateway_settings import require_gateway
 
         require_gateway()
     run_daemon(config, dashboard=dashboard, trace=trace)

@@ -87,7 +87,7 @@ def demo(
     started = time.perf_counter()
     table, _ = cached_table(rig)
     if dashboard is not None:
-        from controller.gateway.settings import require_gateway
+        from controller.gateway.gateway_settings import require_gateway
 
         require_gateway()
         check_page(dashboard)

@@ -26,7 +26,7 @@ from controller.daemon.config import DaemonConfig, load_daemon_config, loopback_
 from controller.daemon.handlers import ApiService
 from controller.daemon.layouts import LayoutChoice, TouchInputs, read_again
 from controller.daemon.messages import EventPublisher, amplifier_statuses
-from controller.gateway.settings import require_gateway
+from controller.gateway.gateway_settings import require_gateway
 from controller.learning.learning import Learning
 from controller.operation.fault_dumps import FaultDumps
 from controller.operation.operation_states import ENERGISED, DaemonState, Operation

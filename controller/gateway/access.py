@@ -9,7 +9,7 @@ import re
 
 from aiohttp import HttpVersion10, HttpVersion11, web
 
-from controller.gateway.settings import GatewaySettings, sent_origin
+from controller.gateway.gateway_settings import GatewaySettings, sent_origin
 
 SUBPROTOCOL = "era-haptics.v1"
 _TOKEN_SUBPROTOCOL = "era-haptics.token."  # noqa: S105 (a prefix, not a token)

@@ -51,8 +51,8 @@ from controller.gateway.connections import (
     bridge,
 )
 from controller.gateway.field import DrawnField
+from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import GatewaySettings
 from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections

@@ -25,7 +25,7 @@ from controller.cli.main import run
 from controller.content.formats import read_content
 from controller.effects.layout import load_layout
 from controller.effects.strengths import read_strengths
-from controller.gateway.settings import read_token
+from controller.gateway.gateway_settings import read_token
 from controller.sources.tuio import read_capture
 from drivers.errors import CommandError
 from era_haptics.lab.design.problem import area_of

@@ -21,7 +21,7 @@ from controller.cli.status_text import show_event, show_status
 from controller.daemon.children import gateway_options
 from controller.daemon.daemon import run_daemon
 from controller.effects.layout import default_effects
-from controller.gateway.settings import read_token
+from controller.gateway.gateway_settings import read_token
 from controller.play.planner import SilenceReport
 from controller.process.log import LogThread
 from daemons import (
@@ -88,7 +88,7 @@ def test_daemon_goes_on_without_the_page_of_its_file_when_not_installed(
 ) -> None:
     """It says once what to install, and starts no gateway that could only end."""
     pages: list[str | None] = []
-    monkeypatch.setattr("controller.gateway.settings.find_spec", lambda name: None)
+    monkeypatch.setattr("controller.gateway.gateway_settings.find_spec", lambda name: None)
     monkeypatch.setattr(
         "controller.daemon.daemon._run",
         lambda config, lock, *, log, dashboard: pages.append(dashboard),

@@ -29,8 +29,8 @@ from controller.gateway import app
 from controller.gateway.access import Access
 from controller.gateway.app import serve
 from controller.gateway.field import DrawnField, FieldSolver
+from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
-from controller.gateway.settings import GatewaySettings
 from daemons import PATIENCE, ready_daemon, until
 from gateway_bench import (
     TOKEN,

@@ -17,7 +17,7 @@ from aiohttp import web
 from controller.demo.demonstration import check_page
 from controller.gateway.app import Gateway, listen, load_certificate, serve
 from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
-from controller.gateway.settings import GatewaySettings, read_token
+from controller.gateway.gateway_settings import GatewaySettings, read_token
 from daemons import PATIENCE, until
 from gateway_attacks import ATTACKS, LIMIT, attack, attacked_gateway, make_certificate
 from gateway_bench import (

@@ -1,4 +1,4 @@
-"""The process that plays; `sim.soft_amp.supervisor` starts, watches and, if need be, kills it.
+"""The process that plays; `sim.soft_amp.respawning` starts, watches and, if need be, kills it.
 
     python -m sim.soft_amp SETTINGS COUNTERS TERMINAL LISTENING PARENT RATE
 

@@ -89,7 +89,7 @@ def soft_amp(
     from model.commands.options import print_report
     from sim.soft_amp.engine import library
     from sim.soft_amp.output import listed_devices
-    from sim.soft_amp.supervisor import SoftAmplifierSupervisor
+    from sim.soft_amp.respawning import SoftAmplifierSupervisor
 
     if list_devices:
         print_report(*listed_devices(), as_json=as_json)

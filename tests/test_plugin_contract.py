@@ -27,7 +27,7 @@ from drivers.errors import CommandError
 from drivers.wires.known import address_of
 from drivers.wires.serial_line import SerialAddress
 from model.errors import InputError
-from model.structure.materials import KNOWN_MATERIALS, known_material, material_names
+from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text
 
 URL_CLASS = """\

@@ -8,7 +8,7 @@ from model.config.fields import Section
 from model.rig import sections
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.structure.attachments import FEET, FOOT_LOSS
-from model.structure.materials import EXCITER_TYPES, KNOWN_MATERIALS
+from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
 
 SECTIONS: Mapping[str, type[Section]] = {
     "rig": sections.RigSection,

@@ -1,6 +1,6 @@
 """Interfaces for materials by name: entry points `era_haptics.materials`."""
 
-from model.structure.materials import KnownMaterial
+from model.structure.material import KnownMaterial
 from model.structure.plate import Material, Orthotropy
 
 __all__ = ["KnownMaterial", "Material", "Orthotropy"]

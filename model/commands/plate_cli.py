@@ -249,7 +249,7 @@ def _percents(shares: Iterable[float]) -> str:
 @plate_app.command()
 def materials(as_json: JsonOption = False) -> None:
     """List known materials with their sources."""
-    from model.structure.materials import known_material, material_names
+    from model.structure.material import known_material, material_names
 
     known, problems = {}, []
     for name in material_names():

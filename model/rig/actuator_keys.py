@@ -36,7 +36,7 @@ from model.config.units import (
 from model.finger import THRESHOLDS
 from model.structure.attachments import Era, Gain, damping_from_ratio
 from model.structure.exciter import Actuator, Exciter
-from model.structure.materials import EXCITER_TYPES
+from model.structure.material import EXCITER_TYPES
 from model.structure.plate import Plate
 from registry.plugins import did_you_mean
 

@@ -40,7 +40,7 @@ from model.structure.attachments import (
     support_problem,
 )
 from model.structure.exciter import Exciter
-from model.structure.materials import EXCITER_TYPES
+from model.structure.material import EXCITER_TYPES
 from model.structure.plate import (
     AirGap,
     Bond,

@@ -25,7 +25,7 @@ from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig
 from model.rig.rig_file import rig_of
 from model.rig.sections import PlateSection, RigSection
-from model.structure.materials import known_material
+from model.structure.material import known_material
 from model.structure.plate import FOLLOWED_FIELDS
 
 _PER_LINE = 4

@@ -67,7 +67,7 @@ from model.structure.attachments import (
     PointLoad,
     edge_points,
 )
-from model.structure.materials import KnownMaterial, known_material, material_names
+from model.structure.material import KnownMaterial, known_material, material_names
 from model.structure.plate import (
     MAX_LOSS_EXPONENT,
     AirGap,

@@ -25,7 +25,7 @@ from model.rig.rig_summary import RIG as RIG_SUMMARY_RIG
 from model.rig.rig_summary import gain_notes
 from model.rig.rig_writing import rewritten_text
 from model.structure.attachments import Fingertip, PointLoad, footprints_of
-from model.structure.materials import material
+from model.structure.material import material
 from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseMotions, Term

@@ -20,7 +20,7 @@ from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad
 from model.structure.exciter import Actuator, Exciter
-from model.structure.materials import material
+from model.structure.material import material
 from model.structure.plate import (
     AirGap,
     Bond,

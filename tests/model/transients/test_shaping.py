@@ -17,7 +17,7 @@ from model.finger import fingertip_points, fingertip_weights
 from model.reduction.reduced_plate import ReducedPlate
 from model.rig.rig_file import load_rig
 from model.structure.attachments import Era
-from model.structure.materials import material
+from model.structure.material import material
 from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import (

@@ -90,7 +90,7 @@ lint: .venv/installed-test
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 	$(BIN)/python tests/support/vocabulary.py
-	-$(BIN)/python tests/support/names.py
+	$(BIN)/python tests/support/names.py
 	$(BIN)/python tests/support/ceilings.py
 	$(PAGES) --check
 

@@ -33,8 +33,8 @@ _FIRST_BLOCK = 5.0  # s
 _FADE = 0.05  # s; ramp, blocks and buffers
 
 
-class _Ended(Exception):
-    """By a signal."""
+class _EndedBySignal(Exception):
+    """The process is to end, by a signal."""
 
 
 def main() -> None:
@@ -76,7 +76,7 @@ def main() -> None:
         library().sound_lost()  # the fault reaction
         time.sleep(_FADE)
         os._exit(LOST)  # not by way of a library whose device has gone
-    except _Ended:
+    except _EndedBySignal:
         library().sound_end()
         time.sleep(_FADE)
         if output is not None:
@@ -113,7 +113,7 @@ def _tell(**event: object) -> None:
 
 def _end(number: int, frame: FrameType | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise _Ended
+    raise _EndedBySignal
 
 
 def _end_with_parent() -> None:

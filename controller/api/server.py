@@ -1,8 +1,15 @@
 """The API's server and the hub of its notifications, within the control loop's event loop.
 
-However much was sent, clients are served in short turns (`controller/api/connection.py`). What
-takes longer, such as arming, runs as a task of its own. How often a topic is sent is a row of
-`TOPICS` (`controller/api/methods.py`).
+A `Connection` never waits. Its input is taken a line at a time, and both what it has sent and what
+it has not read are bounded. `ApiServer` serves the connections in turns, each of 0.1 ms and at most
+one request more, between which everything else runs. A turn begins with clients that touch or hold
+the lease, and waits while a touch is on its way to the wire. A connection whose input may hold a
+stop has turns of its own, which wait for nothing.
+
+There are places for a bounded number of clients. Further ones are in reserve, where only methods
+that silence are served, so that another client can always connect and `stop`. What takes longer,
+such as arming, runs as a task of its own. How often a topic is sent is a row of `TOPICS`
+(`controller/api/methods.py`).
 """
 
 import asyncio
@@ -10,14 +17,14 @@ import logging
 import math
 import socket
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
-from controller.api.connection import STOP, Acceptor, Admission, Connection, Turns
 from controller.api.jsonrpc import (
+    MAX_LINE_LENGTH,
     ErrorCode,
     Id,
     InvalidRequest,
@@ -29,6 +36,7 @@ from controller.api.jsonrpc import (
     result_line,
     unknown_method,
 )
+from controller.api.link import credentials_of
 from controller.api.methods import METHODS, TOPICS, TouchParams
 from controller.api.schema import (
     MAX_RATE,
@@ -36,15 +44,29 @@ from controller.api.schema import (
     Empty,
     Topic,
 )
+from controller.process.log import RateLimiter
 from controller.sources.touch import CONTACT_TIMEOUT
 from drivers.errors import CommandRefused, DriverError, LinkError
 from model.errors import InputError
 from registry import threads
 
+MAX_UNREAD_BYTES = 1 << 18  # written but not read by the client; half of it by notifications
+_MAX_READ = 1 << 14  # bytes in an iteration of the event loop
+_MAX_READ_AHEAD = 1 << 16  # bytes that wait to be served
+UNREAD_TIMEOUT = 5.0  # s; for losing notifications before the connection is closed
+MAX_REQUEST_RATE = 2000.0  # 1/s, and as many in a burst
 MAX_PENDING = 8  # requests of one client that take long; stop is not counted
-_RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
+MAX_PENDING_STOPS = 64  # requests without responses, above which no further line is taken
+STOP = b'"stop"'
 
-Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessage]]
+MAX_CONNECTIONS = 32  # for all methods
+RESERVE = 8  # further ones, for the methods in reserve alone
+IDLE_TIMEOUT = 1.0  # s; without a request, after which a client may be evicted
+_QUEUE = 512  # connections that wait to be accepted, of which an iteration accepts one
+MAX_TURN = 0.0001  # s, and one request; how long a touch waits for clients
+MAX_DEFERRAL = 0.003  # s; of a turn by touches, which may follow each other without a gap
+_RECHECK = 0.0005  # s; of a turn that is deferred
+_RESERVE_METHODS = sorted(name for name, method in METHODS.items() if method.in_reserve)
 
 # Made anew each time: an exception that is raised again and again keeps all its tracebacks.
 _busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewer per second")
@@ -52,45 +74,174 @@ _busy = partial(RpcError, ErrorCode.BUSY, "too many requests", remedy="send fewe
 _logger = logging.getLogger(__name__)
 
 
+class Connection(asyncio.BufferedProtocol):
+    """A client's connection, and what the server and its methods note of the client."""
+
+    _transport: asyncio.Transport
+
+    def __init__(self, server: "ApiServer") -> None:
+        self.name = "unnamed client"
+        self.process = 0  # its id; 0 if unknown
+        self.received_at = server.clock()  # s; when the last bytes arrived
+        self.is_reserve = False  # whether it is in reserve
+        self.is_at_end = False  # whether it has closed its side
+        self.pending: set[asyncio.Task[None]] = set()
+        self.silenced = 0  # its stops and disarms
+        self.touched_at = -math.inf  # s; when it sent fingers, unless it has lifted them since
+        self.topics: dict[Topic, asyncio.TimerHandle | None] = {}  # subscriptions; None: unperiodic
+        self.lease = ""  # token of the last lease that it armed or renewed
+        self.number: int | None = None  # of those that have touched
+        self.rate = RateLimiter(MAX_REQUEST_RATE, clock=server.clock)
+        self._server = server
+        self._received = memoryview(bytearray(_MAX_READ))
+        self._input = bytearray()
+        self._line_end = -1  # of the next line in _input; -1: not received yet
+        self._stop_at = -1  # of the last text in _input that may be a stop; -1: none
+        self._lost = 0
+        self._losing_since = math.inf  # s
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can still be written to."""
+        return not self._transport.is_closing()
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the client has closed its side, or the connection is lost."""
+        return self.is_at_end or not self.is_open
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether anything can be served now."""
+        has_line = self._line_end >= 0 or len(self._input) >= MAX_LINE_LENGTH
+        return has_line and self.is_open and len(self.pending) < MAX_PENDING_STOPS
+
+    @property
+    def is_urgent(self) -> bool:
+        """Whether its input may hold a stop."""
+        return self._stop_at >= 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Store the transport and ask the server for admission."""
+        self._transport = cast(asyncio.Transport, transport)
+        # Output is bounded here, by the size of the write buffer.
+        self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
+        credentials = credentials_of(transport.get_extra_info("socket"))
+        self.process = 0 if credentials is None else credentials[0]
+        self._server.admit(self)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Buffer for the next bytes."""
+        return self._received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Keep the bytes received, undivided; pause reading while much waits to be served."""
+        self.received_at = self._server.clock()
+        before = len(self._input)
+        self._input += self._received[:nbytes]
+        self._stop_at = max(self._stop_at, self._input.rfind(STOP, max(0, before - len(STOP) + 1)))
+        if self._line_end < 0:
+            self._line_end = self._input.find(b"\n", before)
+        if len(self._input) > _MAX_READ_AHEAD:
+            self._transport.pause_reading()
+        self._server.add(self)
+
+    def eof_received(self) -> bool:
+        """Finish what the client requested before it closed its side, then close."""
+        self.is_at_end = True
+        self.close_if_finished()
+        return True
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Report the end; pending requests are carried out all the same."""
+        self._server.forget(self)
+
+    def next_line(self) -> bytes | None:
+        """Take the next line; None if it is too long."""
+        end = self._line_end
+        if not 0 <= end < MAX_LINE_LENGTH:
+            return None
+        line = bytes(memoryview(self._input)[:end])
+        del self._input[: end + 1]
+        self._stop_at = max(self._stop_at - end - 1, -1)
+        self._line_end = self._input.find(b"\n")
+        if len(self._input) <= _MAX_READ_AHEAD:
+            self._transport.resume_reading()
+        return line
+
+    def close_if_finished(self) -> None:
+        """Close after the last response, if the client has closed its side."""
+        if self.is_at_end and not self.has_lines and not self.pending:
+            self.close()
+
+    def respond(self, line: bytes) -> None:
+        """Send a response, or close the connection of a client that does not read."""
+        unread = self._transport.get_write_buffer_size()
+        if unread and unread + len(line) > MAX_UNREAD_BYTES:
+            self.abort()
+        elif self.is_open:
+            self._transport.write(line)
+
+    def notify(self, make_line: Callable[[int], bytes]) -> bool:
+        """Send a notification, made with the number of those dropped before it, or drop it too.
+
+        Returns whether it was dropped because the client reads too slowly.
+        """
+        if not self.is_open:
+            return False
+        if self._transport.get_write_buffer_size() < MAX_UNREAD_BYTES // 2:
+            self._transport.write(make_line(self._lost))
+            self._lost, self._losing_since = 0, math.inf
+            return False
+        now = self._server.clock()
+        self._lost, self._losing_since = self._lost + 1, min(self._losing_since, now)
+        if now - self._losing_since > UNREAD_TIMEOUT:
+            self.abort()
+        return True
+
+    def refuse(self, error: RpcError) -> None:
+        """Send an error and close."""
+        self.respond(error_line(None, error))
+        self.close()
+
+    def close(self) -> None:
+        """Close after all output is sent."""
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._transport.abort()
+
+
+Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessage]]
+
+
 @dataclass(slots=True)
 class _Call:
     """A line as read: a method with its parameters, or an error."""
 
-    id: Id
-    expects_response: bool
+    id: Id = None
+    expects_response: bool = True
     method: str = ""
     params: ApiMessage | None = None
     error: Exception | None = None
     record: dict[str, Any] = field(default_factory=dict)  # for dumps, with the outcome
 
-    def is_superseded_by(self, other: "_Call | None") -> bool:
-        """Whether both are touch frames of one source without an id, and the newer one is enough.
-
-        A frame holds all fingers of its source, hence no lift is lost; nor is a finger that came,
-        for the newer one must have all of the older one.
-        """
-        return (
-            other is not None
-            and not (self.expects_response or other.expects_response)
-            and isinstance(self.params, TouchParams)
-            and isinstance(other.params, TouchParams)
-            and self.params.source == other.params.source
-            and {each.id for each in self.params.touches}
-            <= {each.id for each in other.params.touches}
-        )
-
 
 def _read_call(line: bytes) -> _Call:
+    call = _Call()
     try:
         request = read_request(line)
+        call.id, call.expects_response = request.id, request.expects_response
         if request.method not in METHODS:
             raise unknown_method(request.method, METHODS)
-        params = read_params(METHODS[request.method].params, request)
+        call.params = read_params(METHODS[request.method].params, request)
+        call.method = request.method
     except InvalidRequest as error:
-        return _Call(error.id, True, error=error)
-    except RpcError as error:
-        return _Call(request.id, request.expects_response, error=error)
-    return _Call(request.id, request.expects_response, request.method, params)
+        call.id, call.error = error.id, error
+    except Exception as error:  # of the parameters, or a bug
+        call.error = error
+    return call
 
 
 class ApiServer:
@@ -103,7 +254,7 @@ class ApiServer:
     stop_all: stops all amplifiers where a client's stop has failed on its way.
     requested: notes a request by its client, its method and when it came [s], and returns the
         record that gets its outcome.
-    clock, processor_time: of the process, and of this thread [s].
+    clock: of the process [s].
     """
 
     def __init__(
@@ -116,168 +267,219 @@ class ApiServer:
         stop_all: Callable[[], object] = lambda: None,
         requested: Callable[[str, str, float], dict[str, Any]] = lambda *_: {},
         clock: Callable[[], float] = threads.now,
-        processor_time: Callable[[], float] = time.thread_time,
     ) -> None:
+        self.clock = clock
+        self.clients: dict[Connection, None] = {}
         self._handlers = handlers
         self._on_disconnect = on_disconnect
+        self._holds_lease = holds_lease
+        self._is_busy = is_busy
         self._stop_all = stop_all
         self._requested = requested
-        self._clock = clock
-        self._admission = Admission(holds_lease=holds_lease, clock=clock)
-        self._turns = Turns(
-            self._serve_line,
-            # Fingers that a client no longer reports count as lifted.
-            is_first=lambda client: (
-                clock() - client.touched_at <= CONTACT_TIMEOUT or holds_lease(client)
-            ),
-            is_busy=is_busy,
-            clock=clock,
-            processor_time=processor_time,
-        )
-        self._acceptor: Acceptor | None = None
+        self._listening: asyncio.Server | None = None
+        self._waiting: dict[Connection, None] = {}  # to be served, in this order
+        self._scheduled: set[bool] = set()  # turns, by whether they are for stops
+        self._deferred_since: float | None = None  # s
 
     async def open(self, bound: socket.socket) -> None:
         """Listen on a bound Unix socket; its permissions decide who may connect."""
-        self._acceptor = Acceptor(bound, self._make_connection, clock=self._clock)
+        loop = asyncio.get_running_loop()
+        # asyncio accepts as many in an iteration as it lets wait.
+        self._listening = await loop.create_unix_server(
+            partial(Connection, self), sock=bound, backlog=1
+        )
+        bound.listen(_QUEUE)
 
     async def close(self) -> None:
         """Stop listening and close all connections after their pending output."""
-        if self._acceptor is None:
+        if self._listening is None:
             return
-        await self._acceptor.close()
-        for connection in list(self._admission.admitted):
-            connection.close()
-        await asyncio.sleep(0)
-        for connection in list(self._admission.admitted):
-            connection.abort()
+        for each in self._listening.sockets:
+            asyncio.get_running_loop().remove_reader(each)
+        for _ in range(3):  # iterations in which what was accepted is opened
+            await asyncio.sleep(0)
+        self._listening.close()
+        for end in (Connection.close, Connection.abort):
+            for client in list(self.clients):
+                end(client)
+            await asyncio.sleep(0)
 
-    def _make_connection(self, process: int) -> Connection:
-        return Connection(
-            process,
-            on_connect=self._admission.admit,
-            on_lines=self._turns.add,
-            on_disconnect=self._disconnected,
-            clock=self._clock,
-        )
+    def admit(self, new: Connection) -> None:
+        """Admit a new client, if necessary in place of another, or close it."""
+        new.is_reserve = not self._has_room()
+        reserve = [new, *(each for each in self.clients if each.is_reserve)]
+        if new.is_reserve and len(reserve) > RESERVE:
+            # Of the process with the most of them, so that others keep their places.
+            counts = Counter(each.process for each in reserve)
+            evicted = min(
+                (each for each in reserve if not each.pending),
+                key=lambda each: (-counts[each.process], each.received_at),
+            )
+            self.clients.pop(evicted, None)
+            evicted.abort()
+        if new.is_open:
+            self.clients[new] = None
 
-    def _disconnected(self, connection: Connection) -> None:
-        self._admission.admitted.discard(connection)
-        self._on_disconnect(connection)
+    def _has_room(self) -> bool:
+        """Whether there is a place for all methods, if need be that of the longest idle client."""
+        full = [each for each in self.clients if not each.is_reserve]
+        if len(full) < MAX_CONNECTIONS:
+            return True
+        idle = [each for each in full if not each.pending and not self._holds_lease(each)]
+        evicted = min(idle, key=lambda each: each.received_at, default=None)
+        if evicted is None or self.clock() - evicted.received_at < IDLE_TIMEOUT:
+            return False
+        del self.clients[evicted]
+        evicted.abort()
+        return True
 
-    def _serve_line(self, connection: Connection) -> None:
-        """Serve the next line of a client, or start to."""
-        call = self._next_call(connection)
-        if call is None:
+    def forget(self, client: Connection) -> None:
+        """Forget a client that has disconnected."""
+        self.clients.pop(client, None)
+        self._waiting.pop(client, None)
+        self._on_disconnect(client)
+
+    def add(self, client: Connection) -> None:
+        """Serve a client that has lines: with what may be a stop at once.
+
+        Others have their turn in the next iteration but one. Data that arrived meanwhile and what
+        it wakes, such as the control loop for a touch, run first.
+        """
+        if not client.has_lines:
             return
-        try:
-            call.record = self._requested(connection.name, call.method, connection.received_at)
-            self._check(connection, call)
-            method, handle = METHODS[call.method], self._handlers[call.method]
-            connection.silenced += method.silences
-            if not method.needs_reply:
-                result = handle(connection, call.params)
-            elif call.expects_response:
-                work = partial(handle, connection, call.params)
-                result = _for_one_who_stays(connection, connection.silenced, work)
+        self._waiting.setdefault(client)
+        if client.is_urgent not in self._scheduled:
+            self._scheduled.add(client.is_urgent)
+            loop = asyncio.get_running_loop()
+            if client.is_urgent:
+                loop.call_soon(self._take_turn, True)
             else:
-                result = Empty()
+                loop.call_soon(loop.call_soon, self._take_turn, False)
+
+    def _take_turn(self, is_urgent: bool) -> None:
+        """Serve a line of each client of a rank, round and round, until the turn's time is up.
+
+        Of each rank at least one line, so that none keeps the next one waiting for ever.
+        """
+        if not is_urgent and self._is_deferred():
+            asyncio.get_running_loop().call_later(_RECHECK, self._take_turn, False)
+            return
+        self._scheduled.discard(is_urgent)
+        end = time.perf_counter() + MAX_TURN
+        try:
+            for rank in (0,) if is_urgent else (1, 2):
+                clients = deque(each for each in self._waiting if self._rank(each) == rank)
+                while clients:
+                    client = clients.popleft()
+                    self._waiting.pop(client, None)
+                    if client.has_lines:
+                        self._serve(client)
+                    if client.has_lines:  # behind the others
+                        self._waiting[client] = None
+                        clients.append(client)
+                    client.close_if_finished()
+                    if time.perf_counter() >= end:
+                        break
+        finally:  # whatever fails: others wait, perhaps with a stop
+            for each in [*self._waiting]:
+                self.add(each)
+
+    def _is_deferred(self) -> bool:
+        """Whether a turn waits for a touch on its way to the wire."""
+        now = self.clock()
+        if not self._is_busy():
+            self._deferred_since = None
+        elif self._deferred_since is None:
+            self._deferred_since = now
+        elif now - self._deferred_since >= MAX_DEFERRAL:
+            self._deferred_since = None
+        return self._deferred_since is not None
+
+    def _rank(self, client: Connection) -> int:
+        """Its place in turns: 0 with what may be a stop, 1 if it touches or holds the lease."""
+        # Fingers that a client no longer reports count as lifted.
+        touches = self.clock() - client.touched_at <= CONTACT_TIMEOUT
+        return 0 if client.is_urgent else 1 if touches or self._holds_lease(client) else 2
+
+    def _serve(self, client: Connection) -> None:
+        """Serve the next line of a client, or start to."""
+        line = client.next_line()
+        if line is None:
+            what = f"line longer than {MAX_LINE_LENGTH} bytes"
+            client.refuse(RpcError(ErrorCode.PARSE, what, remedy="send less"))
+            return
+        call = _read_call(line)
+        if (call.error or METHODS[call.method].is_limited) and not client.rate.take():
+            if call.error is not None:
+                client.refuse(_busy())
+                return
+            call.error = _busy()
+        try:
+            call.record = self._requested(client.name, call.method, client.received_at)
+            self._check(client, call)
+            method = METHODS[call.method]
+            client.silenced += method.silences
+            if isinstance(call.params, TouchParams):
+                client.touched_at = self.clock() if call.params.touches else -math.inf
+            handle = partial(self._handlers[call.method], client, call.params)
+            result: ApiMessage | Awaitable[ApiMessage] = Empty()
+            if not method.needs_reply:
+                result = handle()
+            elif call.expects_response:
+                result = _for_one_who_stays(client, client.silenced, handle)
             if isinstance(result, ApiMessage):
-                self._respond(connection, call, result)
+                self._respond(client, call, result)
                 return
         except Exception as error:
-            if call.method == "stop":
+            # A bug in reading the line: what may be a stop is one.
+            if call.method == "stop" or (STOP in line and not isinstance(error, RpcError)):
                 self._stop_all()
-            self._respond(connection, call, error)
+            self._respond(client, call, error)
             return
-        task = asyncio.ensure_future(self._finish(connection, call, result))
-        connection.pending.add(task)
-        task.add_done_callback(lambda task: self._finished(connection, task))
+        task = asyncio.ensure_future(self._finish(client, call, result))
+        client.pending.add(task)
+        task.add_done_callback(lambda task: self._finished(client, task))
 
-    def _next_call(self, connection: Connection) -> _Call | None:
-        """Read the next line, unless it is a touch frame that the one after replaces.
-
-        That one is then read, and ahead.
-        """
-        call: _Call | None = connection.ahead or self._read(connection)
-        connection.ahead = None
-        if call is not None and not connection.is_open and call.method != "stop":
-            return None  # the client has left: its fingers are lifted, and its lease has ended
-        if call is not None and isinstance(call.params, TouchParams):
-            connection.touched_at = self._clock() if call.params.touches else -math.inf
-            connection.ahead = self._read(connection)
-            if call.is_superseded_by(connection.ahead):
-                return None
-        return call
-
-    def _read(self, connection: Connection) -> _Call | None:
-        """Read the next line, within the client's rate; refused requests count."""
-        is_urgent = connection.is_urgent
-        try:
-            line = connection.next_line()
-        except InvalidRequest as error:
-            connection.refuse(error)
-            return None
-        if line is None:
-            return None
-        try:
-            call = _read_call(line)
-        except Exception as error:  # a bug: what may be a stop is one
-            if STOP in line:
-                self._stop_all()
-            call = _Call(None, True, error=error)
-        if is_urgent and STOP in line and call.method != "stop":
-            connection.note_false_alarm()
-        is_limited = call.error is not None or METHODS[call.method].is_limited
-        if not is_limited or connection.rate.take():
-            return call
-        if call.error is not None:
-            connection.refuse(_busy())
-            return None
-        return replace(call, params=None, error=_busy())
-
-    def _finished(self, connection: Connection, task: "asyncio.Task[None]") -> None:
-        connection.pending.discard(task)
-        if connection.has_lines:
-            self._turns.add(connection)
-        connection.close_if_finished()
-
-    def _check(self, connection: Connection, call: _Call) -> None:
+    def _check(self, client: Connection, call: _Call) -> None:
         """Raise why a call is not carried out."""
         if call.error is not None:
             raise call.error
-        if not METHODS[call.method].in_reserve and not self._admission.promote(connection):
-            raise RpcError(
-                ErrorCode.BUSY,
-                f"too many clients; only {', '.join(_RESERVE_METHODS)} are served here",
-                remedy="try again later",
-            )
-        if call.method != "stop" and len(connection.pending) >= MAX_PENDING:
+        if client.is_reserve and not METHODS[call.method].in_reserve:
+            client.is_reserve = not self._has_room()
+            if client.is_reserve:
+                raise RpcError(
+                    ErrorCode.BUSY,
+                    f"too many clients; only {', '.join(_RESERVE_METHODS)} are served here",
+                    remedy="try again later",
+                )
+        if call.method != "stop" and len(client.pending) >= MAX_PENDING:
             raise RpcError(ErrorCode.BUSY, "too many pending requests", remedy="await responses")
 
-    async def _finish(
-        self, connection: Connection, call: _Call, result: Awaitable[ApiMessage]
-    ) -> None:
+    async def _finish(self, client: Connection, call: _Call, result: Awaitable[ApiMessage]) -> None:
         try:
-            self._respond(connection, call, await result)
+            self._respond(client, call, await result)
         except Exception as error:
-            self._respond(connection, call, error)
+            self._respond(client, call, error)
 
-    def _respond(
-        self, connection: Connection, call: _Call, outcome: ApiMessage | Exception
-    ) -> None:
+    def _finished(self, client: Connection, task: "asyncio.Task[None]") -> None:
+        client.pending.discard(task)
+        self.add(client)
+        client.close_if_finished()
+
+    def _respond(self, client: Connection, call: _Call, outcome: ApiMessage | Exception) -> None:
         if isinstance(outcome, ApiMessage):
+            response = result_line(call.id, outcome.model_dump_json())
             call.record["outcome"] = "done"
-            if call.expects_response:
-                connection.respond(result_line(call.id, outcome.model_dump_json()))
-            return
-        error = _rpc_error(outcome)
-        call.record["outcome"] = call.record["refused"] = str(error)
+        else:
+            error = _rpc_error(outcome)
+            response = error_line(call.id, error)
+            call.record["outcome"] = call.record["refused"] = str(error)
         if call.expects_response:
-            connection.respond(error_line(call.id, error))
+            client.respond(response)
 
 
 async def _for_one_who_stays(
-    connection: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
+    client: Connection, silenced: int, handle: Callable[[], ApiMessage | Awaitable[ApiMessage]]
 ) -> ApiMessage:
     """Handle a request of a client that has not left, or silenced all, with the same bytes.
 
@@ -285,9 +487,9 @@ async def _for_one_who_stays(
     """
     for _ in range(2):  # iterations in which its end is received
         await asyncio.sleep(0)
-    if connection.silenced != silenced:
+    if client.silenced != silenced:
         raise RpcError(ErrorCode.LEASE, "stopped or disarmed meanwhile", remedy="arm again")
-    if connection.has_left:
+    if client.has_left:
         raise RpcError(ErrorCode.LEASE, "the client has left", remedy="stay to renew the lease")
     result = handle()
     return result if isinstance(result, ApiMessage) else await result

@@ -17,7 +17,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
-from controller.api.connection import MIN_DESCRIPTORS, allow_many_descriptors
 from controller.api.methods import ReloadResult
 from controller.api.schema import headline
 from controller.api.server import ApiServer
@@ -33,7 +32,12 @@ from controller.operation.operation_states import ENERGISED, DaemonState, Operat
 from controller.operation.supervisor import Supervisor
 from controller.play.loop import Controller
 from controller.play.planner import Observers
-from controller.process.daemon_process import ServiceManager, SocketLock
+from controller.process.daemon_process import (
+    MIN_DESCRIPTORS,
+    ServiceManager,
+    SocketLock,
+    allow_many_descriptors,
+)
 from controller.process.log import LogThread, open_log_file, start_log
 from drivers.errors import DriverError
 from drivers.host.amplifier import WATCHDOG, Amplifier

@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
 
-from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     METHODS,
@@ -38,7 +37,7 @@ from controller.api.methods import (
     api_method,
 )
 from controller.api.schema import AmplifierSilence, Empty, headline
-from controller.api.server import Handler
+from controller.api.server import Connection, Handler
 from controller.content.pattern import pattern_of_points
 from controller.daemon.config import API_SOURCES, DaemonConfig
 from controller.daemon.layouts import LayoutChoice

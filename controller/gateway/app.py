@@ -25,7 +25,6 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic.json_schema import models_json_schema
 
 from controller.api.client import AsyncClient
-from controller.api.connection import allow_many_descriptors
 from controller.api.jsonrpc import (
     ERROR_MEANINGS,
     ErrorCode,
@@ -53,6 +52,7 @@ from controller.gateway.connections import (
 from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
+from controller.process.daemon_process import allow_many_descriptors
 from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections

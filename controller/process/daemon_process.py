@@ -6,6 +6,7 @@ NOTIFY_SOCKET, non-blocking; errors are ignored. Without the variable nothing is
 
 import contextlib
 import os
+import resource
 import socket
 import stat
 from collections.abc import Mapping
@@ -175,3 +176,17 @@ def _check_folder(folder: Path) -> None:
     is_foreign = not {status.st_uid, link.st_uid} <= {0, os.getuid()}
     if is_foreign or status.st_mode & stat.S_IWOTH:
         raise InputError(f"{folder}: other users can write to this folder; {_REMEDY}")
+
+
+MIN_DESCRIPTORS = 64
+_MAX_DESCRIPTORS = 65_536
+
+
+def allow_many_descriptors() -> int:
+    """Raise the limit, so that idle connections do not use it up; return it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limit = _MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else hard
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+        return limit
+    return soft

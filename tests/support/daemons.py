@@ -19,6 +19,7 @@ import json
 import logging
 import os
 import signal
+import struct
 import sys
 import tempfile
 import time
@@ -28,19 +29,18 @@ from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-import virtual_lines
 from chain import Chain
 from controller.api.client import AsyncClient
-from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, RpcError
 from controller.api.link import Notification
 from controller.api.methods import METHODS
 from controller.api.schema import ApiMessage, Empty
-from controller.api.server import ApiServer
+from controller.api.server import ApiServer, Connection
 from controller.daemon.config import load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.process.daemon_process import ServiceManager, SocketLock
@@ -63,7 +63,7 @@ from registry import threads
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from typed_page import ERA
-from virtual_lines import VirtualLoop
+from virtual_lines import VirtualLoop, feed
 
 PATIENCE = 180.0  # s; generous, for a loaded machine
 PLACE = (0.1, 0.1)
@@ -617,10 +617,11 @@ async def playing(
 
 
 class Wire(asyncio.Transport):
-    """Transport of a client that reads nothing."""
+    """Transport of a client, of a process by its id, that reads nothing."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, process: int = 1) -> None:
+        peer = SimpleNamespace(getsockopt=lambda *_: struct.pack("3i", process, 0, 0))
+        super().__init__({"socket": peer})
         self.waiting = b""
         self.is_aborted = False
         self.is_read = True
@@ -666,44 +667,30 @@ def request(method: str, params: str = "{}", *, id: str | int | None = None) -> 
     return f'{{"jsonrpc":"2.0",{head}"method":"{method}","params":{params}}}\n'.encode()
 
 
-def feed(client: Connection, data: bytes) -> None:
-    """Let a client send bytes, whose reading takes no processor time."""
-    virtual_lines.feed(client, data)
-    client.reading_time = 0.0
-
-
 class ServedApi:
-    """A server whose methods take a processor time [s] each, as does a reading of it; clock [s].
+    """A server in memory; clock [s].
 
     calls: name, parameters and time of each; is_busy: whether a touch is on its way to the wire;
     may_arm: what arming waits for; called: called with each name, and its exceptions are those of
-    the method; stops: how often the server itself has stopped all.
+    the method; stops: how often the server itself has stopped all; holder: who holds the lease.
     """
 
-    def __init__(
-        self,
-        *,
-        clock: Callable[[], float] = lambda: 0.0,
-        costs: float = 0.0,
-        reading_costs: float = 0.0,
-    ) -> None:
+    def __init__(self, *, clock: Callable[[], float] = lambda: 0.0) -> None:
         self.calls: list[tuple[str, ApiMessage, float]] = []
         self.is_busy = False
         self.may_arm = asyncio.Event()
         self.stops = 0
         self.called: Callable[[str], object] = lambda name: None
-        self._processor_time = 0.0
         self.clock = clock
-        self._costs, self._reading_costs = costs, reading_costs
+        self.holder: Connection | None = None
         self._clients: list[Connection] = []
         self._server = ApiServer(
             {name: partial(self._handle, name) for name in METHODS},
             on_disconnect=lambda client: None,
-            holds_lease=lambda client: False,
+            holds_lease=lambda client: client is self.holder,
             is_busy=lambda: self.is_busy,
             stop_all=self._stop_all,
-            clock=clock,
-            processor_time=self._read_processor_time,
+            clock=lambda: self.clock(),
         )
 
     @property
@@ -717,7 +704,7 @@ class ServedApi:
 
     def client(self, *, process: int = 1) -> tuple[Connection, Wire]:
         """A client of a process."""
-        client, wire = self._server._make_connection(process), Wire()
+        client, wire = Connection(self._server), Wire(process)
         client.connection_made(wire)
         self._clients.append(client)
         return client, wire
@@ -734,17 +721,12 @@ class ServedApi:
             await asyncio.sleep(0)
             left = 8 if any(client.has_lines for client in self._clients) else left - 1
 
-    def _read_processor_time(self) -> float:
-        self._processor_time += self._reading_costs
-        return self._processor_time
-
     def _stop_all(self) -> None:
         self.stops += 1
 
     def _handle(
         self, name: str, client: Connection, params: ApiMessage
     ) -> ApiMessage | Awaitable[ApiMessage]:
-        self._processor_time += self._costs
         self.calls.append((name, params, self.clock()))
         self.called(name)
         if name == "play":

@@ -33,7 +33,6 @@ from websockets.typing import Subprotocol
 from websockets.uri import parse_uri
 
 from controller.api.client import Client
-from controller.api.connection import Connection
 from controller.api.jsonrpc import ErrorCode, NotSilent, RpcError
 from controller.api.methods import (
     METHODS,
@@ -61,7 +60,7 @@ from controller.api.schema import (
     TableSummary,
     Topic,
 )
-from controller.api.server import ApiServer, Hub
+from controller.api.server import ApiServer, Connection, Hub
 from daemons import PATIENCE, daemon_table, write_daemon
 from model.rig.rig_file import parse_rig
 from model.table.table import LocalizationTable

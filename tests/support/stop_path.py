@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 
 import controller
 import drivers
+from controller.api.server import Connection
 from daemons import Wire, ready_daemon, request, until
 from virtual_lines import VirtualLoop, run_virtual
 
@@ -61,7 +62,7 @@ async def _stopped(folder: Path) -> tuple[tuple[Function, ...], int]:
     assert isinstance(loop, VirtualLoop)
     async with ready_daemon(folder) as (bench, era):
         await era.arm("a test", lease_s=60)
-        client, wire = bench.daemon._server._make_connection(0), Wire()
+        client, wire = Connection(bench.daemon._server), Wire()
         client.connection_made(wire)
         await asyncio.sleep(0.01)
         chain, written, calls = Chain(loop), list[tuple[Function, ...]](), 0

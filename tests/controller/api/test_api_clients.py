@@ -75,7 +75,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
 
         async def lose(duration: float) -> None:
             bench.socket.rename(away)
-            for connection in list(bench.daemon._server._admission.admitted):
+            for connection in list(bench.daemon._server.clients):
                 connection.abort()
             await asyncio.sleep(duration)
             away.rename(bench.socket)

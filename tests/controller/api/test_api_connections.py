@@ -6,9 +6,6 @@ Bounds are to the byte and the request, turns are counted in requests; both in v
 import asyncio
 import contextlib
 import json
-import os
-import resource
-import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,26 +13,23 @@ from typing import Any, cast
 
 import pytest
 
-from controller.api import connection
-from controller.api import connection as turns
+from controller.api import server
 from controller.api.client import AsyncClient, Client
-from controller.api.connection import (
+from controller.api.methods import METHODS, TOPICS, ContactsEvent, EventParams, LogEvent
+from controller.api.schema import MAX_RATE, ApiMessage
+from controller.api.server import (
     MAX_CONNECTIONS,
     MAX_REQUEST_RATE,
     MAX_UNREAD_BYTES,
-    Acceptor,
-    Admission,
+    RESERVE,
     Connection,
+    Hub,
 )
-from controller.api.methods import METHODS, TOPICS, ContactsEvent, EventParams, LogEvent
-from controller.api.schema import MAX_RATE, ApiMessage
-from controller.api.server import Hub
 from controller.gateway.field import DrawnField
 from daemons import (
     PLACE,
     ServedApi,
     Wire,
-    feed,
     holding,
     request,
     running_daemon,
@@ -43,7 +37,7 @@ from daemons import (
     until_state,
 )
 from registry.threads import no_long_collections
-from virtual_lines import in_virtual_time
+from virtual_lines import feed, in_virtual_time
 
 READY, ENABLED = "READY_TO_SWITCH_ON", "OPERATION_ENABLED"
 # keyed by name, not messages: so many levels deep
@@ -157,23 +151,30 @@ async def test_daemon_sends_exactly_the_documented_keys(tmp_path: Path) -> None:
 
 
 REQUEST = request("renew", '{"lease":"a"}')
+ARM = request("arm", '{"owner":"me","lease_s":5}', id=1)
 TOUCH = request("touch", '{"source":"a","touches":[]}', id=1)
 TOUCH_DOWN = TOUCH.replace(b"[]", b'[{"id":1,"x_m":0.1,"y_m":0.1}]')
 LOOKALIKE = request("renew", '{"lease":"stop"}')
 STOP = request("stop")
 
 
-def serve(**costs: float) -> ServedApi:
-    """A server that counts time from now on; costs: as for `ServedApi`."""
+def serve() -> ServedApi:
+    """A server that counts time from now on."""
     loop = asyncio.get_running_loop()
     began_at = loop.time()
-    return ServedApi(clock=lambda: loop.time() - began_at, **costs)
+    return ServedApi(clock=lambda: loop.time() - began_at)
 
 
 @pytest.fixture(autouse=True)
 def one_line_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """End turns by the number of lines, as virtual time stands still meanwhile."""
-    monkeypatch.setattr(connection, "MAX_TURN", 0.0)
+    monkeypatch.setattr(server, "MAX_TURN", 0.0)
+
+
+async def iterate(count: int) -> None:
+    """Run the event loop for some iterations."""
+    for _ in range(count):
+        await asyncio.sleep(0)
 
 
 @in_virtual_time
@@ -188,55 +189,37 @@ async def test_turn_ends_with_the_line_after_a_tenth_of_a_millisecond(
         lines += 1
 
     monkeypatch.undo()
-    monkeypatch.setattr(connection.time, "perf_counter", lambda: 30e-6 * lines)
+    monkeypatch.setattr(server.time, "perf_counter", lambda: 30e-6 * lines)
     served = serve()
     served.called = count
     feed(served.client()[0], REQUEST * 10)
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
+    await iterate(3)
     assert lines == 4
 
 
 @in_virtual_time
-async def test_clients_take_a_burst_then_a_quarter_of_the_time() -> None:
-    """Of requests of 1 ms each: 20 at once, then 250 in a second, each overdrawn by at most one."""
-    served = serve(costs=0.001)
-    client, _ = served.client()
-    feed(client, TOUCH * 700)
-    await asyncio.sleep(1.0)
-    times = served.times("touch")
-    assert sum(time == 0 for time in times) == pytest.approx(20, abs=1)
-    assert len(times) == pytest.approx(20 + 250, abs=3)
-
-
-@in_virtual_time
 async def test_client_that_touches_waits_for_no_other_client() -> None:
-    """Beside 30 that ask without end, whose requests of 1 ms each take all of their own share."""
-    served = serve(costs=0.001)
+    """Its frames go before all that 30 ask without end, until 150 ms after its last one.
+
+    The others have their turns all the same.
+    """
+    served = serve()
     touching, _ = served.client()
+    feed(touching, TOUCH_DOWN * 8)
+    asking = [served.client()[0] for _ in range(30)]
+    for each in asking:
+        feed(each, REQUEST * 100)
+    await iterate(40)
+    assert served.names[:15] == ["touch", *["touch", "renew"] * 7]  # at first it has not touched
+    await served.settle()
+    await asyncio.sleep(0.16)
+    others = len(served.names)
+    assert others == 3008
+    for each in asking:
+        feed(each, REQUEST)
     feed(touching, TOUCH_DOWN)
-    for _ in range(30):
-        feed(served.client()[0], REQUEST * 100)
-    for number in range(1, 6):
-        await asyncio.sleep(0.1 * number - served.clock())
-        feed(touching, TOUCH_DOWN)
-    await asyncio.sleep(0.05)
-    assert len(served.times("renew")) < 250
-    assert served.times("touch") == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5], abs=0.002)
-
-
-@in_virtual_time
-async def test_client_whose_fingers_were_never_lifted_is_one_of_the_others() -> None:
-    """150 ms after its last frame, as its contacts: it and the others have one share."""
-    served = serve(costs=0.001)
-    silent, _ = served.client()
-    feed(silent, TOUCH_DOWN)
-    feed(served.client()[0], REQUEST * 400)
-    await asyncio.sleep(0.3)
-    feed(silent, REQUEST * 400)
-    await asyncio.sleep(1.0 - served.clock())
-    assert len(served.calls) == pytest.approx(1 + 20 + 250, abs=3)
+    await served.settle()
+    assert served.names[others:] == ["renew"] * 30 + ["touch"]
 
 
 @in_virtual_time
@@ -256,67 +239,39 @@ async def test_requests_wait_while_a_touch_is_on_its_way_to_the_wire() -> None:
 
 
 @in_virtual_time
-async def test_a_turn_that_is_deferred_costs_its_clients_nothing() -> None:
-    """Else what was saved until it is due may be spent by finding that it is not due yet."""
-    served = serve(costs=0.015, reading_costs=3e-6)
-    client, _ = served.client()
-    feed(client, REQUEST * 3)
-    await asyncio.sleep(0.1)
-    assert served.times("renew") == pytest.approx([0.0, 0.0, 0.04], abs=0.001)
-
-
-@in_virtual_time
-async def test_stop_is_served_at_once_though_touches_come_first_and_time_is_overdrawn() -> None:
+async def test_stop_is_served_at_once_though_touches_come_first() -> None:
     """Also behind other requests of its client, and in two parts."""
-    served = serve(costs=0.001)
+    served = serve()
     client, _ = served.client()
-    feed(client, TOUCH * 100)
-    await asyncio.sleep(0.01)
-    assert len(served.times("touch")) < 30
     served.is_busy = True
+    feed(client, TOUCH * 100)
+    await asyncio.sleep(0.001)
+    assert served.calls == []
     feed(client, STOP[:-5])
     feed(client, STOP[-5:])
-    await asyncio.sleep(0.001)
-    assert served.times("stop") == [pytest.approx(0.01)]
+    await asyncio.sleep(0.0001)
+    assert served.times("stop") == [pytest.approx(0.001)]
     assert len(served.times("touch")) == 100
 
 
 @in_virtual_time
-async def test_lines_that_only_look_like_a_stop_are_served_in_turn() -> None:
-    """The first of them is served at once, the next one so only a tenth of a second later."""
+async def test_lines_that_only_look_like_a_stop_keep_no_other_client_waiting() -> None:
+    """With a stop of another client among them, which comes first after one of them."""
     served = serve()
-    client, _ = served.client()
-    served.is_busy = True
-    for pause in (0.0, 0.001, 0.05, 0.06):
-        await asyncio.sleep(pause)
-        feed(client, LOOKALIKE)
-        for _ in range(4):
-            await asyncio.sleep(0)
-    delays = [
-        time - sent
-        for time, sent in zip(served.times("renew"), (0.0, 0.001, 0.051, 0.111), strict=True)
-    ]
-    assert delays == pytest.approx([0.0, 0.003, 0.003, 0.0], abs=0.0006)
+    for _ in range(3):
+        feed(served.client()[0], LOOKALIKE * 100)
+    feed(served.client()[0], REQUEST)
+    stopping, _ = served.client()
+    feed(stopping, STOP)
+    await iterate(12)
+    assert served.names.index("stop") <= 4
+    renewed = [params.model_dump()["lease"] for name, params, _ in served.calls if name == "renew"]
+    assert "a" in renewed
 
 
-async def iterate() -> None:
-    """Run the event loop for a few iterations."""
-    for _ in range(4):
-        await asyncio.sleep(0)
-
-
-def connect(now: Callable[[], float], *, process: int = 1) -> tuple[Connection, Wire]:
-    """A connection of a process and its transport."""
-    connection = Connection(
-        process,
-        on_connect=lambda one: None,
-        on_lines=lambda one: None,
-        on_disconnect=lambda one: None,
-        clock=now,
-    )
-    wire = Wire()
-    connection.connection_made(wire)
-    return connection, wire
+def connect(now: Callable[[], float]) -> tuple[Connection, Wire]:
+    """A connection to a server with a clock, and its transport."""
+    return ServedApi(clock=now).client()
 
 
 def test_connection_closes_when_unread_responses_exceed_256_kib() -> None:
@@ -443,7 +398,6 @@ async def callback_times(data: bytes) -> list[float]:
         times.append(time.thread_time() - begin)
 
     with no_long_collections(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(turns, "MAX_TURN", 0.0)
         patch.setattr(asyncio.Handle, "_run", timed)
         asyncio.get_running_loop().call_soon(feed, connection, data)
         for _ in range(300):
@@ -470,129 +424,49 @@ async def test_no_line_takes_longer_than_some_fixed_work(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("clients", "dropped"),
+    ("idle", "dropped"),
     [
-        ([("kept", 99), ("pending", 99), ("asking", 0.5)], None),
-        ([("kept", 99), ("silent", 0.2), ("subscribed", 99), ("asking", 99)], 1),
-        ([("kept", 99), ("silent", 0.05), ("subscribed", 99)], None),  # it may still speak
-        ([("asking", 99), ("subscribed", 2), ("subscribed", 3)], 2),
-        ([("asking", 2), ("asking", 3), ("subscribed", 0.5)], 1),
+        ([("holder", 99), ("pending", 99), ("asking", 0.9)], None),
+        ([("holder", 99), ("asking", 2), ("asking", 3)], 2),
+        ([("asking", 1.1), ("pending", 3)], 0),
     ],
 )
-def test_place_is_taken_from_the_silent_then_idle_subscribers_then_the_idle(
-    clients: list[tuple[str, float]], dropped: int | None
+async def test_place_is_taken_from_the_client_that_is_idle_for_longest(
+    idle: list[tuple[str, float]], dropped: int | None
 ) -> None:
-    """Never from a holder of the lease or one that waits; kind and silence [s] of each client."""
-    made: list[tuple[Connection, str]] = []
-    admission = Admission(
-        holds_lease=lambda one: (one, "kept") in made,
-        clock=lambda: 100.0,
-    )
-    for kind, silence in [*clients, *[("kept", 0.0)] * (MAX_CONNECTIONS - len(clients))]:
-        connection, _ = connect(lambda silence=silence: 100.0 - silence)
-        connection.has_spoken = kind != "silent"
-        connection.topics = {"state": None} if kind == "subscribed" else {}
-        connection.pending = {cast("asyncio.Task[None]", None)} if kind == "pending" else set()
-        made.append((connection, kind))
-        admission.admitted.add(connection)
-    new, _ = connect(lambda: 100.0)
-    admission.admit(new)
+    """If it is so for a second; never from the holder of the lease, or from one that waits."""
+    served, made = ServedApi(), []
+    for kind, duration in [*idle, *[("asking", 0.0)] * (MAX_CONNECTIONS - len(idle))]:
+        served.clock = lambda duration=duration: 100.0 - duration  # type: ignore[misc]
+        client, wire = served.client()
+        await served.takes(client, ARM if kind == "pending" else REQUEST)
+        served.holder = client if kind == "holder" else served.holder
+        made.append(wire)
+    served.clock = lambda: 100.0
+    new, _ = served.client()
     assert new.is_reserve is (dropped is None)
-    gone = [number for number, (one, _) in enumerate(made) if one not in admission.admitted]
+    gone = [number for number, wire in enumerate(made) if wire.is_aborted]
     assert gone == ([] if dropped is None else [dropped])
+    served.may_arm.set()
+    await served.settle()
 
 
-@pytest.mark.parametrize("processes", [1, 20])
-def test_client_in_reserve_survives_processes_that_connect_again_and_again(
-    processes: int,
-) -> None:
-    """Neither before its first bytes were read nor after, if they hold more of the reserve.
-
-    However many processes there are, none evicts a client whose first bytes wait to be read.
-    """
+async def test_client_in_reserve_survives_a_process_that_connects_again_and_again() -> None:
+    """Before its first bytes and after them; the reserve stays bounded."""
     now = 0.0
-    admission = Admission(
-        holds_lease=lambda one: not one.is_reserve,
-        clock=lambda: now,
-    )
-
-    def newcomers(count: int) -> None:
-        nonlocal now
-        for number in range(count):
-            now += 0.0005
-            one, _ = connect(lambda now=now: now, process=number % processes)
-            one.has_spoken = True
-            admission.admit(one)
-
-    newcomers(2000)
-    near, far = socket.socketpair()
-    with near, far:
-        own, wire = connect(lambda: now, process=4711)
-        wire._extra = {"socket": near}
-        admission.admit(own)
-        assert own in admission.admitted
-        far.send(b"{")
-        newcomers(2000)
-        assert own in admission.admitted
-        feed(own, near.recv(10))
-        newcomers(2000 if processes == 1 else 0)
-        assert own in admission.admitted
-
-
-async def test_server_refuses_connections_of_a_process_above_a_rate(tmp_path: Path) -> None:
-    """After 64 at once the next is closed; a twentieth of a second later one is accepted."""
-    now = 0.0
-    bound = socket.socket(socket.AF_UNIX)
-    bound.bind(str(tmp_path / "s"))
-    made: list[Connection] = []
-
-    def make(process: int) -> Connection:
-        assert process == os.getpid()
-        made.append(connect(lambda: now)[0])
-        return made[-1]
-
-    acceptor = Acceptor(bound, make, clock=lambda: now)
-    async with contextlib.AsyncExitStack() as stack:
-        stack.push_async_callback(acceptor.close)
-
-        async def is_accepted() -> bool:
-            client = stack.enter_context(socket.socket(socket.AF_UNIX))
-            client.setblocking(False)
-            before = len(made)
-            client.connect(str(tmp_path / "s"))
-            while len(made) == before:
-                with contextlib.suppress(BlockingIOError):
-                    return bool(client.recv(1))
-                await asyncio.sleep(0)
-            return True
-
-        assert [await is_accepted() for _ in range(65)] == [True] * 64 + [False]
-        now = 0.05
-        assert [await is_accepted() for _ in range(2)] == [True, False]
-        for each in made:
-            each.abort()
-        await iterate()
-
-
-async def test_server_without_descriptors_closes_new_connections(tmp_path: Path) -> None:
-    """The client reads the end in place of waiting."""
-    bound = socket.socket(socket.AF_UNIX)
-    bound.bind(str(tmp_path / "s"))
-    acceptor = Acceptor(bound, lambda process: connect(lambda: 0.0)[0], clock=lambda: 0.0)
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with socket.socket(socket.AF_UNIX) as client:
-        client.setblocking(False)
-        client.connect(str(tmp_path / "s"))
-        free = os.open(os.devnull, os.O_RDONLY)
-        os.close(free)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (free, before[1]))
-        try:
-            await iterate()
-            received = client.recv(1)
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, before)
-        assert received == b""
-    await acceptor.close()
+    served = ServedApi(clock=lambda: now)
+    for _ in range(MAX_CONNECTIONS):
+        served.client()
+    flooding: list[Wire] = []
+    own, wire = served.client(process=4711)
+    for line in (b"", request("hello", '{"client":"a"}', id=1), request("stop", id=2)):
+        for _ in range(1000):
+            now += 0.0002
+            flooding.append(served.client(process=1)[1])
+        assert own.is_open
+        await served.takes(own, line)
+        assert ["result" in each for each in wire.lines()] == ([True] if line else [])
+    assert sum(not each.is_aborted for each in flooding) == RESERVE - 1
 
 
 async def test_hub_survives_an_exception_of_a_producer(caplog: pytest.LogCaptureFixture) -> None:

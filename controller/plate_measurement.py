@@ -34,8 +34,7 @@ from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
 from model.estimate.forward import Sensor
-from model.estimate.least_squares import MeasuredPlate, Measurement, Repeat
-from model.estimate.measurement import Responses
+from model.estimate.measurement import MeasuredPlate, Measurement, Repeat, Responses
 from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Channel, Rig

@@ -29,7 +29,7 @@ from benchmarks.setting import RIG, random_contacts, use_one_thread
 from model.estimate.forward import RestingFinger, Sensor
 from model.estimate.identify import identify
 from model.estimate.learned_plate import LivePlate, PatternReport, PlateEstimate
-from model.estimate.least_squares import Measurement
+from model.estimate.measurement import Measurement
 from model.estimate.settled_patterns import SettledPattern
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig_file import load_rig

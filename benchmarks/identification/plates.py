@@ -13,7 +13,7 @@ from benchmarks.setting import random_contacts
 from model.errors import InputError
 from model.estimate.forward import Sensor
 from model.estimate.identify import Identification, identify
-from model.estimate.least_squares import Measurement
+from model.estimate.measurement import Measurement
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable

@@ -21,8 +21,7 @@ from model.quantities import counted
 
 if TYPE_CHECKING:
     from model.config.document import Document
-    from model.estimate.least_squares import MeasuredPlate
-    from model.estimate.measurement import Responses
+    from model.estimate.measurement import MeasuredPlate, Responses
     from model.rig.rig import Rig
 
 _NOT_EXPLAINED = (
@@ -128,7 +127,7 @@ def identify(
     from model.estimate import identify as identification_report
     from model.estimate.identify import expected_contrast
     from model.estimate.identify import identify as fit
-    from model.estimate.least_squares import DeviceSettings, measure_by_device
+    from model.estimate.measurement import DeviceSettings, measure_by_device
     from model.estimate.verdict import check_meaning
     from model.structure.modal_elasticity import check_measurable
 
@@ -212,8 +211,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Responses of a file, where they are what they claim to be; raises InputError."""
     import numpy as np
 
-    from model.estimate.least_squares import MeasuredPlate
-    from model.estimate.measurement import read_measured, responses_of
+    from model.estimate.measurement import MeasuredPlate, read_measured, responses_of
     from model.estimate.verdict import check_consistency
 
     responses = responses_of(read_measured(path), rig)

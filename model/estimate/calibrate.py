@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import ComplexArray, FloatArray, best_of
 from model.errors import InputError
 from model.estimate.calibration_fit import (
+    CalibrationFit,
     CalibrationProblem,
-    Fit,
     Parameter,
     clear,
     project_gains,
@@ -228,7 +228,9 @@ def calibrate(
     return report
 
 
-def _identified(problem: CalibrationProblem, start: Fit) -> tuple[CalibrationProblem, Fit]:
+def _identified(
+    problem: CalibrationProblem, start: CalibrationFit
+) -> tuple[CalibrationProblem, CalibrationFit]:
     """Fix parameters that the data determine less than their prior does, and fit again."""
     fit = solve(problem, start.z, start.noise, start.used)
     while True:
@@ -244,7 +246,7 @@ def _identified(problem: CalibrationProblem, start: Fit) -> tuple[CalibrationPro
         fit = solve(problem, z, fit.noise, fit.used)
 
 
-def _with_median_scale_one(problem: CalibrationProblem, fit: Fit) -> Fit:
+def _with_median_scale_one(problem: CalibrationProblem, fit: CalibrationFit) -> CalibrationFit:
     """Attribute the common scale of sensors to the gains; responses do not separate both."""
     scales = problem.scales(fit.z)
     middle = float(np.median(scales))
@@ -261,12 +263,12 @@ def _with_median_scale_one(problem: CalibrationProblem, fit: Fit) -> Fit:
     )
 
 
-def _fit_error(problem: CalibrationProblem, fit: Fit) -> float:
+def _fit_error(problem: CalibrationProblem, fit: CalibrationFit) -> float:
     size = row_rms(problem.values, fit.used)
     return relative_error(problem.values, fit.predicted, size, fit.used)
 
 
-def _check_outliers(problem: CalibrationProblem, fit: Fit) -> None:
+def _check_outliers(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     count = int(np.isfinite(problem.values).sum())
     out = count - int(fit.used.sum())
     if out > MAX_OUTLIERS * count:
@@ -277,7 +279,7 @@ def _check_outliers(problem: CalibrationProblem, fit: Fit) -> None:
         )
 
 
-def _check_sides(problem: CalibrationProblem, fit: Fit) -> None:
+def _check_sides(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
     if _fit_error(problem, fit) > MAX_FIT_ERROR:
         return
@@ -297,7 +299,7 @@ def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     )
 
 
-def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
+def _check_gains(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     """Raise InputError for gains that no drive has: they would hide another plate."""
     for number, era in enumerate(problem.plate.rig.eras):
         measured = np.isfinite(fit.gains_error[:, number])
@@ -313,7 +315,7 @@ def _check_gains(problem: CalibrationProblem, fit: Fit) -> None:
             )
 
 
-def _check_suspensions(problem: CalibrationProblem, fit: Fit) -> None:
+def _check_suspensions(problem: CalibrationProblem, fit: CalibrationFit) -> None:
     """Raise InputError for exciters and feet with a stiffness at its bound, of another kind."""
     plate = problem.plate
     factors: dict[str, float] = {}
@@ -341,7 +343,7 @@ def _check_suspensions(problem: CalibrationProblem, fit: Fit) -> None:
         )
 
 
-def _at_bounds(problem: CalibrationProblem, fit: Fit) -> NDArray[np.bool_]:
+def _at_bounds(problem: CalibrationProblem, fit: CalibrationFit) -> NDArray[np.bool_]:
     """Mask (n,) of the fitted values that are free and at a bound."""
     space = problem.plate.model.space
     distance = np.abs(np.array([space.lower, space.upper]) - fit.z).min(axis=0)
@@ -350,7 +352,7 @@ def _at_bounds(problem: CalibrationProblem, fit: Fit) -> NDArray[np.bool_]:
 
 def _report(
     problem: CalibrationProblem,
-    fit: Fit,
+    fit: CalibrationFit,
     live: Responses,
     *,
     dead_sensors: tuple[str, ...],
@@ -411,7 +413,7 @@ def _report(
     )
 
 
-def rig_of_fit(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> Rig:
+def rig_of_fit(problem: CalibrationProblem, fit: CalibrationFit, z: FloatArray) -> Rig:
     """Rig of the fit z (p,) without form errors; ERAs move where they clearly are elsewhere.
 
     Its gains are those of the rig before.
@@ -425,7 +427,7 @@ def rig_of_fit(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> Rig:
     return replace(rig, eras=eras)
 
 
-def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
+def moved_eras(problem: CalibrationProblem, fit: CalibrationFit) -> tuple[MovedEra, ...]:
     """List the ERAs that are off their places by several standard errors."""
     rig, space, found = problem.plate.rig, problem.plate.model.space, []
     sides = np.array([rig.plate.length, rig.plate.width])
@@ -446,7 +448,7 @@ def moved_eras(problem: CalibrationProblem, fit: Fit) -> tuple[MovedEra, ...]:
 
 
 def predicted_by(
-    rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: Fit
+    rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: CalibrationFit
 ) -> tuple[ComplexArray, ComplexArray]:
     """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
     known = problem.plate
@@ -492,7 +494,9 @@ def _mass_scale_error(rig: Rig) -> float:
     return float(np.hypot(_FOREIGN_MASS, np.linalg.norm(sides)))
 
 
-def hold_out(problem: CalibrationProblem, fit: Fit, live: Responses) -> HeldOutSensors | None:
+def hold_out(
+    problem: CalibrationProblem, fit: CalibrationFit, live: Responses
+) -> HeldOutSensors | None:
     """Fit without some of the live sensors of known scale, and predict their responses.
 
     The prediction is that of the rig as its file has it, without other form errors. Returns None
@@ -546,7 +550,7 @@ def relative_error(
 def uncertainty_of(
     before: Uncertainty,
     problem: CalibrationProblem,
-    fit: Fit,
+    fit: CalibrationFit,
     plain: tuple[FloatArray, FloatArray],
     parameters: Sequence[FittedParameter],
     held_out: HeldOutSensors | None,
@@ -624,7 +628,7 @@ def uncertainty_of(
     return Uncertainty.clipped(**asdict(before) | fitted | gains)
 
 
-def lacking_of(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> FloatArray:
+def lacking_of(problem: CalibrationProblem, fit: CalibrationFit, z: FloatArray) -> FloatArray:
     """Part of a fit's responses that its rig without form errors, z (p,), lacks, relative (f, e).
 
     ERAs stay at the places of the fit, since a rig states the errors of places.
@@ -640,7 +644,7 @@ def lacking_of(problem: CalibrationProblem, fit: Fit, z: FloatArray) -> FloatArr
     return np.asarray(np.sqrt(shares) / size)
 
 
-def place_error(problem: CalibrationProblem, fit: Fit, before: float) -> float:
+def place_error(problem: CalibrationProblem, fit: CalibrationFit, before: float) -> float:
     """Root mean square error of the places of ERAs in the rig of a fit, along a side [m].
 
     Where the fit does not clearly have another place, the error of the kept one counts; before:

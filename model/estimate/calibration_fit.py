@@ -330,7 +330,7 @@ class CalibrationProblem:
         """Scales of sensors (s,) of parameters z (p,)."""
         return 1 + self.plate.model.space.values(z, "sensor_scale")
 
-    def scale_errors(self, fit: "Fit") -> FloatArray:
+    def scale_errors(self, fit: "CalibrationFit") -> FloatArray:
         """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
         return self.free_scales * self.plate.model.space.values(fit.error, "sensor_scale")
 
@@ -357,7 +357,7 @@ class CalibrationProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CalibrationFit:
     """Result of a fit."""
 
     z: FloatArray
@@ -429,7 +429,7 @@ def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np
 
 def solve(
     problem: CalibrationProblem, z: FloatArray, noise: FloatArray, used: NDArray[np.bool_]
-) -> Fit:
+) -> CalibrationFit:
     """Fit parameters, scales and form errors from z (p,), noise (f, e) and a mask (f, e, s)."""
     finite = np.isfinite(problem.values)
     used = used & finite
@@ -451,12 +451,12 @@ def solve(
     return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
 
 
-def clear(fit: Fit) -> NDArray[np.bool_]:
+def clear(fit: CalibrationFit) -> NDArray[np.bool_]:
     """Mask (p,) of parameters that deviate by several standard errors."""
     return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
 
 
-def without_form(problem: CalibrationProblem, fit: Fit) -> tuple[FloatArray, FloatArray]:
+def without_form(problem: CalibrationProblem, fit: CalibrationFit) -> tuple[FloatArray, FloatArray]:
     """Fit the plate without form errors: parameters z (p,), and their standard errors (p,).
 
     Form errors count as noise, since a rig file does not have them; their likeness to another
@@ -536,7 +536,7 @@ def _noise_left(model: ComplexArray, found: Minimum, weight: FloatArray) -> Floa
 
 def _result(
     problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
-) -> Fit:
+) -> CalibrationFit:
     z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
     error, root, chi2 = _errors(problem, found, used)
     model, by_z = responses_of(problem.plate.model, z, searched)
@@ -555,7 +555,7 @@ def _result(
     by_reading = np.tensordot(root[reads].T, relative[reads], axes=1)
     common = np.nanmean(by_reading, axis=(1, 2), keepdims=True)
     beside = by_reading - common
-    return Fit(
+    return CalibrationFit(
         z,
         noise,
         used,

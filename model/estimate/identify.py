@@ -15,7 +15,7 @@ from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import FloatArray
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
-from model.estimate.least_squares import Measurement
+from model.estimate.measurement import Measurement
 from model.estimate.space import KINDS, MAX_GUESSED, Space, Values, rig_with
 from model.estimate.stages import (
     HELD_OUT_FOLDS,

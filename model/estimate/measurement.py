@@ -17,9 +17,12 @@ import logging
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import compress
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +31,6 @@ from model.answer.stimulus import check_on_plate
 from model.arrays import ComplexArray, FloatArray, Point
 from model.errors import InputError
 from model.estimate.forward import Sensor
-from model.estimate.least_squares import Measurement
 from model.files.csv_file import Column, CsvLine, read_lines, write_columns
 from model.files.uff import (
     ACCELERATION,
@@ -42,6 +44,7 @@ from model.files.uff import (
     text_of,
     write_universal,
 )
+from model.processes import Progress
 from model.rig.rig import Rig
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
@@ -87,6 +90,181 @@ _SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(
 PLACES = ("sensor", "x_m", "y_m")
 SENSOR_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
 OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
+
+
+NONLINEAR = 0.02
+"""Relative difference of responses at two levels beyond which a plate is not linear."""
+
+DRIFTED = 0.01
+"""Relative difference of the first tone, played last again, beyond which a plate has changed."""
+
+_FLOOR = 0.1  # of a sensor's rms: below it an error no longer falls with the response
+
+_MEASURER = "era_haptics.lab.measuring.measure:measure_plate"
+"""Named, not imported: the model does not depend on the lab."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repeat:
+    """One tone measured twice."""
+
+    era: str
+    """Name of the ERA that played it, or of several that did together."""
+    frequency: float
+    """Frequency [Hz]."""
+    values: ComplexArray
+    """Responses at all sensors (s,) [1/s²]."""
+    repeated: ComplexArray
+    """The same, measured again (s,) [1/s²]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Responses of s sensors to n ERAs, at some of their paths and frequencies."""
+
+    sensors: tuple[Sensor, ...]
+    frequencies: FloatArray
+    """Ascending (f,) [Hz]."""
+    values: ComplexArray
+    """Acceleration per base displacement at full gain (f, s, n) [1/s²], phases as
+    exp(+i omega t), NaN where not measured."""
+    std: FloatArray
+    """Standard error of the real and of the imaginary part (f, s, n), infinite of outliers."""
+    half_level: tuple[Repeat, ...] = ()
+    """Loud tones repeated at half the level, per base displacement as well."""
+    at_end: tuple[Repeat, ...] = ()
+    """The first tones, as far as they are loud, played last again."""
+    drives_lag: bool = False
+    """Whether bases follow what is played with an unknown lag, as behind voltage amplifiers."""
+    clock_errors: Mapping[str, float] = field(default_factory=dict)
+    """Errors of the clocks of the amplifiers that played and heard, rms [s], by name, as they and
+    their lines state; empty where all have one clock."""
+    free_gains: bool = False
+    """Whether each drive has a gain of its own at every frequency, which nothing states."""
+    drives: tuple[int, ...] = ()
+    """Number of the ERA that each of the n channels drives, empty where each drives its own."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for unordered frequencies, missing values or values without an error."""
+        if not (np.diff(self.frequencies) > 0).all():
+            raise InputError("measurement: frequencies must ascend, each once")
+        if not self.known.any():
+            raise InputError("a measurement must have values, got none")
+        std = self.std[self.known]
+        if not (std > 0).all():
+            raise InputError(f"measurement: std must be above zero, got {std.min():g}")
+
+    @classmethod
+    def of(
+        cls,
+        sensors: Sequence[Sensor],
+        frequencies: FloatArray,
+        values: ComplexArray,
+        *,
+        noise: float = 0.01,
+    ) -> Self:
+        """Make a measurement of responses (f, s, n) [1/s²], NaN where not measured.
+
+        noise: error of each part, relative to a response and to a tenth of its sensor's root mean
+        square together: never relative alone, since a response may vanish.
+        """
+        squares = np.where(np.isfinite(values), np.abs(values), 0.0) ** 2
+        count = np.isfinite(values).sum(axis=(0, 2))[:, None]
+        rms2 = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
+        std = noise * np.sqrt(squares + _FLOOR**2 * rms2)
+        return cls(tuple(sensors), np.asarray(frequencies), np.asarray(values), std)
+
+    @cached_property
+    def known(self) -> NDArray[np.bool_]:
+        """Mask (f, s, n) of the responses that were measured and are no outliers."""
+        return np.isfinite(self.values) & np.isfinite(self.std)
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """1 / std, 0 where nothing is known (f, s, n)."""
+        return np.where(self.known, 1 / self.std, 0.0)
+
+    @cached_property
+    def filled(self) -> ComplexArray:
+        """The values, 0 where nothing is known (f, s, n)."""
+        return np.where(self.known, self.values, 0.0)
+
+    @property
+    def columns(self) -> slice | list[int]:
+        """Index of the model's ERA that each channel drives."""
+        return list(self.drives) or slice(None)
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return int(self.known.sum())
+
+    @cached_property
+    def tone_rms(self) -> FloatArray:
+        """Root mean square of the values at each tone, (f, 1, 1) [1/s²]."""
+        squares = np.where(self.known, np.abs(self.values) ** 2, 0.0)
+        count = self.known.sum(axis=(1, 2), keepdims=True)
+        return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
+
+    def part(self, kept: NDArray[np.bool_]) -> Self:
+        """Keep the values of a mask (f, s, n)."""
+        return replace(self, values=np.where(kept, self.values, np.nan))
+
+    def check(self) -> None:
+        """Raise InputError for a plate that was not linear or has changed meanwhile."""
+        for repeats, limit, cause in (
+            (self.half_level, NONLINEAR, "at half the level; measure at a lower level"),
+            (self.at_end, DRIFTED, "at the end; wait until the plate has settled, measure again"),
+        ):
+            for repeat in repeats:
+                size = np.linalg.norm(repeat.values)
+                difference = np.linalg.norm(repeat.repeated - repeat.values) / size
+                if not difference <= limit:
+                    raise InputError(
+                        f"response to ERA {repeat.era} at {repeat.frequency:g} Hz must stay within "
+                        f"{100 * limit:g} %, got {100 * difference:.1f} % {cause}"
+                    )
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPlate:
+    """A measurement and the circumstances in which it was made."""
+
+    measurement: Measurement
+    level: float | None
+    """Level of what was played, 0..1 of full stroke, None if unknown."""
+    duration: float | None
+    """Duration [s], None if unknown."""
+    sensors: tuple[Mapping[str, object], ...]
+    """The sensors used, for programs."""
+    notes: tuple[str, ...]
+    """Lines for people."""
+    details: Mapping[str, object]
+    """Further keys and values for programs."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceSettings:
+    """Settings of `era rig identify --device`."""
+
+    device: str
+    """Sound card that plays and records."""
+    sensors_file: Path
+    """File of the accelerometers."""
+    frequencies: FloatArray | None
+    """Tones (f,) [Hz], None for the usual ones."""
+    level: float | None
+    """Level of the tones, None for the usual one."""
+    periods: int
+    """Seconds of each run that count."""
+    seed: int
+    """Seed of the phases."""
+
+
+def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+    """Measure a plate by a sound card; raises InputError, LinkError."""
+    found: MeasuredPlate = resolve_name(_MEASURER)(rig, settings, progress=progress)
+    return found
 
 
 @dataclass(frozen=True)

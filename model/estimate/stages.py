@@ -37,12 +37,8 @@ from scipy import linalg
 
 from model.arrays import NEARLY, ComplexArray, FloatArray, best_by, best_of, ranked_by
 from model.estimate.forward import ForwardModel, Sensor, by_mass_at, jacobian
-from model.estimate.least_squares import (
-    IdentificationProblem,
-    Linearization,
-    Measurement,
-    solve,
-)
+from model.estimate.least_squares import IdentificationProblem, Linearization, solve
+from model.estimate.measurement import Measurement
 from model.estimate.space import KINDS, MODE_SHIFTS, Space, inwards, plate_with, space_of
 from model.finger import Grid
 from model.processes import Progress, unseen

@@ -25,7 +25,7 @@ from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.estimate.forward import Sensor
 from model.estimate.identify import identify
-from model.estimate.least_squares import MeasuredPlate
+from model.estimate.measurement import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

@@ -185,7 +185,7 @@ def test_plate_that_changes_while_it_is_measured_is_refused(
     typed: Typed, plate: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first tones, played last again, differ."""
-    monkeypatch.setattr("model.estimate.least_squares.DRIFTED", 1e-9)
+    monkeypatch.setattr("model.estimate.measurement.DRIFTED", 1e-9)
     with pytest.raises(InputError, match="at the end"):
         typed("check", "--url", PORT, "--yes", on=plate)
 

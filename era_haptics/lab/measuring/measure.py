@@ -41,8 +41,11 @@ from era_haptics.lab.measuring.sound_card import (
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
 from model.estimate.forward import Sensor
-from model.estimate.least_squares import DeviceSettings, MeasuredPlate, Measurement, Repeat
 from model.estimate.measurement import (
+    DeviceSettings,
+    MeasuredPlate,
+    Measurement,
+    Repeat,
     Responses,
     WiredSensor,
     are_places,

@@ -20,7 +20,7 @@ from model.estimate.forward import (
     jacobian,
 )
 from model.estimate.identify import identify, parameter_rows
-from model.estimate.least_squares import Measurement
+from model.estimate.measurement import Measurement
 from model.estimate.space import (
     FINGER_PARTS,
     Space,

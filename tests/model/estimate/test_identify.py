@@ -29,7 +29,7 @@ from model.estimate.identify import (
     fit_rows,
     identify,
 )
-from model.estimate.least_squares import Measurement, Repeat
+from model.estimate.measurement import Measurement, Repeat
 from model.estimate.space import space_of
 from model.files.array_file import whole_or_nothing
 from model.reduction.free_plate import solve_free_plate

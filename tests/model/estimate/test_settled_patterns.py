@@ -28,7 +28,7 @@ from model.errors import InputError
 from model.estimate import learned_plate
 from model.estimate.forward import Sensor
 from model.estimate.learned_plate import LearnedTable, LivePlate, PlateEstimate
-from model.estimate.least_squares import Measurement
+from model.estimate.measurement import Measurement
 from model.estimate.settled_patterns import (
     WINDOW,
     Alarm,

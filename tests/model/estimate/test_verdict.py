@@ -33,8 +33,13 @@ from model.estimate import causes
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate
 from model.estimate.calibration_fit import sensed_plate, without_outliers
 from model.estimate.diagnosis_report import as_json, channel_table, verdict_rows
-from model.estimate.least_squares import MeasuredPlate
-from model.estimate.measurement import Responses, read_measured, responses_of, write_responses
+from model.estimate.measurement import (
+    MeasuredPlate,
+    Responses,
+    read_measured,
+    responses_of,
+    write_responses,
+)
 from model.estimate.plate_match import MAX_FIT_ERROR, ShapeMatch, match_plate, phases_of_drive
 from model.estimate.verdict import (
     Verdict,

@@ -39,8 +39,13 @@ from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.calibration_fit import sensed_plate
 from model.estimate.identify import identify
-from model.estimate.least_squares import MeasuredPlate
-from model.estimate.measurement import WiredSensor, read_measured, read_sensors, responses_of
+from model.estimate.measurement import (
+    MeasuredPlate,
+    WiredSensor,
+    read_measured,
+    read_sensors,
+    responses_of,
+)
 from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig

@@ -1,0 +1,355 @@
+"""The one fit of a plate to a measurement: the most likely parameters, and what they leave open.
+
+    d_fsn = g_fn a_fsn(x) + noise
+
+d are the values at frequency f, sensor s and drive n, a those of a forward model whose parameters
+x are normal with the deviations of its `Space` or a prior's. Gains g are 1, or free at every
+frequency and drive: then the best ones follow from any a, so that only x is searched, with the
+derivatives of gains and residuals by it (variable projection: Golub and Pereyra, SIAM J. Numer.
+Anal. 10, 1973). Outliers weigh less by a soft loss, or are left out by `fit_to_noise`, which also
+finds the noise from the residuals. Of hypotheses, each a model of its own, the one of least cost
+explains a measurement best.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from model.arrays import ComplexArray, FloatArray, best_first
+from model.estimate.forward import ForwardModel, PlateAt, by_mass_at, jacobian
+from model.estimate.measurement import Measurement
+from model.estimate.space import Space
+
+_CONVERGED = 1e-7  # of the cost and of x, relative
+_ROUNDS = 8  # of fits and estimates of the noise
+_SETTLED = 0.1  # of the noise between two rounds
+_MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
+_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
+_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_MAX_GROUPS = 12  # of weak to strong rows, each with a noise of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The most likely parameters of a model for a measurement, and the fit linearised there.
+
+    Residuals and slopes are in standard deviations, softened by the loss that was asked for.
+    """
+
+    model: ForwardModel
+    measurement: Measurement
+    x: FloatArray
+    """All parameters (p,)."""
+    cost: float
+    """Half the sum of squares: of residuals, and of what is searched by its prior."""
+    searched: NDArray[np.bool_]
+    """Mask (p,) of the q parameters that were searched."""
+    residuals: FloatArray
+    """Real parts of all m values, imaginary parts, then the q rows of the prior (2 m + q,)."""
+    slopes: FloatArray
+    """Derivatives of the residuals by what is searched (2 m + q, q)."""
+    predicted: ComplexArray
+    """Values as the model and the gains predict them (f, s, n)."""
+    gains: ComplexArray
+    """Gains (f, n), 1 where they are not free, NaN where they are but nothing was measured."""
+    gain_slopes: ComplexArray
+    """Derivatives of the gains by what is searched (f, n, q)."""
+
+    @property
+    def space(self) -> Space:
+        """The parameters."""
+        return self.model.space
+
+    @cached_property
+    def plate(self) -> PlateAt:
+        """The plate of x."""
+        return self.model.at(self.x)
+
+    @cached_property
+    def of_values(self) -> tuple[FloatArray, FloatArray]:
+        """Residuals (2 m,) and slopes (2 m, q) without the rows of the prior."""
+        count = 2 * self.measurement.count
+        return self.residuals[:count], self.slopes[:count]
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """J^T J with the prior, of what is searched (q, q)."""
+        return np.asarray(self.slopes.T @ self.slopes)
+
+    @cached_property
+    def chi2(self) -> float:
+        """Squared residuals of the values per degree of freedom."""
+        r, J = self.of_values
+        taken = np.trace(linalg.solve(self.information, J.T @ J, assume_a="pos"))
+        if self.measurement.free_gains:
+            taken += 2 * self.measurement.known.any(axis=1).sum()
+        return float(r @ r / max(len(r) - taken, 1.0))
+
+    @cached_property
+    def stated_covariance(self) -> FloatArray:
+        """Covariance of x by the errors that the measurement states (p, p), 0 of what is known."""
+        found, own = np.zeros((len(self.x), len(self.x))), np.flatnonzero(self.searched)
+        found[np.ix_(own, own)] = linalg.inv(self.information)
+        return found
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of x (p, p), wider where the residuals exceed the stated errors."""
+        return max(self.chi2, 1.0) * self.stated_covariance
+
+    @cached_property
+    def errors(self) -> FloatArray:
+        """Standard errors of x (p,), 0 of what was not searched."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @cached_property
+    def leverage(self) -> FloatArray:
+        """Share of each value's noise that what is searched takes up (m,)."""
+        root = linalg.cholesky(self.information, lower=True)
+        taken = (linalg.solve_triangular(root, self.of_values[1].T, lower=True) ** 2).sum(axis=0)
+        return np.asarray(taken.reshape(2, -1).mean(axis=0))
+
+    def loads(
+        self,
+        points: FloatArray,
+        *,
+        factor: FloatArray | ComplexArray | None = None,
+        std: float = 1.0,
+        beside: NDArray[np.bool_] | None = None,
+    ) -> list[tuple[int, float]]:
+        """Points (m, 2) [m] where a load alone explains most: number and size, best first.
+
+        factor (f,): effect of a load of size 1 relative to that of 1 kg, 1 by default; std: prior
+        standard deviation of the sizes, of which those above 0 count; beside: mask (p,) of the
+        parameters that follow the load, by default all that were searched.
+        """
+        by_load = by_mass_at(self.plate, points)
+        if factor is not None:
+            by_load = by_load * factor[:, None, None, None]
+        drives = self.measurement.columns
+        _, _, _, columns = best_gains(
+            self.plate.responses[:, :, drives], by_load[:, :, drives], self.measurement
+        )
+        by_size = std * np.vstack([columns.real, columns.imag])
+        r, J = self.of_values
+        kept = np.ones(J.shape[1], bool) if beside is None else beside[self.searched]
+        J, rows = J[:, kept], np.append(np.ones(len(r), bool), kept)
+        whole = self.slopes[rows][:, kept]
+        H = linalg.cho_factor(whole.T @ whole)
+        left = r - J @ linalg.cho_solve(H, whole.T @ self.residuals[rows])
+        following = by_size - J @ linalg.cho_solve(H, J.T @ by_size)
+        downhill = -(left @ by_size)
+        sizes = downhill / ((by_size * following).sum(axis=0) + 1)
+        explained = np.where(sizes > 0, sizes * downhill, 0.0)
+        return [(int(n), std * float(sizes[n])) for n in best_first(explained) if explained[n] > 0]
+
+
+def fit(
+    model: ForwardModel,
+    measurement: Measurement,
+    *,
+    searched: NDArray[np.bool_] | None = None,
+    start: FloatArray | None = None,
+    prior: tuple[FloatArray, FloatArray] | None = None,
+    soft: float | None = None,
+    evaluations: int = 40,
+    inside: float = 1e-9,
+) -> Fit:
+    """Find the most likely parameters of a model for a measurement.
+
+    searched (p,): those to find, by default all that are uncertain; start (p,): where to begin, and
+    values of all others, by default zero; prior: mean (p,) and covariance (p, p) in place of the
+    deviations of the space; soft: standard deviations from which a residual counts as its
+    magnitude, not its square; evaluations: of the model, at most; inside: least distance of a start
+    from its bounds, at which a search begins with small steps.
+    """
+    from scipy.optimize import least_squares  # a daemon reads what was fitted, but fits nothing
+
+    space, drives = model.space, measurement.columns
+    own = space.uncertain if searched is None else searched
+    base = np.zeros(space.size) if start is None else start
+    low, high = space.lower[own], space.upper[own]
+    mean, root = np.zeros(int(own.sum())), np.eye(int(own.sum()))
+    if prior is not None:
+        mean, covariance = prior[0][own], prior[1][np.ix_(own, own)]
+        root = linalg.inv(linalg.cholesky(covariance, lower=True))
+    last: dict[bytes, Fit] = {}
+
+    def at(y: FloatArray) -> Fit:
+        if y.tobytes() in last:
+            return last[y.tobytes()]
+        x = base.copy()
+        x[own] = y
+        plate = model.at(x)
+        slopes = jacobian(plate, own)[..., own][:, :, drives]
+        gains, by_gain, r, J = best_gains(plate.responses[:, :, drives], slopes, measurement)
+        if soft is not None:
+            r, J = _softened(r, J, soft)
+        last.clear()
+        last[y.tobytes()] = Fit(
+            model,
+            measurement,
+            x,
+            np.nan,
+            own,
+            np.concatenate([r.real, r.imag, root @ (y - mean)]),
+            np.vstack([J.real, J.imag, root]),
+            np.nan_to_num(gains)[:, None] * plate.responses[:, :, drives],
+            gains,
+            by_gain,
+        )
+        return last[y.tobytes()]
+
+    margin = np.minimum(inside, (high - low) / 4)
+    if not own.any():
+        found = at(mean)
+        return replace(found, cost=float(found.residuals @ found.residuals / 2))
+
+    def residuals(y: FloatArray) -> FloatArray:
+        return at(y).residuals
+
+    def slopes_at(y: FloatArray) -> FloatArray:
+        return at(y).slopes
+
+    best = least_squares(
+        residuals,
+        np.clip(base[own], low + margin, high - margin),
+        slopes_at,
+        bounds=(low, high),
+        x_scale="jac",
+        max_nfev=evaluations,
+        ftol=_CONVERGED,
+        xtol=_CONVERGED,
+    )
+    return replace(at(best.x), cost=float(best.cost))
+
+
+def best_gains(
+    responses: ComplexArray, slopes: ComplexArray, measurement: Measurement
+) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
+    """Take the best gains out of a model's responses (f, s, n) and their slopes (f, s, n, q).
+
+    Returns gains (f, n), their slopes (f, n, q), and of the m values the residuals in standard
+    deviations (m,) with their slopes (m, q).
+    """
+    known, w, d = measurement.known, measurement.weight, measurement.filled
+    gains = np.ones((len(responses), responses.shape[2]), dtype=complex)
+    by_gain = np.zeros((*gains.shape, slopes.shape[-1]), dtype=complex)
+    if measurement.free_gains:
+        heard = known.any(axis=1)
+        power = ((w * np.abs(responses)) ** 2).sum(axis=1)
+        power = np.where(power > 0, power, 1.0)
+        gains = (w**2 * responses.conj() * d).sum(axis=1) / power
+        of_inner = np.einsum("fsnq,fsn->fnq", slopes.conj(), w**2 * d)
+        of_power = 2 * np.einsum("fsnq,fsn->fnq", slopes, w**2 * responses.conj()).real
+        by_gain = (of_inner - gains[..., None] * of_power) / power[..., None]
+        slopes = by_gain[:, None] * responses[..., None] + gains[:, None, :, None] * slopes
+        responses = gains[:, None] * responses
+        gains = np.where(heard, gains, np.nan)
+    weight = w[known]
+    return gains, by_gain, weight * (responses - d)[known], weight[:, None] * slopes[known]
+
+
+def _softened(
+    r: ComplexArray, slopes: ComplexArray, scale: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Residuals (m,) whose squares are a soft L1 loss, and their derivatives (m, q)."""
+    root = np.sqrt(1 + (np.abs(r) / scale) ** 2)
+    weight = np.sqrt(2 / (1 + root))
+    grown = (r.conj()[:, None] * slopes).real / (2 * scale**2 * root * (1 + root))[:, None]
+    return weight * r, weight[:, None] * (slopes - r[:, None] * grown)
+
+
+def fit_to_noise(
+    model: ForwardModel,
+    measurement: Measurement,
+    *,
+    searched: NDArray[np.bool_] | None = None,
+    start: FloatArray | None = None,
+    prior: tuple[FloatArray, FloatArray] | None = None,
+) -> Fit:
+    """Fit with errors as the residuals show them, and without outliers.
+
+    The measurement of the fit has these errors, infinite of outliers.
+    """
+    found = fit(model, measurement, searched=searched, start=start, prior=prior)
+    for _ in range(_ROUNDS):
+        before = found.measurement
+        raw = np.abs(measurement.values - found.predicted)
+        of_gain = np.abs(before.weight * found.predicted) ** 2 * before.free_gains
+        total = of_gain.sum(axis=1, keepdims=True)
+        left = 1 - of_gain / np.where(total > 0, total, 1)
+        left[before.known] -= found.leverage
+        std = noise_of(before.part(before.known).values, raw, left)
+        kept = raw < _MAX_DEVIATION * np.sqrt(2) * std
+        now = replace(measurement, std=np.where(kept, std, np.inf))
+        found = fit(model, now, searched=searched, start=found.x, prior=prior)
+        if (before.known == now.known).all() and np.allclose(
+            before.std[now.known], now.std[now.known], rtol=_SETTLED
+        ):
+            break
+    return found
+
+
+def row_rms(values: ComplexArray) -> FloatArray:
+    """Root mean square of values (f, s, n) over the sensors (f, 1, n), 1 without any."""
+    known = np.isfinite(values)
+    power = np.where(known, np.abs(values) ** 2, 0).sum(axis=1, keepdims=True)
+    rms = np.sqrt(power / np.maximum(known.sum(axis=1, keepdims=True), 1))
+    return np.where(rms > 0, rms, 1.0)
+
+
+def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> FloatArray:
+    """Error of each part of values (f, s, n): sqrt(a² + b² size²) by the size of their row.
+
+    From the medians of residuals (f, s, n), over rows from weak to strong. left (f, s, n): share of
+    noise power that a fit leaves in each. Returns (f, 1, n).
+    """
+    from scipy.optimize import nnls
+
+    known, size = np.isfinite(values), row_rms(values)
+    rows = np.flatnonzero((known.sum(axis=1) >= 2).ravel())
+    floor = _SMALLEST_NOISE * size
+    if len(rows) < 4:
+        return floor
+    telling = known & (left > _MIN_NOISE_LEFT)
+    power = np.where(telling, residuals**2 / np.where(telling, left, 1) / 2, np.nan)
+    power = power.swapaxes(1, 2).reshape(-1, values.shape[1])[rows]
+    sizes = size.ravel()[rows]
+    found, at = [], []
+    for group in np.array_split(np.argsort(sizes, kind="stable"), min(_MAX_GROUPS, len(rows) // 2)):
+        # The median of |z|² of complex noise with variance 2 is 2 log 2.
+        found.append(np.nanmedian(power[group]) / np.log(2))
+        at.append(np.median(sizes[group] ** 2))
+    scale = np.maximum(found, 1e-12 * np.array(at))
+    matrix = np.column_stack([1 / scale, np.array(at) / scale])
+    weight = np.linalg.norm(matrix, axis=0)
+    a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
+    return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
+
+
+def prediction_errors(
+    found: Fit, hidden: NDArray[np.bool_], *, evaluations: int = 8
+) -> tuple[Fit, FloatArray, FloatArray]:
+    """Fit without some values, a mask (f, s, n), and predict these.
+
+    Returns that fit, and of each hidden value the squared error and its variance by uncertain
+    parameters, (m,).
+    """
+    shown = found.measurement.part(~hidden)
+    other = fit(found.model, shown, searched=found.searched, start=found.x, evaluations=evaluations)
+    own = np.flatnonzero(found.searched)
+    J = jacobian(other.plate, found.searched)[..., own][hidden]
+    covariance = other.stated_covariance[np.ix_(own, own)]
+    variance = ((J @ covariance) * J.conj()).sum(axis=1).real
+    squares = np.abs(other.plate.responses - found.measurement.values)[hidden] ** 2
+    return other, np.asarray(squares), np.asarray(variance)
+
+
+def likeliest(found: Sequence[Fit]) -> Fit:
+    """The fit of least cost, the first of equals."""
+    return min(found, key=lambda each: each.cost)

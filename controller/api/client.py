@@ -16,15 +16,15 @@ each are written by `make pages` from their registration in `controller/daemon/h
 
 import asyncio
 import functools
+import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
-from controller.api.jsonrpc import ErrorCode, RpcError
+from controller.api.jsonrpc import ErrorCode, RpcError, request_line
 from controller.api.link import (
     RESPONSE_TIMEOUT,
     ConnectionLost,
@@ -35,7 +35,9 @@ from controller.api.link import (
     as_position,
     find_socket,
     make_params,
+    read_line,
     read_result,
+    result_of,
     touches_at,
 )
 from controller.api.methods import (
@@ -58,7 +60,6 @@ from controller.api.schema import ApiMessage, Empty, Topic, headline
 from registry.threads import LoopThread, pauses
 
 MAX_QUEUED_EVENTS = 1000  # not yet taken; the oldest is dropped
-_MIN_RETRY_INTERVAL, _MAX_RETRY_INTERVAL = 0.05, 0.5  # s
 _REPEATED_FOR = 0.3  # s; requests whose connection is lost, as by a daemon with many clients
 _RENEWAL_INTERVAL = 0.25  # s; within it a lost lease is noticed, however long it was
 
@@ -81,7 +82,9 @@ class AsyncClient:
         self._name = name
         self._timeout = timeout
         self._link: DaemonLink | None = None
-        self._following: asyncio.Task[None] | None = None
+        self._reading: asyncio.Task[None] | None = None
+        self._pending: dict[int, asyncio.Future[Any]] = {}  # of the present connection, by id
+        self._ids = itertools.count(1)
         self._connecting = asyncio.Lock()
         self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
@@ -230,15 +233,12 @@ class AsyncClient:
     async def subscribe(self, *topics: Topic, rate_hz: float | None = None) -> None:
         """Receive notifications of topics; see `events`."""
         await self._call(Empty, "subscribe", topics=list(topics), rate_hz=rate_hz)
-        for topic in topics:
-            self._rates.pop(topic, None)
-            self._rates[topic] = rate_hz
+        self._rates.update(dict.fromkeys(topics, rate_hz))
 
     async def unsubscribe(self, *topics: Topic) -> None:
         """Receive no more notifications of topics."""
         await self._call(Empty, "unsubscribe", topics=list(topics))
-        for topic in topics:
-            self._rates.pop(topic, None)
+        self._rates = {each: rate for each, rate in self._rates.items() if each not in topics}
 
     @asynccontextmanager
     async def armed(
@@ -332,7 +332,7 @@ class AsyncClient:
             params = params.model_copy(update={"epoch": self._seen[1]})
         if method == "stop":
             self._release()
-        found = await self._within_timeout(self._send(method, params))
+        found = await self.request(method, params)
         if method in SILENCING:
             self._release()
         elif isinstance(params, HelloParams):
@@ -345,16 +345,33 @@ class AsyncClient:
         """Call a method with these parameters."""
         return await self.call(method, make_params(method, **values), result)
 
-    async def _send(self, method: str, params: ApiMessage) -> Any:
-        """Send a request, again over new connections if that is harmless."""
+    async def request(self, method: str, params: ApiMessage) -> Any:
+        """Send a request, again over new connections if that is harmless.
+
+        Returns its result as parsed JSON, with the keys of a later daemon.
+        """
 
         async def attempt() -> Any:
-            return await (await self._connected()).call(method, params)
+            return await self._exchange(await self._connected(), method, params)
+
+        async def once() -> Any:
+            return await self._exchange(await self._repeated(self._connected), method, params)
 
         if method in METHODS and not METHODS[method].is_repeated:
-            return await (await self._repeated(self._connected)).call(method, params)
+            return await self._within_timeout(once())
         after = Unreachable if method == "stop" else ConnectionLost
-        return await self._repeated(attempt, after=after)
+        return await self._within_timeout(self._repeated(attempt, after=after))
+
+    async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
+        """Send a request over the present connection; raises RpcError and Unreachable."""
+        id, pending = next(self._ids), self._pending
+        response = pending[id] = asyncio.get_running_loop().create_future()
+        try:
+            content = params.model_dump_json(exclude_none=True)
+            link.write(request_line(id, method, content.encode()))
+            return result_of(await response)
+        finally:
+            del pending[id]
 
     async def _repeated(
         self,
@@ -392,25 +409,41 @@ class AsyncClient:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._link is None or not self._link.is_open:
                 link = await DaemonLink.open(self.path, self._name)
+                self._pending, self._ids = {}, itertools.count(1)
                 connection = self._connections + 1
-                following = link.follow(partial(self._received, connection))
-                self._following = asyncio.create_task(following, name="API")
-                self._following.add_done_callback(lambda _: self._changed.set())
+                reading = self._read(link, self._pending, connection)
+                self._reading = asyncio.create_task(reading, name="API")
                 try:
-                    for rate in dict.fromkeys(self._rates.values()):
-                        topics = [topic for topic, each in self._rates.items() if each == rate]
-                        params = make_params("subscribe", topics=topics, rate_hz=rate)
-                        await link.call("subscribe", params)
+                    for topic, rate in list(self._rates.items()):
+                        params = make_params("subscribe", topics=[topic], rate_hz=rate)
+                        await self._exchange(link, "subscribe", params)
                 except BaseException:
                     link.abort()
                     raise
                 self._link, self._connections = link, connection
             return self._link
 
-    def _received(self, connection: int, event: Notification) -> None:
-        if len(self._events) == MAX_QUEUED_EVENTS:
-            self._lost += 1 + self._events.popleft()[1].lost
-        self._events.append((connection, event))
+    async def _read(
+        self, link: DaemonLink, pending: dict[int, asyncio.Future[Any]], connection: int
+    ) -> None:
+        """Hand out responses and events until a connection is lost; then fail what is pending."""
+        try:
+            while True:
+                received = read_line(await link.next_line())
+                if isinstance(received, Notification):
+                    if len(self._events) == MAX_QUEUED_EVENTS:
+                        self._lost += 1 + self._events.popleft()[1].lost
+                    self._events.append((connection, received))
+                    self._changed.set()
+                    continue
+                for id, response in pending.items():  # without an id, of all of them
+                    if received["id"] in (id, None) and not response.done():
+                        response.set_result(received)
+        except Unreachable as error:
+            link.abort()
+            for response in pending.values():
+                if not response.done():
+                    response.set_exception(error)
         self._changed.set()
 
     def _see(self, connection: int, epoch: int | None) -> None:
@@ -439,26 +472,21 @@ class AsyncClient:
         loop = asyncio.get_running_loop()
         params = make_params("renew", lease=lease.lease)
         expires_at = loop.time() + lease.lease_s
-        pause = _RENEWAL_INTERVAL
         reason: RpcError | Unreachable | None = None
-        while loop.time() < expires_at:
-            await asyncio.sleep(min(pause, expires_at - loop.time()))
+        while (left := expires_at - loop.time()) > 0:
+            await asyncio.sleep(min(_RENEWAL_INTERVAL, left))
             sent_at = loop.time()
             try:
                 async with asyncio.timeout_at(expires_at):
-                    await self._send("renew", params)
-            except Unreachable as error:
-                reason, pause = error, _MIN_RETRY_INTERVAL
+                    await self.request("renew", params)
             except TimeoutError as error:
                 reason = reason or Unreachable.at(self.path, error)
-            except RpcError as error:
+            except (RpcError, Unreachable) as error:
                 reason = error
-                if error.code is not ErrorCode.BUSY:
+                if isinstance(error, RpcError) and error.code is not ErrorCode.BUSY:
                     break
-                pause = _MAX_RETRY_INTERVAL
             else:
-                expires_at, pause = sent_at + lease.lease_s, _RENEWAL_INTERVAL
-                reason = None
+                expires_at, reason = sent_at + lease.lease_s, None
         if self._lease is lease:
             self._lease_lost = await self._why_lost(reason)
             self._changed.set()

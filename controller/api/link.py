@@ -1,15 +1,13 @@
-"""The client's side of the API: where the daemon's socket is, and one connection to it.
+"""The client's side of the API: where the daemon's socket is, and the lines to and from it.
 
 `find_socket` chooses the socket, `check_peer` decides whether the process behind it is trusted.
-`DaemonLink` is a connection in the name of a client: lines passed on as they are, or calls over
-them. Without I/O are arguments to parameters (`make_params`, `touches_at`) and lines to responses
-and notifications (`read_line`, `result_of`, `read_result`). A daemon of a later minor version sends
-keys that this program does not know: they are ignored here, whereas the server is strict about
-every request.
+`DaemonLink` is a connection in the name of a client, which passes lines on as they are. Without I/O
+are arguments to parameters (`make_params`, `touches_at`) and lines to responses and notifications
+(`read_line`, `result_of`, `read_result`). A daemon of a later minor version sends keys that this
+program does not know: they are ignored here, whereas the server is strict about every request.
 """
 
 import asyncio
-import itertools
 import json
 import math
 import os
@@ -17,7 +15,7 @@ import pwd
 import socket
 import struct
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -268,9 +266,7 @@ _READ = 1 << 16  # bytes; read ahead, and the rest of a line that is incomplete
 class DaemonLink:
     """A connection to the daemon in the name of a client, made by `open`.
 
-    Its lines are for who awaits `next_line`, or for any number of calls and events once it is
-    followed. hello: the daemon's reply to the hello of that name, whose id it is; without its line
-    feed.
+    hello: the daemon's reply to the hello of that name, whose id it is; without its line feed.
     """
 
     def __init__(
@@ -282,9 +278,6 @@ class DaemonLink:
         self._writer = writer
         self._received = b""
         self._is_closed = False
-        self._lost: Unreachable | None = None
-        self._pending: dict[int, asyncio.Future[Any]] = {}
-        self._ids = itertools.count(1)
 
     @classmethod
     async def open(cls, path: Path, name: str) -> Self:
@@ -293,35 +286,26 @@ class DaemonLink:
         Raises InputError for the name, RpcError and Unreachable.
         """
         params = make_params("hello", client=name).model_dump_json()
+        link: Self | None = None
         try:
             async with asyncio.timeout(RESPONSE_TIMEOUT):  # the daemon's queue may be full
                 connected = await connected_socket(path)
-        except TimeoutError as error:
-            raise Unreachable.at(path, error) from error
-        link = cls(path, *await asyncio.open_unix_connection(sock=connected))
-        try:
-            link.hello = await link.request("hello", params.encode(), id=name)
+                link = cls(path, *await asyncio.open_unix_connection(sock=connected))
+                link.write(request_line(name, "hello", params.encode()))
+                link.hello = await link.next_line()
             check_version(result_of(read_line(link.hello)), path)
-        except BaseException:
-            link.abort()
+        except BaseException as error:
+            if link is not None:
+                link.abort()
+            if isinstance(error, TimeoutError):
+                raise Unreachable.at(path, error) from error
             raise
         return link
 
     @property
     def is_open(self) -> bool:
         """Whether neither side has closed it."""
-        is_lost = self._reader.at_eof() or self._reader.exception() or self._lost
-        return not (self._is_closed or is_lost)
-
-    async def request(self, method: str, params: bytes, *, id: str) -> bytes:
-        """Send a request and wait for the next line, its response; raises Unreachable."""
-        try:
-            async with asyncio.timeout(RESPONSE_TIMEOUT):
-                await self.send(request_line(id, method, params))
-                return await self.next_line()
-        except TimeoutError as error:
-            self.close()
-            raise Unreachable.at(self._path, error) from error
+        return not (self._is_closed or self._reader.at_eof() or self._reader.exception())
 
     async def send(self, line: bytes) -> None:
         """Send a line with its line feed, as soon as the daemon reads; raises Unreachable."""
@@ -347,40 +331,6 @@ class DaemonLink:
             self._received += data
         line, _, self._received = self._received.partition(b"\n")
         return line
-
-    async def call(self, method: str, params: ApiMessage) -> Any:
-        """Call a method and return its result as parsed JSON, while it is followed.
-
-        Raises RpcError and Unreachable.
-        """
-        if self._lost is not None:
-            raise self._lost.with_traceback(None)
-        id = next(self._ids)
-        response = self._pending[id] = asyncio.get_running_loop().create_future()
-        try:
-            content = params.model_dump_json(exclude_none=True)
-            self.write(request_line(id, method, content.encode()))
-            return result_of(await response)
-        finally:
-            del self._pending[id]
-
-    async def follow(self, on_event: Callable[[Notification], None]) -> None:
-        """Hand out responses and notifications until it is lost; then fail all pending calls."""
-        try:
-            while True:
-                received = read_line(await self.next_line())
-                if isinstance(received, Notification):
-                    on_event(received)
-                    continue
-                for id, pending in self._pending.items():  # without an id, of all of them
-                    if received["id"] in (id, None) and not pending.done():
-                        pending.set_result(received)
-        except Unreachable as error:
-            self._lost = error
-            self.abort()
-            for pending in self._pending.values():
-                if not pending.done():
-                    pending.set_exception(error)
 
     def close(self) -> None:
         """Close once the daemon has carried out what it was sent, at the latest after a while.

@@ -22,8 +22,8 @@ from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from controller.api.jsonrpc import ErrorCode, RpcError, read_request
-from controller.api.link import DaemonLink, Unreachable
+from controller.api.jsonrpc import ErrorCode, RpcError, read_request, request_line
+from controller.api.link import RESPONSE_TIMEOUT, DaemonLink, Unreachable
 from controller.api.methods import SILENCING
 from controller.gateway.access import HEADERS
 from controller.gateway.field import DrawnField
@@ -148,7 +148,13 @@ class KeptLink:
                 self._link = await DaemonLink.open(path, name)
             if self._is_over:  # sent all the same
                 asyncio.get_running_loop().call_soon(self.close)
-            return await self._link.request(method, params, id=name)
+            async with asyncio.timeout(RESPONSE_TIMEOUT):
+                await self._link.send(request_line(name, method, params))
+                return await self._link.next_line()
+        except TimeoutError as error:
+            if self.is_open:
+                self.close()
+            raise Unreachable.at(path, error) from error
         finally:
             if not self.is_open:
                 self.kept.discard(self)

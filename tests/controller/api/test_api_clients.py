@@ -252,9 +252,11 @@ def responding(path: Path, *answers: bytes, rest: bytes = b"") -> Iterator[list[
 
         thread = threading.Thread(target=respond)
         thread.start()
-        yield received
-        server.shutdown(socket.SHUT_RDWR)
-        thread.join()
+        try:
+            yield received
+        finally:
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
 
 
 async def connect_error(folder: Path, *lines: bytes) -> tuple[Exception, Exception]:

@@ -34,7 +34,7 @@ WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 ENDING := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true --max-worker-restart 0
 test: .venv/installed-test
 	$(BIN)/pytest $(ENDING) -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest $(ENDING) -m 'real_time and not alone and not long' --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest $(ENDING) -m 'real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 	$(BIN)/pytest $(ENDING) -m 'alone and not long'
 
 # Of these for a minute those that are nearest to what differs from a commit, by default from where
@@ -104,7 +104,8 @@ fuzz: .venv/installed-test
 	FRAMES=1000000 $(BIN)/pytest -q tests/drivers/wires/test_frames.py
 
 # Every planted fault (tests/faults) in a copy of the tree, under the tests that must find it;
-# `make test` takes five. Others: make faults FAULTS='--only wire/ --json out/faults.json'
+# or those that no test of `make test` finds: make faults FAULTS=--nightly.
+# Others: make faults FAULTS='--only wire/ --json out/faults.json'
 faults: .venv/installed-test
 	$(BIN)/python tests/faults/run.py $(FAULTS)
 

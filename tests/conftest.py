@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-from long_form import SLOWEST  # noqa: E402
+from long_form import COLLECTED, SLOWEST  # noqa: E402
 from model.reduction import free_plate  # noqa: E402
 from model.rig.rig import Rig  # noqa: E402
 from model.rig.rig_file import example_rig_path, load_rig  # noqa: E402
@@ -79,8 +79,9 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Run the slowest files first, all in one order; the order within each file stays."""
+    config.stash[COLLECTED] = {item.nodeid for item in items}
     place = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: (place.get(item.path.name, len(SLOWEST)), item.path))
 

@@ -1,6 +1,7 @@
-"""The comparison of answers of two checkouts.
+"""What benchmarks compute beside their timing.
 
-The contrast benchmark: its data set, how entries are read, and what scores do.
+The comparison of the answers of two checkouts; the data set of the contrast benchmark, how its
+entries are read, and its scores.
 """
 
 import hashlib

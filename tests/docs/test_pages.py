@@ -1,20 +1,9 @@
-"""What programs write of pages and files, and the check of it.
+"""Pages of the docs against what they describe.
 
-The ways that docs/architecture.md follows through the files are those that the code takes.
-
-The file of tested versions.
-
-The tutorials, followed to the letter.
-
-The reference of the daemon's file against what it describes.
-
-Comparison of shown with printed output, and invalid pages.
-
-The reference of commands against the commands.
-
-What pages state and something else decides: constants, URLs, figures of other pages, files.
-
-All of docs/reference/amplifier.json by a reader that knows nothing else, against the codecs.
+Generated parts; what pages state and something else decides (constants, URLs, figures of other
+pages, files); the references of commands, of the daemon's file and of the amplifier, read by a
+reader that knows nothing else; the ways through the files in docs/architecture.md; the file of
+tested versions; the comparison of shown with printed output; and the tutorials, typed.
 """
 
 import json
@@ -166,8 +155,6 @@ def test_constraints_pin_every_dependency_within_its_bounds() -> None:
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "tutorials"
-SHORT = "own-plate"
-"""Followed by every run of the tests; the others by `make test-long`."""
 
 
 @pytest.fixture
@@ -178,13 +165,8 @@ def home() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=[] if page == SHORT else [pytest.mark.long])
-        for page in sorted(path.stem for path in PAGES.glob("*.md"))
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
 def test_a_reader_sees_what_the_page_shows(page: str, tmp_path: Path, home: Path) -> None:
     """A tutorial typed from an empty folder beside the examples prints what it shows."""
     folder = tmp_path / "my_plate"

@@ -1,8 +1,7 @@
-"""Ports: opened, written without waiting, and lost.
+"""Playback of layers against curves that the protocol gives by hand, its bounds, and ports.
 
-Playback of layers against curves of the protocol computed by hand, and invariants.
-
-Bounds of what plays contain what every amplifier plays that committed within the intervals.
+The bounds of what plays contain every amplifier that committed within the intervals; a port is
+opened, written without waiting, and lost.
 """
 
 import asyncio

@@ -1,8 +1,6 @@
-"""Amplifiers older and newer than who reads them, by one word of Status, on every wire.
+"""URLs of amplifiers on every wire, the trace of wires, and amplifiers of other editions.
 
-The trace of wires.
-
-Amplifier URLs of every wire, parsed and refused.
+An older or newer amplifier differs by one word of Status.
 """
 
 import io

@@ -1,7 +1,4 @@
-"""Tables, queries and their pictures from Python, against the commands and the figures.
-
-A rig's amplifiers, drives and places from a script.
-"""
+"""Tables, queries, pictures and amplifiers of a rig from a script, against the commands."""
 
 import json
 import math

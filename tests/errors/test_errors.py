@@ -1,6 +1,6 @@
-"""Errors as a user meets them, and commands that are interrupted or find no room.
+"""Errors as a user meets them: commands, files that are no such file, interruptions, a full disk.
 
-Files that users name and that are no such file: each reader refuses each of them in words.
+Each reader refuses each file in words.
 """
 
 import contextlib

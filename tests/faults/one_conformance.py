@@ -1,9 +1,9 @@
 """One conformance check of an amplifier on one wire, in virtual time.
 
 Run by the judge of planted faults only: the suite has all checks in turn in
-`tests/era_haptics/lab/conformance`. Faults of a simulated amplifier are found on it; those of
-`drivers.playing`, which conformance asks what must be played, on the firmware, which does
-not.
+`tests/era_haptics/lab/conformance`; `long` are those that `make test` has not. Faults of a
+simulated amplifier are found on it; those of `drivers.playing`, which conformance asks what must be
+played, on the firmware, which does not.
 """
 
 from functools import partial
@@ -13,9 +13,18 @@ import pytest
 
 from era_haptics.lab.conformance.contract import CHECKS, Result, of_kind
 from firmware_machine import FirmwareEnd, build_firmware
-from virtual_lines import JUDGED_LINE_KINDS, judged, plain
+from long_form import shortly
+from virtual_lines import JUDGED_LINE_KINDS, judged, plain, short_checks
 
-_CASES = [(kind, check.name) for kind in JUDGED_LINE_KINDS for _, check in of_kind(kind)]
+_CASES = [
+    pytest.param(
+        *(kind, check.name),
+        id=f"{kind}-{check.name}",
+        marks=[] if check.name in short_checks(kind) else pytest.mark.long,
+    )
+    for kind in JUDGED_LINE_KINDS
+    for _, check in of_kind(kind)
+]
 _OF_ANY_WIRE = [check.name for check in CHECKS if not check.kinds]
 _OF_SERIAL_LINES = [check.name for _, check in of_kind("serial")]
 
@@ -26,20 +35,21 @@ def _violation(kind: str, name: str, level: float = 0.3, **options: bool) -> str
     return result.reason * (result.result is Result.FAILED)
 
 
-@pytest.mark.parametrize(("kind", "name"), _CASES, ids=[f"{k}-{name}" for k, name in _CASES])
+@pytest.mark.parametrize(("kind", "name"), _CASES)
 def test_check(kind: str, name: str) -> None:
     """The check finds no violation."""
     violation = _violation(kind, name)
     assert not violation, violation
 
 
-@pytest.mark.parametrize("name", _OF_ANY_WIRE)
+@pytest.mark.parametrize("name", shortly(_OF_ANY_WIRE, ["limited", "voices"]))
 def test_loud(name: str) -> None:
     """It finds none where it drives at nearly full level."""
     violation = _violation("serial", name, 0.9)
     assert not violation, violation
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", _OF_ANY_WIRE)
 def test_plain(name: str) -> None:
     """It finds none on an amplifier with all that the table allows."""

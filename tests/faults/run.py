@@ -1,12 +1,13 @@
 """Judge the tests by planted faults: plant each in a copy of the tree, run the tests that find it.
 
-    python tests/faults/run.py [--only PATTERN] [--quick] [--workers N] [--json FILE]
+    python tests/faults/run.py [--only PATTERN] [--nightly] [--workers N] [--json FILE]
 
 Faults are data, in the files `AREA.yaml` beside this one; CONTRIBUTING.md has their format. A fault
 is found if every test named by it fails and shows what it must, missed if one of them does not or
 takes too long, stale if a text to change does not occur exactly once in its file, or no test can be
 run with it. Those of `missed.yaml` are not found by any test of today, with the reason: a line to
-fall behind never.
+fall behind never. --nightly lists, in place of judging, the faults that `make test` does not
+find, since all their tests are long.
 Exit status 1 for anything missed or stale that is not among them, or found though it is.
 """
 
@@ -16,6 +17,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -67,7 +69,6 @@ class PlantedFault:
     edits: tuple[tuple[str, str, str], ...]
     tests: tuple[str, ...]
     shows: str
-    is_quick: bool
     missed: str
 
 
@@ -125,7 +126,6 @@ def _fault_of(area: str, row: dict[str, Any]) -> PlantedFault:
         tuple((edit["file"], edit["find"], edit["replace"]) for edit in row["change"]),
         tuple(dict.fromkeys(tests)),
         row.get("shows", ""),
-        row.get("quick", False),
         row.get("missed", ""),
     )
 
@@ -169,6 +169,23 @@ def stale_edits(fault: PlantedFault, tree: Path) -> dict[str, str]:
         for file, find, _ in fault.edits
         if not (tree / file).is_file() or _text(tree / file).count(find) != 1
     }
+
+
+def collected(*arguments: str) -> set[str]:
+    """Return the ids of the tests that pytest collects in this checkout."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
+    done = subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(done.stdout + done.stderr)
+    return {*done.stdout.splitlines()}
+
+
+def _list_nightly(faults: Sequence[PlantedFault]) -> None:
+    short = collected("-m", "not long", "tests", "tests/faults/one_conformance.py")
+    nightly = [one for one in faults if one.tests and short.isdisjoint(one.tests)]
+    for one in nightly:
+        sys.stdout.write(f"{one.name}: {', '.join(one.tests)}\n")
+    sys.stdout.write(f"{len(nightly)} of {len(faults)} faults are found by `make nightly` alone\n")
 
 
 def judge(fault: PlantedFault, sound: Path) -> Judgement:
@@ -238,15 +255,16 @@ def main() -> int:
     """Judge the faults asked for; print each, then the totals."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", default="", help="part of AREA/NAME of faults")
-    parser.add_argument("--quick", action="store_true", help="those that `make test` takes")
+    parser.add_argument("--nightly", action="store_true", help="list what `make test` leaves")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path, help="file for the judgements")
     asked = parser.parse_args()
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"  # before numpy loads
-    faults = [
-        one for one in load_faults() if asked.only in one.name and one.is_quick >= asked.quick
-    ]
+    faults = [one for one in load_faults() if asked.only in one.name]
+    if asked.nightly:
+        _list_nightly(faults)
+        return 0
     for module in (*_PRELOADED, *(_PRELOADED_FOR_MANY if len(faults) > _MANY else ())):
         import_module(module)
     known = {one.name for one in faults if one.missed}

@@ -1,17 +1,10 @@
-"""What the firmware sends, as the header of its records makes it.
+"""The firmware in C: its sources, its samples, and its programs with the host of protocol 4.
 
-The C sources: structs by the names of their fields, and no circle of files.
-
-The firmware under damaged frames on every line, built with sanitizers.
-
+Structs go by the names of their fields and files have no circle; samples follow the formulas of
+docs/decisions/0088-protocol-4.md; the firmware is compared with the simulated amplifier, judged by
+conformance, and run as a program on terminals and TCP. Damaged frames meet it under sanitizers:
 `make firmware-test` has 20 000 for each line, under the sanitizer of addresses as well, and
 200 000 with --long.
-
-The firmware as a program, on terminals and TCP, and the host of protocol 4.
-
-The firmware beside the simulated amplifier, under conformance, and with the host on lines.
-
-The firmware's samples against the formulas of docs/decisions/0088-protocol-4.md.
 """
 
 import asyncio
@@ -482,7 +475,7 @@ OF_WIRE = {"rtu": {"events"}, "tcp": {"events"}}
 """Skipped, too, by the wire."""
 
 
-@pytest.mark.parametrize("kind", shortly(FIRMWARE_MACHINE_LINES, ["can", "rtu"]))
+@pytest.mark.parametrize("kind", shortly(FIRMWARE_MACHINE_LINES, ["can"]))
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind, far=partial(FirmwareEnd, kind, replaying))

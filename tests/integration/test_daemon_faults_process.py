@@ -1,10 +1,8 @@
-"""`era daemon` as a process: commands, locks and children; paused, starved, full disks, killed.
+"""`era daemon` as a process with faults, and what each finger feels of a touch stream.
 
-The far end runs in the test's process with the same clock, by which silence must be in time.
-
-From a touch stream to what each finger felt, over every wire and over two, by the same checks.
-
-In virtual time, so that times are asserted as well as what is felt.
+Commands, locks and children; daemons that are paused, starved, killed, without room on disk. The
+far end runs in the test's process with the same clock, by which silence must be in time. The stream
+runs over every wire and over two, in virtual time, so that times are asserted too.
 """
 
 import asyncio

@@ -1,29 +1,9 @@
-"""Examples for several people in the shipped daemon, each finger with a vibration of its own.
+"""Whole programmes with people at a plate: in virtual time, as processes, and on the desk.
 
-The benchmark of touch to wire: a real daemon on its lines, tapped in random places.
-
-From a modal test in time on the simulated plate, through a file, to a new rig: the commands.
-
-A sound server that is killed while the daemon plays through a software amplifier.
-
-Its short form has no daemon: tests/sim/soft_amp/test_soft_amp.py.
-
-Idle, unreading and insistent clients, in processes of their own, while fingers play.
-
-The control loop of the whole daemon must not be affected.
-
-Corrupt, foreign and malicious files wherever the daemon reads one.
-
-They are refused with file, line and key, and a running daemon keeps its configuration.
-
-Examples of eight, twelve and sixteen ERAs, from their files to fingertips in virtual time.
-
-The Qt application of the examples, without a screen.
-
-The desk without hardware: real JACK server, plate and commands.
-
-Its short forms have no server, or no plate: tests/era_haptics/lab/measuring/test_measuring.py,
-test_sound_card.py.
+Examples for several people and for many ERAs; a modal test that becomes a new rig; touches from the
+panel to the wire; clients that flood and files that are damaged while the loop goes on; a sound
+server that is killed; the Qt application; the desk without hardware. Short forms without a server
+or a daemon are in tests/sim/soft_amp and tests/era_haptics/lab/measuring.
 """
 
 import asyncio

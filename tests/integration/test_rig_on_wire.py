@@ -1,8 +1,7 @@
-"""`era rig check --url` and `identify` as typed, beside a plate on a wire in virtual time.
+"""Rigs that are checked, identified and followed on a wire, and applications on top of them.
 
-A daemon whose plate changes: its estimator, a process of its own, and what touches get of it.
-
-Examples of an application: a page in a real browser through losses, a program in Python.
+`era rig check --url` and `identify` run as typed beside a plate in virtual time; a daemon follows
+its plate by an estimator, a process of its own; a page in a real browser comes back after losses.
 """
 
 import asyncio
@@ -49,6 +48,7 @@ from gateway_bench import (
     wait_for,
     wait_for_state,
 )
+from long_form import shortly
 from model.errors import InputError
 from model.estimate.learned_plate import load_learned
 from model.estimate.measurement import write_responses_csv, write_responses_uff
@@ -125,16 +125,20 @@ def _thinner(rig: Rig) -> Rig:
     return replace(rig, plate=replace(rig.plate, thickness=0.9 * rig.plate.thickness))
 
 
+def _long(name: str, *values: Any) -> Any:
+    return pytest.param(*values, id=name, marks=pytest.mark.long)
+
+
 @pytest.mark.parametrize(
     ("spoil", "verdicts", "plate_matches"),
     [
-        (lambda rig: _weak(rig, 1e-6), ["dead", "well", "well", "well"], True),
-        (lambda rig: _weak(rig, 0.5), ["weak", "well", "well", "well"], True),
-        (_inverted, ["inverted", "well", "well", "well"], True),
-        (_thinner, ["well"] * 4, True),  # as far as sheets tell of its modulus
-        (_exchanged, ["well"] * 4, False),  # its sensors go with an ERA: another plate
+        _long("dead", lambda rig: _weak(rig, 1e-6), ["dead", "well", "well", "well"], True),
+        _long("weak", lambda rig: _weak(rig, 0.5), ["weak", "well", "well", "well"], True),
+        pytest.param(_inverted, ["inverted", "well", "well", "well"], True, id="inverted"),
+        # Thinner as far as sheets tell of its modulus; the sensors of an exchanged ERA go with it.
+        pytest.param(_thinner, ["well"] * 4, True, id="thinner"),
+        _long("exchanged", _exchanged, ["well"] * 4, False),
     ],
-    ids=["dead", "weak", "inverted", "thinner", "exchanged"],
 )
 def test_faults_of_wiring_and_plate_are_told(
     typed: Typed,
@@ -257,7 +261,7 @@ def test_plate_with_a_part_that_does_not_scale_is_refused_before_it_is_measured(
         typed(*command, "--url", "serial:///dev/none", "--yes", on=plate)
 
 
-@pytest.mark.parametrize("ending", ["csv", "uff"])
+@pytest.mark.parametrize("ending", shortly(["csv", "uff"], ["uff"]))
 def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: str) -> None:
     """Measured by a modal test in time, two plugs exchanged: the file's names are the rig's own."""
     rig = load_rig(write_rig(tmp_path / "rig.yaml", mesh="12x9"))

@@ -1,6 +1,6 @@
-"""Templates in real size: lengths on paper, mirrored for the underside, no fonts, pages of A4.
+"""Figures of the paper, pictures of tables, and templates in real size.
 
-Figures of the paper, and pictures of tables.
+Templates have their lengths on paper, are mirrored for the underside, and need no fonts.
 """
 
 import re

@@ -1,10 +1,7 @@
-"""How far meshes are from converged, against independent solvers and a different element.
+"""Vibration in frequency, how far meshes are from converged, and what fingertips feel.
 
-Vibration in frequency: discretised, and of plates with changed parameters.
-
-Points and weights over a fingertip's disc, against exact integrals.
-
-Thresholds, levels, the band that is felt, and the grid of fingers.
+Against independent solvers, another element and exact integrals over the disc of a fingertip;
+thresholds, levels, the band that is felt, and the grid of fingers.
 """
 
 import math

@@ -1,8 +1,7 @@
-"""What voices do to the plate follows the clock of their amplifier: its law, crystal and rate.
+"""A whole rig in numbers, on a virtual clock: from a request to what a finger feels.
 
-Sensors of amplifiers of protocol 4: what they measure, what disturbs, what is refused.
-
-A whole rig in numbers: from a request to what a finger feels, on a virtual clock.
+What voices do to the plate follows the clock of their amplifier, with its law, crystal and rate;
+sensors of amplifiers measure, are disturbed, and refuse.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
-"""The control socket: operations and errors.
+"""The control socket of a simulation and the command of the witness, with their errors.
 
-The witness as a command: its relays in real wires, its options, its report.
+The witness relays real wires and writes a report.
 """
 
 import asyncio

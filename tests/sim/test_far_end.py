@@ -1,10 +1,7 @@
-"""Accelerometers on a bench, recordings of them and of fingers, and their files.
+"""Parts of a far end: terminals, delays of lines, programs of the firmware, recordings.
 
-Delays of lines against the numbers of their standards and data sheets.
-
-Stable names of pseudo-terminals.
-
-Programs of the firmware as amplifiers, and the frequencies of their samples.
+Delays are by the numbers of their standards and data sheets; recordings of accelerometers and of
+fingers are written to files and read back.
 """
 
 import math

@@ -1,7 +1,4 @@
-"""A host of protocol 4 on a simulated rig in this process: what fingers feel, faults, URLs.
-
-Fault files, and faults of frames.
-"""
+"""A host of protocol 4 on a rig simulated in this process: fingers, faults and their files."""
 
 import asyncio
 import json

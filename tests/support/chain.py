@@ -1,18 +1,11 @@
 """The one chain, in virtual time: control loop, wires in memory, far ends, plate and witness.
 
 Everything between the touch frames and the plate is the project's own, with the durations of the
-wires; only the lines are memory. The witness reads every byte, and the plate is judged beside it.
-
-A chain with a table that a test sets, on a rig for which nothing has to be solved.
-
-The chain with a touch stream: what fingertips felt and sensors read in each of its situations.
-
-Fingers are at every place of the stream, so that what they felt can be read for any window
-afterwards; those that do not touch have no weight.
-
-The chain with a table of two patterns, played scenarios: touches and operator commands.
-
-What each touch must give is known by hand.
+wires; only the lines are memory. The witness reads every byte, and the plate is judged beside it. A
+chain has a table that a test sets, on a rig for which nothing has to be solved, or one of two
+patterns with scenarios of touches and commands whose results are known by hand, or plays the touch
+stream: then fingers are at every place of the stream, so that what they felt can be read for any
+window afterwards, and those that do not touch have no weight.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
 """Courses in virtual time: lists of steps in a YAML file, by the sentence that they prove.
 
 A step is a method of what is played or, with dots, of its parts; or `is`: values of properties.
-
-Calls of the project's own functions, but those of far ends and judges.
+`calls` lists calls of the project's own functions, without those of far ends and judges.
 """
 
 import asyncio

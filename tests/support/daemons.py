@@ -1,16 +1,9 @@
-"""A daemon within the test's event loop, over a line to simulated amplifiers.
+"""Daemons for tests: within the event loop, as a process, or only their API in memory.
 
-In virtual time the line is memory, and a witness that reads every byte is the judge; in real time
-it is a pseudo-terminal.
-
-`era daemon` as a process over real wires, and clients whose fingers are felt.
-
-The far end runs in the test's own process, so that its amplifier's clock can be read: it is
-time.monotonic(), the same for all processes.
-
-The far end as users start it, a process of its own, with its control socket at hand.
-
-The API's server in memory: its methods only record their calls, its clients read nothing.
+In the loop and in virtual time the line to the simulated amplifiers is memory, and a witness that
+reads every byte is the judge; in real time it is a pseudo-terminal. As a process it plays over real
+wires to a far end in the test's own process, whose clock, time.monotonic(), is the same for all
+processes, or to a far end that is a process too, with its control socket at hand.
 """
 
 import asyncio
@@ -41,7 +34,7 @@ from controller.api.link import Notification
 from controller.api.methods import METHODS
 from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer, Connection
-from controller.daemon.config import load_daemon_config
+from controller.daemon.config import DaemonConfig, load_daemon_config
 from controller.daemon.daemon import Daemon
 from controller.process.daemon_process import ServiceManager, SocketLock
 from controller.process.log import LogThread
@@ -51,6 +44,7 @@ from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import unpack_layers
+from model.arrays import FloatArray
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table import LocalizationTable
@@ -152,11 +146,13 @@ async def daemon_at(
     changes: Sequence[tuple[str, str]] = (),
     environment: Mapping[str, str] | None = None,
     table: Callable[[Rig], LocalizationTable] = lambda rig: daemon_table(),
+    has_reader: bool = False,
 ) -> AsyncIterator[DaemonBench]:
     """A serving daemon at an existing far end.
 
     changes: replacements in the rig's text; environment: that its service manager gives it; table:
-    that of its rig.
+    that of its rig; has_reader: whether it reloads as in use, in a child, which takes a second to
+    import, or in this process.
     """
     config = load_daemon_config(write_daemon(folder, dict(far.urls), more, changes=changes))
     lock, log = SocketLock(config.socket), LogThread(folder / "log")
@@ -174,6 +170,9 @@ async def daemon_at(
         watchdog=AMPLIFIER_WATCHDOG if is_virtual else 2.0,
     )
     chain = chain_of(daemon, far) if is_virtual else None
+    patch = pytest.MonkeyPatch()
+    if not has_reader:
+        patch.setattr("controller.daemon.layouts.read_in_child", _read_here)
     task = asyncio.create_task(daemon.run(lock))
     logging.getLogger().addHandler(log)
     try:
@@ -190,9 +189,14 @@ async def daemon_at(
             log.close()
             manager.close()
             lock.release()
+            patch.undo()
     if chain is not None:
         chain.plate_judge.close()
         chain.judge()
+
+
+def _read_here(file: Path, frequencies: FloatArray) -> DaemonConfig:
+    return load_daemon_config(file).for_table(frequencies)
 
 
 def chain_of(daemon: Daemon, far: FarSide) -> Chain:

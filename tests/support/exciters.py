@@ -1,12 +1,9 @@
-"""Motions of magnets by what a simulated amplifier plays, by another solution than the product's.
+"""Exciters by another solution than the product's: motions of magnets, and one behind a resistor.
 
 The terms of every output are recorded as they reach the plate, sampled, and move the matrices of
-plate and magnets, whose motion is integrated step by step.
-
-An exciter behind a resistor as the far end of a sound card, in time: two voltages by one.
-
-The trapezoidal rule: at a frequency f it is the exact circuit at tan(pi f / rate) rate / pi, 0.14 %
-above at 1 kHz and 48 kHz, and less below.
+plate and magnets, whose motion is integrated step by step. The exciter behind a resistor is the far
+end of a sound card, in time; by the trapezoidal rule it is at a frequency f the exact circuit at
+tan(pi f / rate) rate / pi, 0.14 % above at 1 kHz and 48 kHz, and less below.
 """
 
 from collections.abc import Iterator

@@ -1,10 +1,7 @@
-"""The firmware, built by the compiler of this machine, and its programs.
+"""The firmware, built by the compiler of this machine: its programs, and in this process.
 
-Random requests of a host: sets in parts, commits, silence, stops and nonsense.
-
-The firmware in this process, on a clock that its caller moves: nothing of it takes real time.
-
-Drive the amplifiers of a bench by requests that must not be refused.
+In this process it has a clock that its caller moves, so that nothing takes real time. Random
+requests of a host are sets in parts, commits, silence, stops and nonsense.
 """
 
 import ctypes

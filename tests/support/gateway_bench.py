@@ -1,8 +1,7 @@
-"""The gateway as a process, with a scripted or a real daemon, and raw HTTP and WebSocket clients.
+"""The gateway as a process, with a scripted or a real daemon, raw clients and a real browser.
 
-All of it blocks: the test is one thread, the scripted daemon another, the gateway a process.
-
-A real headless Chromium, driven over its own DevTools protocol.
+The browser is a headless Chromium, driven over its own DevTools protocol. All of it blocks: the
+test is one thread, the scripted daemon another, the gateway a process.
 """
 
 import asyncio

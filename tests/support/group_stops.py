@@ -4,9 +4,8 @@ Over every wire of protocol 4, in virtual time. First frames are lost, late and 
 while all is stopped, at any moment of what a host does. Then one exception is raised on the way of
 each stop, at a line of the drivers that is drawn at random. Last the host is killed, and one of its
 amplifiers stopped by `era amp stop`. Whatever happens, a stop ends in time, and what it reports of
-each amplifier agrees with what its channels play.
-
-Random days of amplifiers on the chain: layers, stops, faults, lost frames.
+each amplifier agrees with what its channels play. Also random days of amplifiers on the chain:
+layers, stops, faults, lost frames.
 """
 
 import asyncio

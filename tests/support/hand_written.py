@@ -1,9 +1,7 @@
-"""Serial frames of protocol 4 written by hand from docs/decisions/0088-protocol-4.md.
+"""A host and an amplifier on a serial line, whose frames of protocol 4 are written by hand.
 
-None of the product's codecs is used: a frame is 00, COBS of (type, version, address, sequence as
-u16, payload, CRC-32), 00; words are little-endian.
-
-A host and an amplifier on a serial line, written by hand, before a witness of protocol 4.
+By docs/decisions/0088-protocol-4.md, with none of the product's codecs: a frame is 00, COBS of
+(type, version, address, sequence as u16, payload, CRC-32), 00; words are little-endian.
 """
 
 import struct

@@ -29,6 +29,9 @@ def _long(*values: Any) -> Any:
     return pytest.param(*values, marks=pytest.mark.long)
 
 
+COLLECTED = pytest.StashKey[set[str]]()
+"""Ids of all tests that were collected, also of those that no mark has selected."""
+
 SLOWEST = (
     "test_identify.py",
     "test_dashboard.py",
@@ -51,7 +54,6 @@ SLOWEST = (
     "test_four_amplifiers.py",
     "test_daemon_faults_process.py",
     "test_daemon_in_use.py",
-    "test_quick_faults.py",
     "test_wires.py",
     "test_pages.py",
     "test_over_duration.py",

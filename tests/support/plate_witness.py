@@ -3,15 +3,10 @@
 A chain of tests has these beside the bytes on its wires. With them the witness has further rules
 for hosts: those of `RULES`; limits also of measured levels; armed only on an operator's request; a
 stop as the next frame, within 20 ms of its request; no heartbeat while the control loop stalls.
-Times in s.
-
-A witness of amplifiers by their URLs, and of a control loop in virtual time.
-
-Who judges a chain beside the witness: the fingers on its plate, and bounds that always hold.
-
-Fingers are by the touch frames alone and docs/reference/touch.md. The witness excuses wires with
-faults: what must hold whatever fails is judged by what the simulated amplifiers really play, with
-bounds that the fault table and the timeouts of a link add up to.
+Times in s. Beside it the fingers on the plate are judged, by the touch frames alone and
+docs/reference/touch.md. The witness excuses wires with faults: what must hold whatever fails is
+judged by what the simulated amplifiers really play, with bounds that the fault table and the
+timeouts of a link add up to.
 """
 
 import asyncio

@@ -1,26 +1,11 @@
-"""The founding paper's plate, for tests that need a rig without a file.
+"""Plates for tests: rigs and their files, tables, measured responses, and second solutions.
 
-A table of the paper's plate that is built in a moment.
-
-The paper's plate on a mesh that is quick to solve, as smooth as its fields, and its table.
-
-Rig files for tests: the paper's plate on a coarse mesh, with what is changed in its text.
-
-Boards on exciters: four of them, and foam at the corners.
-
-A plate that is not quite the paper's, and responses measured on it, from the direct solve.
-
-Measured responses that are not what they claim, from a measurement that is.
-
-The paper's plate on its ERAs in time: a stepping solver, amplitudes and distances.
-
-Bases that move in a way known twice: as a function of time, and as terms for the plant.
-
-A drive's score and level, tone by tone from the forms.
-
-Derivatives by Richardson's extrapolation of central differences: another route to them.
-
-Settled patterns of a hidden plate, whose theory is not the model's, at random touches.
+The founding paper's plate, also on a mesh that is quick to solve, with a table that is built in a
+moment or in time on its ERAs; boards on exciters; a plate that is not quite the paper's, with
+responses measured on it, sound ones and others that are not what they claim; settled patterns of a
+hidden plate, whose theory is not the model's. Second solutions are a stepping solver, bases that
+move in a way known twice, scores of a drive tone by tone, and derivatives by Richardson's
+extrapolation of central differences.
 """
 
 import cmath

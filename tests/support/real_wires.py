@@ -1,14 +1,9 @@
 """Simulated amplifiers of protocol 4 on real wires: terminals, TCP, CAN servers and adapters.
 
-The amplifiers of a rig on a real wire, as version 4 speaks, in the test's own event loop.
-
-Modbus masters that are not ours, and what each does with an amplifier of four channels.
-
-Damage to the bytes of frames.
-
-Status with one word more than the table has: what a later edition of the protocol adds.
-
-It is a reading that may be 0 or less, -12 to 60 V in steps of 10 mV: 1 on the wire is -12 V.
+Those of a rig run in the test's own event loop. Also Modbus masters that are not ours, with what
+each does at an amplifier of four channels; damage to the bytes of frames; and Status with one word
+more than the table has, as of a later edition of the protocol: a reading that may be 0 or less,
+-12 to 60 V in steps of 10 mV, of which 1 on the wire is -12 V.
 """
 
 import asyncio

@@ -1,11 +1,8 @@
-"""A table whose answers a test sets, its timing, and rigs for which nothing has to be solved.
+"""Tables whose answers a test sets, with their timing, and rigs for which nothing is solved.
 
 The control loop asks a table that has `answer` by that, once this is imported, and any other as it
-does without.
-
-Fingers and answers of tests, and of an only vibration the layer and the first sensation.
-
-What fingers shall feel without a layout: the newest one a buzz, until it lifts.
+does without. Without a layout the newest finger feels a buzz until it lifts; of an only vibration
+the layer and the first sensation are at hand.
 """
 
 from collections import defaultdict

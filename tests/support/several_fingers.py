@@ -1,8 +1,7 @@
 """Fingers on a layout in virtual time: real bytes on a wire, a plate in time, what is felt.
 
-The chain under a supervisor, in virtual time; events of the daemon are steps of its courses.
-
-TUIO as a sender makes it, by python-osc; captures of it, and a panel of a daemon.
+The chain has a supervisor, and events of the daemon are steps of its courses. TUIO is as a sender
+makes it, by python-osc: captures of it, and a panel of a daemon.
 """
 
 import asyncio

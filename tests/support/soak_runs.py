@@ -1,12 +1,9 @@
-"""Actions of one soak run, generated from a seed.
+"""Soak runs: actions that are drawn from a seed, and the chain on which they are played.
 
-A plan is scenes one after the other: calm ones, without faults, and rough ones, with
-faults of wires and amplifiers and random operator commands; between some of them the plate is
-disarmed and untouched for up to an hour.
-
-One soak run: the one chain with its supervisor, used and misused as its plan says.
-
-Plates of the soak: the founding paper's, and that of a weekend on exciters, with a layout.
+A plan is scenes one after the other: calm ones, without faults, and rough ones, with faults of
+wires and amplifiers and random operator commands; between some of them the plate is disarmed and
+untouched for up to an hour. The chain has its supervisor, and the founding paper's plate or that of
+a weekend on exciters, with a layout.
 """
 
 import asyncio

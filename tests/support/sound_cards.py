@@ -1,6 +1,6 @@
-"""A sound card without sound: a JACK server, and a client that captures what is played to it.
+"""Sound cards without sound: a JACK server whose output is captured, and a card in memory.
 
-A sound card in memory in front of a plate on the desk, with what can be wrong with its wires.
+The card in memory is in front of a plate on the desk, with what can be wrong with its wires.
 """
 
 import contextlib

@@ -11,22 +11,17 @@ reader sees, say of the next fence:
     <!-- edit: NAME -->        a `diff`: its lines of - are replaced by those of +
     <!-- not typed: WHY -->    is for another machine
 
-Whatever else stands on the page is for reading.
+Whatever else stands on the page is for reading. The reader types, edits, and opens and ends
+terminals in an empty folder, where nothing of a checkout can be found, with an installed `era`; an
+error says which command did what else.
 
-An installed `era`, run from an empty folder where nothing of a checkout can be found.
+A command must print the facts that the page shows; the words around them are free. Facts are
+numbers and what holds a digit, an underscore, a slash, a dot within, or two capitals: names of
+states, files and addresses. `...` stands for any of them within a line, and on a line of its own
+for any lines. A number may be off by one in its last printed digit, or by two parts in a hundred,
+whichever is more. Lines without facts are not compared.
 
-Each step is what a user types first; Failed says which command did what else.
-
-The `era` under test, and what of the system a machine may lack: skipped by name, not in CI.
-
-Whether a command prints the facts that a page shows; the words around them are free.
-
-Facts are numbers and what holds a digit, an underscore, a slash, a dot within, or two capitals:
-names of states, files and addresses. `...` stands for any of them within a line, and on a line of
-its own for any lines. A number may be off by one in its last printed digit, or by two parts in a
-hundred, whichever is more. Lines without facts are not compared.
-
-Follow a page to the letter: type, edit, open terminals and end them.
+Also which programs and libraries a machine may lack: tests are skipped by their names, not in CI.
 """
 
 import contextlib

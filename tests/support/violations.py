@@ -1,8 +1,4 @@
-"""What an amplifier must not do, each in a conversation written by hand.
-
-Messages are by docs/decisions/0088-protocol-4.md, rules by docs/reference/witness.md.
-
-What a host must not do, each in a conversation written by hand.
+"""What a host or an amplifier must not do, each in a conversation written by hand.
 
 Messages are by docs/decisions/0088-protocol-4.md, rules by docs/reference/witness.md.
 """

@@ -1,18 +1,10 @@
-"""An event loop on a clock that jumps to the next timer, with a TCP network of its own.
+"""Virtual time: an event loop on a clock that jumps, and lines of every kind of wire in memory.
 
-Connections of that network are between listeners and clients of the same loop; all else has the
-machine's sockets and pipes, and costs no time. Runs without those and with the same random seed are
-identical, byte for byte.
-
-Serial lines in memory, for virtual time.
-
-Hosts and far ends write real bytes, which arrive after random delays, sometimes in two pieces.
-
-A line of protocol 4 in virtual time, of any kind of wire: hosts and simulated amplifiers.
-
-An amplifier of protocol 4 in memory, on a virtual clock, and its conformance.
-
-It is a simulated one, or any other far end of a wire: the firmware, an example.
+The loop jumps to its next timer and has a TCP network of its own, between listeners and clients of
+the same loop; all else has the machine's sockets and pipes, and costs no time. Runs without those
+and with the same random seed are identical, byte for byte. Hosts and far ends write real bytes to
+the lines, which arrive after random delays, sometimes in two pieces; on them an amplifier of
+protocol 4, simulated, of the firmware or of an example, can be judged by conformance.
 """
 
 import asyncio
@@ -799,6 +791,21 @@ def varied(channels: int = 4) -> SimulatedAmplifier:
     far.capabilities["limits"][1].update(frequency_min=300, frequency_max=8000, level_max=9000)
     far.capabilities["limits"][2].update(level_max=9500)
     return far
+
+
+_OF_EVERY_WIRE = {"lengths", "parts_of_sets", "doubled_frames", "achieved"}
+
+
+def short_checks(kind: str) -> list[str]:
+    """Checks that `make test` makes on a kind of line, by name: all on a serial line.
+
+    On another one it makes those that a serial line lacks, and some that each wire carries in a way
+    of its own.
+    """
+    names, serial = ([check.name for _, check in of_kind(each)] for each in (kind, "serial"))
+    if kind == "serial":
+        return names
+    return [name for name in names if name not in serial or name in _OF_EVERY_WIRE]
 
 
 async def results_of(

@@ -1,12 +1,7 @@
-"""The .haptic format, version 1; the values as its converter to AHAP has them, by hand.
+"""Formats of content and what a file of each becomes on a plate, by values worked out by hand.
 
-HJIF: values by hand, and the level of waves that the test makes itself.
-
-What a pattern becomes on a plate, by values calculated by hand.
-
-AHAP as Apple documents it; all values by hand.
-
-Files of content: which are refused before their format reads them, and what none may do.
+AHAP as Apple documents it, .haptic of version 1 as its converter to AHAP has it, and HJIF with
+waves that the tests make; files that are refused before their format reads them.
 """
 
 import io

@@ -399,7 +399,7 @@ async def test_reload_costs_the_loop_nothing(
         raise AssertionError("read in the daemon's process")
 
     write_layout(tmp_path / "large.yaml")
-    async with ready_daemon(tmp_path, "level_db_sl: 20\n") as (bench, era):
+    async with ready_daemon(tmp_path, "level_db_sl: 20\n", has_reader=True) as (bench, era):
         await era.subscribe("layout", "log")
         await era.arm("me", lease_s=60)
         for name in ("controller.daemon.config", "controller.effects.layout"):

@@ -247,9 +247,7 @@ def test_commands_choose_a_layout_and_reload(
         home.write_text("elsewhere: null\n", "utf-8")
         for keys, elsewhere, is_done, reasons in (
             (text, "buzz", True, ["layouts.home: changed"]),
-            (text, "buzz", True, ["nothing has changed"]),
             (f"{text}mode: phased\n", "click", False, ["mode: ", "layouts.home: changed, but not"]),
-            (text, "clik", False, [f"{config}:4: layouts.home", f"{home}:1: elsewhere: "]),
             (
                 text.replace(", climate: climate.yaml", ""),
                 "click",
@@ -266,7 +264,7 @@ def test_commands_choose_a_layout_and_reload(
             assert (client.status().layout == "climate") is ("climate" in keys)
     log = [json.loads(line) for line in (tmp_path / "daemon.log").read_text("utf-8").splitlines()]
     verdicts = [each["level"] for each in log if each["message"].startswith("config: reload")]
-    assert verdicts == ["info", "info", "error", "error", "info"]
+    assert verdicts == ["info", "error", "info"]
 
 
 JUMPS = (86_400.0, -86_400.0, 0.4, -0.4, 3e8, -1.7e9, 0.0)

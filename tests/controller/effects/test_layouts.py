@@ -1,8 +1,7 @@
-"""The dial: detents in angle about the centre of a region.
+"""Surface layouts: their files and reference page, dials, and files of content as effects.
 
-Surface layouts in their files, and the page on their keys.
-
-Files of content as effects: read beside a layout, then felt by a finger, click after click.
+Detents of a dial are at angles about the centre of its region; the clicks of a file are felt one
+after the other.
 """
 
 import json

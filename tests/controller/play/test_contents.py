@@ -1,8 +1,7 @@
-"""A modulated content beside a steady one, over the wire at the fingertips.
+"""Several contents at once in virtual time, over the wire at the fingertips.
 
-Limits of amplifiers over several contents: who is lowered, and that the sum is within.
-
-Courses in virtual time: what channels play of them, piece after piece, over the wire.
+What channels play of courses, piece after piece; a modulated content beside a steady one; and which
+contents are lowered so that their sum is within the limits of the amplifiers.
 """
 
 import asyncio

@@ -284,7 +284,7 @@ async def test_a_click_goes_before_what_lasts_of_other_fingers(
 async def test_latency_counts_from_the_change_that_an_answer_is_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A slide of 1.5 s, answers of 0.2 s, too late for a touch: one that runs, then its own."""
+    """A slide of 0.9 s, answers of 0.2 s, too late for a touch: one that runs, then its own."""
     answering_after(0.2, monkeypatch)
     async with fingers_on(
         table(), LAYOUT, breaks="touch", at={1: (0.03, 0.06), 2: RIGHT}, held=0.5
@@ -294,9 +294,9 @@ async def test_latency_counts_from_the_change_that_an_answer_is_for(
         def slide(since: float) -> None:
             fingers.at[1] = (0.03 + 0.07 * since, 0.06)
 
-        await fingers.hold(1.5, slide)
+        await fingers.hold(0.9, slide)
         latencies = [each.latency or 0.0 for each in fingers.applied[count:]]
-        assert len(latencies) >= 3
+        assert len(latencies) >= 2
         assert min(latencies) >= 0.2
         assert max(latencies) <= 0.45
 

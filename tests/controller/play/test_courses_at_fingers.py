@@ -1,11 +1,7 @@
-"""Files at fingers in virtual time: beside other effects and each other, at the edge.
+"""Files of content at fingers, played over a wire in virtual time on the simulated plate.
 
-How far programs of content move magnets, and heat coils, by what reaches the simulated plate.
-
-Content that is as strong as rigs allow, at the frequencies at which magnets move most: each program
-is played over a wire in virtual time, and its outputs move the plate of `magnets`.
-
-What reaches fingers that it is not for: regions where others are not noticed, and leaks.
+Beside other effects and each other, at the edge of the plate, and at other fingers; how far strong
+programs move magnets and how much they heat coils at the frequencies that move magnets most.
 """
 
 import logging

@@ -1,11 +1,9 @@
-"""Fingers that rest are answered again when that passes for which one of them was held back.
+"""Answers for all fingers together, on the plate in virtual time.
 
-What moving fingers are answered for, and what is promised of it.
-
-The way from what plays to a better answer, once all fingers rest, on the plate in virtual time.
-
-Two fingers that land 0.35 s apart on the paper's plate are promised 8.9 dB, since the frequency of
-the first is kept, and 19.5 where they land together; on the way both frequencies change.
+What moving fingers are promised; fingers at rest that are answered again once the cause that held
+one of them back has passed; and the way from what plays to a better answer. Two fingers that land
+0.35 s apart on the paper's plate are promised 8.9 dB, since the frequency of the first is kept, and
+19.5 where they land together; on the way both frequencies change.
 """
 
 import asyncio

@@ -1,13 +1,8 @@
-"""Clocks of several amplifiers, as the control loop's answers count them.
+"""The way from a rig and its open amplifiers to what can be played, and to the commands.
 
-How far magnets of the plate for a weekend move in onsets and endings, by another solution.
-
-Voltages of envelopes, sample by sample, move the plate of `magnets`; what programs of content do is
-in test_magnets_by_programs.py.
-
-Contents on two amplifiers of which one's clock is not held, on a plate that deviates.
-
-From the rig and its open amplifiers to what can be played, and to the commands that play it.
+Clocks of several amplifiers as answers count them, one that is not held among them; and how far
+onsets and endings move the magnets of the plate for a weekend, sample by sample in another solution
+(programs of content: test_courses_at_fingers.py).
 """
 
 import cmath

@@ -1,6 +1,7 @@
-"""Questions to the table for an intent, and when a pattern is selected again.
+"""Selection of patterns: queries for an intent, when one is selected again, and how long it plays.
 
-Vibrations in virtual time: along envelopes, renewed while contacts are confirmed, of taps.
+Vibrations in virtual time follow envelopes, are renewed while their contacts are confirmed, and end
+after a tap.
 """
 
 import asyncio

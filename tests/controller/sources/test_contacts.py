@@ -1,7 +1,4 @@
-"""From touch frames to contacts.
-
-How fast a finger moves, by places whose errors are those of a panel.
-"""
+"""Contacts that are tracked from touch frames, and the speed of a finger on a panel with errors."""
 
 import math
 from collections import Counter

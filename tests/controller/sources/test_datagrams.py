@@ -1,6 +1,6 @@
-"""Datagrams that arrive while the loop is busy, in floods, or not at all from a resting finger.
+"""Touch sources over UDP: recorded TUIO streams, invalid files, and datagrams that come too many.
 
-Recorded TUIO streams, and files that are none.
+Also datagrams that arrive while the loop is busy, and none at all from a finger that rests.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
-"""Touch panels read from the kernel's input devices, with a pipe for the device.
+"""Touch panels that are read from the kernel's input devices, with a pipe in place of the device.
 
-Events of touch panels, worked out by hand from the kernel's multi-touch protocol, type B.
+Events are worked out by hand from the kernel's multi-touch protocol, type B.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
-"""Actions of `era amp` on real wires, at simulated amplifiers of version 4.
+"""`era amp` and the synchronous amplifier, at simulated amplifiers of protocol 4.
 
-The commands `era amp` and the synchronous amplifier, over one simulated in the same process.
+The commands run over an amplifier in the same process, the actions below them on real wires too.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
-"""The check of a rig's amplifiers by their URLs alone.
+"""Reaching the amplifiers of a rig by their URLs: the check of a rig, clocks, and slcan adapters.
 
-How closely clocks are held by the lines of a rig, as `era config check` tells it.
-
-Detection of slcan adapters by two characters, and listening.
+`era config check` tells how closely the clocks are held by the lines; an adapter is detected by two
+characters, and by listening.
 """
 
 import asyncio

@@ -1,10 +1,7 @@
-"""Readings of sensors: whole ones, and replies that contradict themselves or the request.
+"""The host's amplifier of protocol 4, on real terminals, TCP connections and CAN adapters.
 
-Who is at an address: the expected amplifier, another one, or several.
-
-What an amplifier says it plays, compared with what it was sent.
-
-Amplifiers of protocol 4 by their URLs, on real terminals, TCP connections and CAN adapters.
+Which amplifier is at an address, what it says that it plays beside what it was sent, and readings
+of its sensors that contradict themselves or the request.
 """
 
 import asyncio

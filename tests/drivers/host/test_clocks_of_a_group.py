@@ -1,8 +1,7 @@
-"""Amplifiers and lines that lie, on every kind of wire: refused or counted; stops are truthful.
+"""Clocks of several amplifiers over real lines, and amplifiers and lines that lie about anything.
 
-Words of replies are altered after they were packed, by the name of the first value in them.
-
-Clocks of several amplifiers over lines as they are: the whole host, in virtual time.
+In virtual time with the whole host. Replies are altered by the name of the first word in them; they
+are refused or counted, and stops remain truthful.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
 """Lines, amplifiers and their group on every kind of wire of protocol 4, in virtual time.
 
-What a person would feel is read from the simulated amplifiers themselves.
-
-Times of a line: how long its bits take, what is late, and what a delay of this process costs.
+What a person would feel is read from the simulated amplifiers themselves. Also times of a line: how
+long its bits take, what is late, and what a delay of this process costs.
 """
 
 import asyncio

@@ -1,6 +1,7 @@
-"""The ledger: what it admits stays within the limits whenever it is played, and what it refuses.
+"""The ledger and the line below it.
 
-One line: which request goes when, how often, and what callers learn.
+What the ledger admits stays within the limits whenever it is played; the line decides which request
+goes when and how often, and what callers learn.
 """
 
 import asyncio

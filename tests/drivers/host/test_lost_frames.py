@@ -1,12 +1,8 @@
-"""Sets of which frames are lost: all play whole and once, or it is said that they do not.
+"""Groups on lines in virtual time that lose frames, and that fail where they should not.
 
-Statuses that are late, of what ends meanwhile: no sound amplifier contradicts its requests.
-
-What a group does where something fails that should not: nobody feels more than is said.
-
-Groups on lines in virtual time: courses, of the sentence that they prove.
-
-What a person would feel is read from the simulated amplifiers themselves.
+Courses in YAML, each by the sentence that it proves. Sets play whole and once, or it is said that
+they do not; no late status makes a sound amplifier contradict its requests. What a person would
+feel is read from the simulated amplifiers themselves.
 """
 
 import asyncio

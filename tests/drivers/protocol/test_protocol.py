@@ -1,6 +1,6 @@
-"""Sets of layers as streams of words, against a stream written by hand from the decision.
+"""Messages of protocol 4 as words, and sets of layers as streams of words.
 
-Messages of protocol 4 as words, against rows written by hand from their definition.
+Against rows and a stream that were written by hand from their definition.
 """
 
 import random

@@ -1,10 +1,8 @@
-"""CAN frames as text of adapters: golden lines, and what is no frame.
+"""Messages of protocol 4 in CAN frames, and the buses and adapters that carry these.
 
-Messages of protocol 4 in CAN frames: bytes worked out by hand from the decision, and losses.
-
-A bus of python-can as a port: a transmit queue that is full, and error frames.
-
-CAN adapters that speak text, as they open: socketcand's greeting, slcan's commands.
+Bytes are worked out by hand from the decision. Frames as text of adapters, the greeting of
+socketcand and the commands of slcan, a transmit queue of python-can that is full, error frames,
+losses.
 """
 
 import asyncio

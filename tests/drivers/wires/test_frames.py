@@ -1,12 +1,8 @@
-"""A request and its reply on each wire, as bytes worked out by hand from docs/reference.
+"""Requests and replies on each wire, as bytes worked out by hand from docs/reference.
 
-The checksums are by other programs: zlib and `cobs`, and the loop over bits of Modbus.
-
-Both ends of a wire with damaged bytes on their way: the short form, and whatever comes in.
-
-The host's side of a CAN bus: bytes by hand, other hosts, and damage.
-
-The host's side of Modbus: how much is read, and responses that belong to no request.
+Checksums are by other programs: zlib and `cobs`, and the loop over bits of Modbus. Both ends with
+damaged bytes in between; the host's side of a CAN bus with other hosts; and how much the host reads
+of Modbus, with responses that belong to no request.
 """
 
 import asyncio

@@ -1,14 +1,7 @@
-"""Silence before each frame of Modbus RTU, in virtual time.
+"""Framing of wires by their specifications: serial lines, Modbus RTU and TCP, interfaces of CAN.
 
-Readers of streams without a length: frames in any pieces, after any noise, in bounded memory.
-
-Frames of serial lines by their specification.
-
-Frames and messages of Modbus: what is one, what answers what, and what a library must not do.
-
-Every interface of python-can, by its name in the URL of an amplifier.
-
-A device that hangs while it is opened, read or closed delays nothing else.
+Readers find frames in any pieces and after any noise, in bounded memory; Modbus RTU is silent
+before each frame; what a library must not do; a device that hangs delays nothing else.
 """
 
 import asyncio

@@ -1,9 +1,4 @@
-"""`era table` as a user types it.
-
-`era figure`: pictures and CSV files in a folder.
-
-`era design` as it is typed.
-"""
+"""`era table`, `era design` and `era figure` as typed by a user, with files and pictures."""
 
 import csv
 import json

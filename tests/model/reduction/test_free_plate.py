@@ -1,8 +1,7 @@
-"""The free plate and the plate in a few coordinates, against direct solutions.
+"""The free plate with attachments, against the direct solve of the same mesh.
 
-The free plate with attachments, against the direct solve of the same mesh; the reduced plate, its
-slopes and its modes, against the full one; a part whose mass does not follow the thickness; modes
-that differ from the theory, and a loss factor that varies, in every solution.
+The reduced plate, its slopes and its modes, against the full one; a part whose mass does not follow
+the thickness; modes that differ from the theory, and a loss factor that varies, in every solution.
 """
 
 import math

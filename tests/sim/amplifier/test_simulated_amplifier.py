@@ -1,8 +1,6 @@
-"""The clock of a simulated amplifier against sums by hand: crystal, warm-up, rate, shift, moments.
+"""The simulated amplifier of protocol 4 against decision 0088, and its clock against sums by hand.
 
 2^32 steps in 20 s are 214 748 364.8 a second; a step of the high word is 20 s / 65536 = 305.18 us.
-
-The simulated amplifier of protocol 4 against decision 0088 and arithmetic by hand.
 """
 
 import math

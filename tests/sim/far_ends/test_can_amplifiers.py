@@ -1,12 +1,7 @@
-"""The amplifiers' side of Modbus in protocol 4, driven by masters that are not ours.
+"""Far ends of protocol 4 on real ports: CAN, its adapters, and Modbus with masters of others.
 
-Far ends of protocol 4 on real ports, asked with bytes written by hand.
-
-Amplifiers of protocol 4 on a CAN bus: bytes by hand, of which some are lost.
-
-Frames are written as identifier and data in hexadecimal digits.
-
-The far end's adapters against python-can's own interfaces, and against text by hand.
+Bytes are written by hand, frames as identifier and data in hexadecimal digits, and some are lost;
+adapters are compared with the interfaces of python-can.
 """
 
 import asyncio

@@ -1,6 +1,6 @@
-"""Bases that move as voices say, late and wrong in gain and phase, seen from the plate.
+"""Excitations on the plate in time: by hand, in the frequency domain, and with imperfections.
 
-An excitation played on the plate in time, against the frequency domain and by hand.
+Bases move as voices say, late and wrong in gain and phase, as seen from the plate.
 """
 
 import cmath

@@ -1,8 +1,7 @@
-"""The plate in time, against a linear system on straight lines, and its continuity.
+"""The plate in time, against a linear system and the unreduced finite-element plate.
 
-Exciters on the simulated plate: answers of a table as they are played, and contacts.
-
-The plate in time against the unreduced finite-element plate: transients and steady states.
+Transients, steady states and continuity; exciters, the answers of a table as they are played, and
+contacts.
 """
 
 import math

@@ -1,10 +1,8 @@
-"""A software amplifier without its sound server: it waits, and hosts see a fault meanwhile.
+"""The software amplifier: its settings, its clock, and its sound server.
 
-The clock of a software amplifier, as a made-up JACK server says when a block is played.
-
-What a software amplifier refuses before any sound device is opened.
-
-A software amplifier through a real JACK server, as a client that captures it hears it.
+What it refuses before any device is opened; the clock as a made-up JACK server says when a block is
+played; samples as a client of a real JACK server captures them; and the fault that hosts see while
+the amplifier waits for its server.
 """
 
 import asyncio

@@ -1,6 +1,7 @@
-"""Regions of a layout at the same time: what fingers in two and three of them are promised.
+"""Checks of layouts: content in time, and regions that are touched at the same time.
 
-What of content will be felt, beside the plate in time solved piece by piece.
+What of content will be felt, beside the plate in time solved piece by piece; what fingers in two
+and three regions are promised.
 """
 
 import asyncio

@@ -51,6 +51,7 @@ from virtual_lines import (
     judged,
     plain,
     results_of,
+    short_checks,
     varied,
 )
 
@@ -80,7 +81,7 @@ def expect_passed(results: list[CheckResult], skipped: set[str], *, within: floa
     assert sum(each.seconds for each in results) < within
 
 
-@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
+@pytest.mark.parametrize("kind", shortly(JUDGED_LINE_KINDS, ["serial"]))
 def test_simulated_amplifier_passes(kind: str) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind)
@@ -88,10 +89,17 @@ def test_simulated_amplifier_passes(kind: str) -> None:
     expect_passed(results, SKIPPED[kind])
 
 
-def test_amplifier_with_the_whole_table_passes_loud() -> None:
+@pytest.mark.parametrize("kind", [kind for kind in JUDGED_LINE_KINDS if kind != "serial"])
+def test_simulated_amplifier_passes_what_serial_lines_lack(kind: str) -> None:
+    """The checks of the wire alone, and some that it carries in a way of its own."""
+    expect_passed(judged(kind, short_checks(kind)), set())
+
+
+@pytest.mark.parametrize("names", shortly([[], ["limited", "voices"]], [["limited", "voices"]]))
+def test_amplifier_with_the_whole_table_passes_loud(names: list[str]) -> None:
     """At 0.9 of full level, where a sum of layers is limited."""
-    results = judged("serial", level=0.9, far=plain())
-    expect_passed(results, SKIPPED["serial"] - {"limited"})
+    results = judged("serial", names, level=0.9, far=plain())
+    expect_passed(results, set() if names else SKIPPED["serial"] - {"limited"})
 
 
 @in_virtual_time
@@ -142,12 +150,18 @@ OWN_STEPS = [
 ]
 
 
+ROUNDED = ["steps_as_stated", "achieved", "phases"]
+"""Checks of which what is rounded is the subject."""
+
+
+@pytest.mark.parametrize("names", shortly([[], ROUNDED], [ROUNDED]))
 @pytest.mark.parametrize("steps", shortly(OWN_STEPS, OWN_STEPS[:1]))
-def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int]) -> None:
+def test_amplifier_that_keeps_its_own_steps_passes(steps: dict[str, int], names: list[str]) -> None:
     """Those that it states: 1 Hz, thousandths or even 0.4 % of full level, half a circle."""
     far = _Coarse("coarse", channels=2)
     far.capabilities.update(steps)
-    expect_passed(judged("serial", far=far), SKIPPED["serial"] - {"steps_as_stated"})
+    skipped = set() if names else SKIPPED["serial"] - {"steps_as_stated"}
+    expect_passed(judged("serial", names, far=far), skipped)
 
 
 @pytest.mark.parametrize("knots", shortly([0, 1], [0]))
@@ -461,7 +475,7 @@ class _Unsteered(SimulatedAmplifier):
         return super().handle(name, {**values, "rate": 0} if name == "Ping" else values, now)
 
 
-@pytest.mark.parametrize("kind", ["can", "rtu"])
+@pytest.mark.parametrize("kind", shortly(["can", "rtu"], ["rtu"]))
 def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,7 @@
-"""Designs on several machines.
+"""Layouts designed for contrast, against enumeration, symmetry and the answers of tables.
 
-Files that say where ERAs may stand and where fingers touch.
-
-Layouts found for contrast, against enumeration, symmetry and the answers of tables.
+Also the files that say where ERAs may stand and where fingers touch, and designs on several
+machines.
 """
 
 import json

@@ -1,6 +1,6 @@
-"""Which output drives which actuator: told by a person, and by one accelerometer.
+"""Outputs and their actuators, told by a person or by one accelerometer; stepped sines in files.
 
-A stepped sine that other programs have recorded or measured, against what made it.
+The sines are as other programs record or measure them, against what made them.
 """
 
 import json

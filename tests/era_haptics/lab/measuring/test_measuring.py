@@ -1,6 +1,6 @@
-"""A plate that is simulated in place of a desk, against the plate in time and its own seed.
+"""Measurement of a plate through a sound card in memory, and what is refused.
 
-A plate measured through a sound card in memory, and what is refused.
+The plate on the desk is simulated from a seed, and compared with the plate in time.
 """
 
 import ctypes

@@ -1,12 +1,8 @@
-"""A board with exciters on the desk: in time against a direct solution, and identified.
+"""A plate or board on the desk behind a sound card: measured, and identified.
 
-What a sound card of a real JACK server, or of PortAudio over it, is refused for, and lost by.
-
-A process has one server at a time, and PortAudio keeps it: commands try PortAudio.
-
-The plate on a desk against a direct solution, and identified behind its sound card.
-
-`era measure` with one sensor that is moved: its mass, its file, and what can go wrong.
+In time against a direct solution; with one sensor that is moved, its mass and its file; and through
+a real JACK server, or PortAudio over it, with what they refuse and lose. A process has one server
+at a time, and PortAudio keeps it, so that commands try PortAudio.
 """
 
 import json
@@ -120,6 +116,7 @@ def test_a_board_that_is_given_is_not_drawn(board: Rig) -> None:
     assert -0.3 < np.angle(lag[0]) < 0
 
 
+@pytest.mark.long
 def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: Path) -> None:
     """5 g at twelve places: fields between them are known to 3 %, and worse without the mass.
 

@@ -1,6 +1,7 @@
-"""Days of amplifiers on every kind of wire, of which the witness finds nothing.
+"""The witness on days of sound amplifiers, of which it finds nothing, and its decoders.
 
-The witness's decoders against bytes that were written by hand.
+The days are random and scenarios, on every kind of wire; the decoders read bytes that were written
+by hand.
 """
 
 import random
@@ -49,7 +50,7 @@ def live(kind: str, lines: str, seed: int, *, lossy_steps: int = 0) -> None:
     run_virtual(run(), rng=rng)
 
 
-@pytest.mark.parametrize("seed", shortly(range(12), [1, 7, 11]))
+@pytest.mark.parametrize("seed", shortly(range(12), [1, 11]))
 @pytest.mark.parametrize(("kind", "lines"), in_turn(KINDS, LINES))
 def test_witness_finds_nothing_in_random_days(kind: str, lines: str, seed: int) -> None:
     """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""

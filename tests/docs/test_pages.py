@@ -383,17 +383,17 @@ def test_the_keys_are_those_that_are_printed(
     assert keys == set(json.loads(result.stdout))
 
 
-STATED_FACTS_ROOT = Path(model.__file__).parents[1]
-STATED_FACTS_PAGES = [
-    STATED_FACTS_ROOT / "README.md",
-    STATED_FACTS_ROOT / "CONTRIBUTING.md",
-    *(STATED_FACTS_ROOT / "docs").rglob("*.md"),
+CHECKOUT = Path(model.__file__).parents[1]
+FACT_PAGES = [
+    CHECKOUT / "README.md",
+    CHECKOUT / "CONTRIBUTING.md",
+    *(CHECKOUT / "docs").rglob("*.md"),
 ]
 
 
 def text_of(page: str) -> str:
     """A page's text; its name is relative to the root."""
-    return (STATED_FACTS_ROOT / page).read_text("utf-8")
+    return (CHECKOUT / page).read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -460,26 +460,23 @@ def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
 
 def test_files_that_pages_name_are_there() -> None:
     """In any folder, and tests by their bare names; decisions name what was there at the time."""
-    tests = {path.name for path in (STATED_FACTS_ROOT / "tests").rglob("test_*.py")}
-    folders = "|".join(path.name for path in STATED_FACTS_ROOT.iterdir() if path.is_dir())
+    tests = {path.name for path in (CHECKOUT / "tests").rglob("test_*.py")}
+    folders = "|".join(path.name for path in CHECKOUT.iterdir() if path.is_dir())
     named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
     gone = {
         name
-        for page in STATED_FACTS_PAGES
+        for page in FACT_PAGES
         if "decisions" not in page.parts
         for name in named.findall(page.read_text("utf-8"))
-        if not (STATED_FACTS_ROOT / name).exists()
-        and not name.startswith(("dist/", "tests/faults/AREA"))
+        if not (CHECKOUT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
     }
-    pages = [
-        page.read_text("utf-8") for page in STATED_FACTS_PAGES if "decisions" not in page.parts
-    ]
+    pages = [page.read_text("utf-8") for page in FACT_PAGES if "decisions" not in page.parts]
     assert gone == set()
     assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
 
 
-STATED_FACTS_PAGE = (STATED_FACTS_ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")
-EXAMPLES = re.findall(r"^\| `(\S+)` \| `(\S+)` \| (\d+) \|$", STATED_FACTS_PAGE, re.MULTILINE)
+URLS_PAGE = (CHECKOUT / "docs" / "reference" / "urls.md").read_text("utf-8")
+EXAMPLES = re.findall(r"^\| `(\S+)` \| `(\S+)` \| (\d+) \|$", URLS_PAGE, re.MULTILINE)
 SCHEMES = {url.partition("://")[0] for url, _, _ in EXAMPLES}
 
 
@@ -492,9 +489,7 @@ def test_example_is_the_amplifier_that_the_page_says(url: str, line: str, number
 
 def test_slowest_line_is_that_of_the_page() -> None:
     """As the check has it; the next slower speed is refused."""
-    baud, bitrate = map(
-        int, re.findall(r"at least (\d+) baud, or (\d+) kbit/s", STATED_FACTS_PAGE)[0]
-    )
+    baud, bitrate = map(int, re.findall(r"at least (\d+) baud, or (\d+) kbit/s", URLS_PAGE)[0])
     slow = {
         "a": "serial:///dev/a?baud={}",
         "b": "modbus+rtu:///dev/b?baud={}",
@@ -514,9 +509,9 @@ def test_page_has_every_scheme_and_the_time_of_a_board() -> None:
     assert (
         set(re.findall(r"([\w+-]+)://[,;\s]", f"{unknown.value} ")) - {"carrier+pigeon"} == SCHEMES
     )
-    assert set(re.findall(r"^\| `([\w+-]+)://", STATED_FACTS_PAGE, re.MULTILINE)) == SCHEMES
+    assert set(re.findall(r"^\| `([\w+-]+)://", URLS_PAGE, re.MULTILINE)) == SCHEMES
     assert set(re.findall(r"^  ([\w+-]+)://", str(amp.info.epilog), re.MULTILINE)) == SCHEMES
-    assert f"for {BOOT_TIME:g} s" in STATED_FACTS_PAGE
+    assert f"for {BOOT_TIME:g} s" in URLS_PAGE
 
 
 SHEET = json.loads(

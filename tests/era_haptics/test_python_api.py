@@ -126,7 +126,7 @@ def test_name_loads_only_what_it_needs(module: str, not_loaded: str) -> None:
 
 
 ROOT = Path(__file__).parents[2]
-NAMES_PAGE = (ROOT / "docs" / "reference" / "plugins.md").read_text("utf-8")
+PLUGINS_PAGE = (ROOT / "docs" / "reference" / "plugins.md").read_text("utf-8")
 PACKAGE = Path(era_haptics.plugins.__file__).parent
 KINDS = sorted(path.stem for path in PACKAGE.glob("[!_]*.py"))
 
@@ -151,11 +151,11 @@ def test_module_exports_its_imports_and_page_documents_them(kind: str) -> None:
     module = import_module(f"era_haptics.plugins.{kind}")
     assert imported == set(module.__all__)
     documented = re.findall(
-        rf"^\.\. (?:auto|py:)\w+:: era_haptics\.plugins\.{kind}\.(\w+)", NAMES_PAGE, re.M
+        rf"^\.\. (?:auto|py:)\w+:: era_haptics\.plugins\.{kind}\.(\w+)", PLUGINS_PAGE, re.M
     )
     assert sorted(documented) == sorted(module.__all__)
     # Where the directive is not filled in, a link leads to the docstrings.
-    assert f"](../../era_haptics/plugins/{kind}.py)" in NAMES_PAGE
+    assert f"](../../era_haptics/plugins/{kind}.py)" in PLUGINS_PAGE
 
 
 RIG = on_two_amplifiers(era.load_rig(era.example_rig_path()))
@@ -255,7 +255,7 @@ def test_play_without_targets_needs_an_answer(answer: era.Answer) -> None:
 
 
 EXAMPLES = ROOT / "examples"
-EXAMPLES_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
+API_PAGE = (ROOT / "docs" / "reference" / "python-api.md").read_text("utf-8")
 
 # Founding paper, in-house column of Table 2 [Hz].
 TABLE_2 = ["31.98", "68.50", "76.62", "107.84", "160.77"]
@@ -336,7 +336,7 @@ def test_page_example_feels_what_was_predicted(
     (tmp_path / "examples").mkdir()
     shutil.copy(EXAMPLES / "paper_plate.yaml", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    lines = re.findall(r"^```python\n(.*?)^```$", EXAMPLES_PAGE, re.MULTILINE | re.DOTALL)[0]
+    lines = re.findall(r"^```python\n(.*?)^```$", API_PAGE, re.MULTILINE | re.DOTALL)[0]
     assert len(lines.split("\n\n")[1].splitlines()) == 12
     (tmp_path / "page.py").write_text(lines, "utf-8")
     ran = runpy.run_path("page.py")
@@ -367,7 +367,7 @@ def test_page_rig_needs_no_file(
 ) -> None:
     """Nine lines, executed as printed: of three plates the thickest has the most contrast."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    lines = re.findall(r"^```python\n(.*?)^```$", EXAMPLES_PAGE, re.MULTILINE | re.DOTALL)[1]
+    lines = re.findall(r"^```python\n(.*?)^```$", API_PAGE, re.MULTILINE | re.DOTALL)[1]
     exec(lines, {"era": era})
     contrasts = [float(line.split()[1]) for line in capsys.readouterr().out.splitlines()]
     assert len(contrasts) == 3
@@ -377,10 +377,8 @@ def test_page_rig_needs_no_file(
 def test_page_documents_every_name() -> None:
     """Exactly the exported names."""
 
-    documented = named(EXAMPLES_PAGE)
-    errors = set(
-        re.findall(r"`(\w+)`", EXAMPLES_PAGE.partition("| exception")[2].partition("\n## ")[0])
-    )
+    documented = named(API_PAGE)
+    errors = set(re.findall(r"`(\w+)`", API_PAGE.partition("| exception")[2].partition("\n## ")[0]))
     assert documented | (errors & set(era.__all__)) == set(era.__all__)
     assert documented & errors == set()
 
@@ -507,8 +505,8 @@ def test_command_draws_into_files_whatever_backend_is_named(backend: str) -> Non
     assert done.stdout.splitlines()[-1] == "agg"
 
 
-ARGUMENTS_RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
-SOLVED, DRIVE, TARGET = era.SolvedPlate(ARGUMENTS_RIG), {"SW": 110}, (0.08, 0.06)
+COARSE_RIG = era.load_rig(era.example_rig_path(), mesh="12x9")
+SOLVED, DRIVE, TARGET = era.SolvedPlate(COARSE_RIG), {"SW": 110}, (0.08, 0.06)
 ANSWER = era.query(small_table(), TARGET)
 
 SHEET = era.Plate(length=0.3, width=0.2, thickness="2 mm", material="aluminium")
@@ -524,11 +522,11 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "fingertip": era.Fingertip(), "threshold": "vibrotactile-probe",
         "promised_thresholds": ["pressing-fingertip"],
     },
-    era.save_rig: {"rig": ARGUMENTS_RIG, "path": "rig.yaml"},
-    era.load_table: {"path": "t.npz", "rig": ARGUMENTS_RIG},
+    era.save_rig: {"rig": COARSE_RIG, "path": "rig.yaml"},
+    era.load_table: {"path": "t.npz", "rig": COARSE_RIG},
     era.save_table: {"table": None, "path": "t.npz"},
     era.table: {
-        "rig": ARGUMENTS_RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3),
+        "rig": COARSE_RIG, "drive_mode": "switched", "frequencies": [60], "grid": era.Grid(4, 3),
         "progress": print,
     },
     era.query: {
@@ -544,14 +542,14 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
         "table": None, "fingers": [era.Finger(TARGET, era.Stimulus())],
         "quiet": [era.Finger((0.2, 0.1))], "drive_mode": "phased", "apart_hz": 30.0,
     },
-    era.calibrate: {"rig": ARGUMENTS_RIG, "measured": "measured.csv", "progress": print},
+    era.calibrate: {"rig": COARSE_RIG, "measured": "measured.csv", "progress": print},
     era.design: {
-        "rig": ARGUMENTS_RIG, "eras": [4], "layouts": "random:3", "keep": ["SW"], "where": "edge",
+        "rig": COARSE_RIG, "eras": [4], "layouts": "random:3", "keep": ["SW"], "where": "edge",
         "contacts": "contacts.yaml", "contents": 1, "apart": 0.03, "lowest": 20.0,
         "stiffness": [17e3], "finalists": 1, "starts": 1, "seed": 0, "workers": 1,
         "cluster": "tcp://127.0.0.1:1", "progress": print,
     },
-    era.SolvedPlate: {"rig": ARGUMENTS_RIG, "seed": 1},
+    era.SolvedPlate: {"rig": COARSE_RIG, "seed": 1},
     SOLVED.map: {"drive": DRIVE, "raster": (3, 3)},
     SOLVED.play: {
         "drive": np.zeros((4, 300)), "target": TARGET, "quiet": (), "loads": (1.5,),
@@ -566,8 +564,8 @@ GOOD: dict[Callable[..., Any], dict[str, Any]] = {
     era.draw_answer: {"table": None, "answer": ANSWER, "layer": 0},
     era.draw_contents: {"table": None, "answer": ANSWER},
     era.draw_playback: {"playback": None},
-    era.open_amplifier: {"rig": ARGUMENTS_RIG, "name": "main", "url": "sim://"},
-    era.commands_for: {"rig": ARGUMENTS_RIG, "drive": DRIVE},
+    era.open_amplifier: {"rig": COARSE_RIG, "name": "main", "url": "sim://"},
+    era.commands_for: {"rig": COARSE_RIG, "drive": DRIVE},
     era.Drive: {"frequency": 110.0, "level": 1.0, "phase_deg": 0.0},
     era.Grid: {"nx": 4, "ny": 3},
     era.Stimulus: {
@@ -634,10 +632,10 @@ def test_every_function_and_argument_is_listed() -> None:
         assert arguments == set(given)
 
 
-RIGS_EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLE_FOLDER = Path(__file__).parents[2] / "examples"
 FILES = sorted(
     path
-    for path in (*RIGS_EXAMPLES.glob("*.yaml"), RIGS_EXAMPLES / "desk" / "rig.yaml")
+    for path in (*EXAMPLE_FOLDER.glob("*.yaml"), EXAMPLE_FOLDER / "desk" / "rig.yaml")
     if "plate" in yaml.safe_load(path.read_text("utf-8"))
 )
 CORNERS = {"SW": (0, 0), "SE": ("12 in", 0), "NE": ("12 in", "9 in"), "NW": (0, "9 in")}
@@ -669,7 +667,7 @@ def test_rig_with_defaults_is_the_papers_and_has_its_table(
     """Without damping, loss factor and stroke, which the example states as they are by default."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     rig = era.rig(SHEET_OF_KEYS, SPRINGS, amplifiers=MAIN)
-    assert rig == era.load_rig(RIGS_EXAMPLES / "paper_plate.yaml")
+    assert rig == era.load_rig(EXAMPLE_FOLDER / "paper_plate.yaml")
     bare = {name: era.Era(at=each["at"], stiffness=17e3) for name, each in SPRINGS.items()}
     assert era.rig(SHEET_OF_KEYS, bare) == rig  # a simulated amplifier, channels in order
     steps: list[tuple[int, int]] = []

@@ -34,7 +34,7 @@ from era_haptics.lab.measuring.loopback import read_stepped
 from era_haptics.lab.measuring.sound_card import Desk
 from era_haptics.lab.witness import capture
 from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
-from error_cases import RIG as ERROR_CASES_RIG
+from error_cases import RIG as CASE_RIG
 from interrupted import full_disk, interrupted
 from long_form import shortly
 from model.errors import InputError
@@ -130,7 +130,7 @@ LONG = {
 
 def furnish(folder: Path, shelf: Path) -> None:
     """Write a rig, a table, and every fourth frequency of a measurement."""
-    rig = ERROR_CASES_RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
+    rig = CASE_RIG.replace("[40, 300]", "[40, 500]").replace("mesh: 12x9", "mesh: auto")
     (folder / "rig.yaml").write_text(rig, encoding="utf-8")
     (folder / "table.npz").write_bytes((shelf / "table.npz").read_bytes())
     head, *rows = (shelf / "measured.csv").read_text("utf-8").splitlines(keepends=True)
@@ -236,7 +236,7 @@ def fill_disk(pid: int) -> None:
 
 def test_recording_fails_without_a_file_when_the_disk_is_full(home: Path) -> None:
     """`era sim` reports the error at its end, and leaves no partial recording."""
-    (home / "rig.yaml").write_text(ERROR_CASES_RIG, encoding="utf-8")
+    (home / "rig.yaml").write_text(CASE_RIG, encoding="utf-8")
     era = Path(sys.executable).with_name("era")
     with subprocess.Popen(
         # -B: bytecode would be cut off, too, and Python does not notice

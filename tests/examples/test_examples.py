@@ -149,8 +149,8 @@ async def test_conformance_finds_what_the_server_cannot_do(kind: str, drives: bo
     assert skipped - BY_MACHINE == names & SKIPPED
 
 
-SYSTEMD_UNIT_FOLDER = Path(model.__file__).parents[1] / "examples" / "systemd"
-WEEKEND = SYSTEMD_UNIT_FOLDER.parent / "weekend"
+UNITS = Path(model.__file__).parents[1] / "examples" / "systemd"
+WEEKEND = UNITS.parent / "weekend"
 AT_HOME = ("era-sound-server", "era-soft-amp", "era-plate")
 """In the order in which they start."""
 MAX_EXPOSURE = 2.0
@@ -201,9 +201,9 @@ def calls_of(program: str, names: list[str]) -> set[str]:
 def test_unit_is_valid_and_hardened(tmp_path: Path, is_allowed: bool) -> None:
     """systemd accepts every line and rates the exposure as low, devices allowed or not."""
     program = installed_program("systemd-analyze", package="systemd")
-    text = (SYSTEMD_UNIT_FOLDER / "era-haptics.service").read_text("utf-8")
+    text = (UNITS / "era-haptics.service").read_text("utf-8")
     if is_allowed:
-        drop_in = (SYSTEMD_UNIT_FOLDER / "devices.conf").read_text("utf-8")
+        drop_in = (UNITS / "devices.conf").read_text("utf-8")
         commented = re.findall(r"^#(\w+=.*\n)", drop_in, re.MULTILINE)
         assert {"DeviceAllow=char-ttyUSB rw\n", "DeviceAllow=char-input r\n"} < set(commented)
         text = text.replace("[Install]", f"{''.join(commented)}[Install]")
@@ -333,7 +333,7 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @asynccontextmanager
-async def unix_wire_served(path: Path) -> AsyncIterator[asyncio.Server]:
+async def served_socket(path: Path) -> AsyncIterator[asyncio.Server]:
     """Two amplifiers at a socket, of which the server hears one host."""
     far = {number: SimulatedAmplifier(str(number), channels=1) for number in (1, 2)}
     loop = asyncio.get_running_loop()
@@ -361,7 +361,7 @@ async def unix_wire_served(path: Path) -> AsyncIterator[asyncio.Server]:
 async def test_group_plays_behind_a_socket_until_it_is_closed(address: Any, tmp_path: Path) -> None:
     """Two amplifiers on one line, played by one commit, silent after a stop; then it is lost."""
     path = tmp_path / "line.sock"
-    async with unix_wire_served(path):
+    async with served_socket(path):
         lines = Lines()
         amplifiers = {
             str(number): await lines.amplifier(
@@ -403,7 +403,7 @@ async def test_url_and_socket_must_be_there(address: Any, tmp_path: Path) -> Non
 SOURCE = Path(era_haptics.__file__).parents[1] / "examples" / "smallest_amplifier" / "amplifier.c"
 MOVED = Path(__file__).parents[1] / "support" / "moved_smallest.c"
 BUILD = "-std=c11 -D_GNU_SOURCE -Wall -Wextra -Werror -O1 -fsanitize=undefined -shared -fPIC"
-SMALLEST_AMPLIFIER_SKIPPED = {
+NOT_IN_SMALLEST = {
     *("sensors", "steps_as_stated", "limited", "measured", "readings", "addresses", "mark"),
 }
 
@@ -445,9 +445,7 @@ def test_conformance_on_a_clock_that_is_moved(level: float, library: Path) -> No
     failed = [f"{each.check.name}: {each.reason}" for each in found if each.result == "failed"]
     assert not failed, failed[0]
     skipped = {each.check.name for each in found if each.result == "skipped"}
-    assert skipped == (
-        SMALLEST_AMPLIFIER_SKIPPED if level < 0.5 else SMALLEST_AMPLIFIER_SKIPPED - {"limited"}
-    )
+    assert skipped == (NOT_IN_SMALLEST if level < 0.5 else NOT_IN_SMALLEST - {"limited"})
 
 
 @pytest.mark.parametrize(
@@ -497,7 +495,7 @@ def test_source_is_small() -> None:
 BUTTON = Path(__file__).parents[2] / "examples" / "javascript" / "button.mjs"
 TARGET, QUIET = "0.08,0.06", "0.22,0.16"
 
-JAVASCRIPT_CLIENT_ROOT = BUTTON.parents[2]
+CLIENT_ROOT = BUTTON.parents[2]
 PAGE = "controller/gateway/page/connection.js"
 
 
@@ -644,7 +642,7 @@ def test_package_is_installed_with_types_of_what_it_has(tmp_path: Path) -> None:
     source, user = tmp_path / "examples" / "javascript", tmp_path / "user"
     shutil.copytree(BUTTON.parent, source)
     (tmp_path / PAGE).parent.mkdir(parents=True)
-    shutil.copy(JAVASCRIPT_CLIENT_ROOT / PAGE, tmp_path / PAGE)
+    shutil.copy(CLIENT_ROOT / PAGE, tmp_path / PAGE)
     user.mkdir()
     package = json.loads((source / "package.json").read_text("utf-8"))
     installed = user / "node_modules" / "era-haptics"

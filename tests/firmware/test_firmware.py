@@ -64,14 +64,14 @@ from firmware_machine import (
     running_firmware,
     values_of,
 )
-from firmware_machine import LINES as FIRMWARE_MACHINE_LINES
+from firmware_machine import LINES as FIRMWARE_KINDS
 from firmware_records import records_header
 from hand_written import tone as command
 from long_form import shortly
 from model.arrays import FloatArray
 from real_wires import MASTERS, damage, drive
 from registry.limits import GuardLimits
-from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedAmplifierAmplifier
+from sim.amplifier.simulated_amplifier import SimulatedAmplifier as SimulatedEnd
 from typed_page import installed_program
 from virtual_lines import judged
 
@@ -265,7 +265,7 @@ def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
 REPLY_TIMEOUT = 5.0  # s; the firmware is another process, on a busy machine
 NEW = 9
-FIRMWARE_HOST_LINES = {
+URL_ENDS = {
     "--serial": "?address=9",
     "--modbus-rtu": "#9",
     "--modbus-tcp": "/9",
@@ -307,7 +307,7 @@ def test_foreign_master_drives_it(name: str, firmware: Path) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("line", FIRMWARE_HOST_LINES)
+@pytest.mark.parametrize("line", URL_ENDS)
 async def test_address_is_taken_and_kept_without_supply(
     line: str, firmware: Path, tmp_path: Path
 ) -> None:
@@ -326,7 +326,7 @@ async def test_address_is_taken_and_kept_without_supply(
                 while not (kept.is_file() and kept.stat().st_size):  # noqa: ASYNC110 - another process writes it
                     await asyncio.sleep(0.01)
     with running_firmware(firmware, *options(line, "--addresses", str(kept))) as (url, _):
-        assert url.endswith(FIRMWARE_HOST_LINES[line])
+        assert url.endswith(URL_ENDS[line])
         async with opened(url) as amplifier:
             assert amplifier.identity["serial_number"] == "FW-1"
 
@@ -376,7 +376,7 @@ BUILDS = {"-DSMALLEST": 4, **{f"-DCHANNELS={channels}": channels for channels in
 """Options of the compiler, with the number of channels."""
 
 
-def like(amplifier: SimulatedAmplifierAmplifier, firmware: Sent) -> SimulatedAmplifierAmplifier:
+def like(amplifier: SimulatedEnd, firmware: Sent) -> SimulatedEnd:
     """Return a simulated amplifier with the capabilities of the firmware."""
     amplifier.capabilities = firmware.values()
     amplifier.restart(0.0)
@@ -416,7 +416,7 @@ def agree(name: str, ours: object, theirs: object) -> bool:
     return ours == theirs
 
 
-def value_at(amplifier: SimulatedAmplifierAmplifier, channel: int, time: float) -> float:
+def value_at(amplifier: SimulatedEnd, channel: int, time: float) -> float:
     """What it plays at a time [s]: Im[A(t) exp(2 pi i f clock(t))], limited."""
     total, seconds = 0.0, amplifier.clock.seconds(time)
     for voice in amplifier.playback.all_voices[channel]:
@@ -436,10 +436,10 @@ def test_random_requests_have_the_same_replies_and_samples(
     """
     draw, channels = random.Random(seed), BUILDS[build]
     firmware = MovedFirmware(moved(build), channels=channels)
-    amplifier = SimulatedAmplifierAmplifier("a", channels=channels)
+    amplifier = SimulatedEnd("a", channels=channels)
     like(
         amplifier,
-        Pair(firmware, SimulatedAmplifierAmplifier("b", channels=channels)).ask(2, [])[0][0],
+        Pair(firmware, SimulatedEnd("b", channels=channels)).ask(2, [])[0][0],
     )
     pair = Pair(firmware, amplifier)
     host = RandomHost(draw, amplifier.capabilities)
@@ -475,7 +475,7 @@ OF_WIRE = {"rtu": {"events"}, "tcp": {"events"}}
 """Skipped, too, by the wire."""
 
 
-@pytest.mark.parametrize("kind", shortly(FIRMWARE_MACHINE_LINES, ["can"]))
+@pytest.mark.parametrize("kind", shortly(FIRMWARE_KINDS, ["can"]))
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind, far=partial(FirmwareEnd, kind, replaying))
@@ -485,9 +485,7 @@ def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     assert skipped == SKIPPED | OF_WIRE.get(kind, set())
 
 
-FIRMWARE_SAMPLES_TOLERANCE = (
-    6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
-)
+SAMPLE_TOLERANCE = 6e-5  # of full level: two steps of a 16-bit sample, and phases over seconds
 
 
 def seconds(count: int) -> FloatArray:
@@ -537,10 +535,8 @@ def test_square_of_voltages_is_the_summed_force(replaying: Path, square_law: Pat
     forces, _ = replay(replaying, script, 150)
     voltages, _ = replay(square_law, script, 150)
     assert voltages.min() >= 0
-    np.testing.assert_allclose(2 * voltages**2 - 1, forces, atol=2 * FIRMWARE_SAMPLES_TOLERANCE)
-    assert voltages[0, 3] == pytest.approx(
-        np.sqrt(0.5), abs=FIRMWARE_SAMPLES_TOLERANCE
-    )  # a silent channel
+    np.testing.assert_allclose(2 * voltages**2 - 1, forces, atol=2 * SAMPLE_TOLERANCE)
+    assert voltages[0, 3] == pytest.approx(np.sqrt(0.5), abs=SAMPLE_TOLERANCE)  # a silent channel
 
 
 @pytest.mark.parametrize(
@@ -561,7 +557,7 @@ def test_bias_is_there_only_under_high_voltage(
     voltages, _ = replay(square_law, script, 200)
     assert not voltages[: 10 * PER_MS].any()
     silent = voltages[10 * PER_MS + 1 : 80 * PER_MS, 3]
-    np.testing.assert_allclose(silent, np.sqrt(0.5), atol=FIRMWARE_SAMPLES_TOLERANCE)
+    np.testing.assert_allclose(silent, np.sqrt(0.5), atol=SAMPLE_TOLERANCE)
     assert not voltages[130 * PER_MS :].any()
 
 
@@ -599,7 +595,7 @@ def test_stalled_loop_is_silent_as_soon_as_it_runs(
     first = 0.0 if is_converter_still else 0.15
     t = seconds(len(samples))
     gain = falling(t - first, 0.005)
-    assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < FIRMWARE_SAMPLES_TOLERANCE
+    assert np.abs(samples - gain * tone(t + 0.1, 100, 0.5, 90)).max() < SAMPLE_TOLERANCE
     status = values_of(firmware, hand.GET_STATUS)
     assert (status["state"], status["fault"]) == (hand.FAULT, hand.WATCHDOG)
 

@@ -55,7 +55,7 @@ from daemons import (
     write_daemon,
 )
 from examples.make_touches import tuio_datagram
-from kills import PLACES as KILLS_PLACES
+from kills import PLACES as KILLED_AT
 from kills import kill_everywhere
 from long_form import shortly
 from model.answer.answer import Layer
@@ -387,7 +387,7 @@ async def test_channels_are_silent_in_time_when_daemon_is_killed() -> None:
     """
     kills = await kill_everywhere(KILLS, seed=4, serial=1 / 3)
     assert len(kills) == KILLS
-    assert {kill.wire for kill in kills} == {name for name, _, _ in KILLS_PLACES}
+    assert {kill.wire for kill in kills} == {name for name, _, _ in KILLED_AT}
     assert not [kill for kill in kills if not kill.is_good]
     # The test is void unless many were energised, and some of them audibly.
     assert sum(kill.energised > 0 for kill in kills) >= KILLS // 3

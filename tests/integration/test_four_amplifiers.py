@@ -53,7 +53,7 @@ from drivers.host.group import GroupState
 from drivers.opening import Lines
 from era_haptics.lab.conformance.contract import opened
 from era_haptics.lab.witness.capture import TimeLimits
-from gateway_bench import ERA as GATEWAY_BENCH_ERA
+from gateway_bench import ERA as INSTALLED_ERA
 from gateway_bench import (
     TOKEN,
     UNCONFIRMED,
@@ -642,7 +642,7 @@ def gateway(
     request: pytest.FixtureRequest, watched: Watch, daemon: Path, tmp_path: Path
 ) -> Iterator[GatewayProcess]:
     """A gateway, which must not log anything; parameter: the command instead of `era`."""
-    program = getattr(request, "param", (GATEWAY_BENCH_ERA,))
+    program = getattr(request, "param", (INSTALLED_ERA,))
     with gateway_process(tmp_path, daemon, program=program) as made:
         wait_for_daemon(made)
         yield made

@@ -32,7 +32,7 @@ import model
 from benchmarks.desk.chain import chain
 from benchmarks.desk.identified import identified_errors
 from benchmarks.desk.session import BLOCK, PLATE, Desk, desk
-from benchmarks.desk.session import EXAMPLES as SESSION_EXAMPLES
+from benchmarks.desk.session import EXAMPLES as DESK_EXAMPLES
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.truth import draw_truth
 from benchmarks.latency.session import Taps, daemon_session, plain_session, taps
@@ -66,7 +66,7 @@ from daemons import (
     until_state,
     write_daemon,
 )
-from daemons import until as daemons_until
+from daemons import until as until_seen
 from examples.make_measured import record_responses, scanning_grid
 from floods import flood
 from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
@@ -104,7 +104,7 @@ async def example_daemon(name: str, folder: Path, cache: Path) -> AsyncIterator[
     )
     socket = folder / "era-haptics" / "daemon.sock"
     try:
-        await daemons_until(lambda: socket.is_socket() or process.returncode, patience=STARTING)
+        await until_seen(lambda: socket.is_socket() or process.returncode, patience=STARTING)
         async with await AsyncClient.connect(socket, name="test", timeout=PATIENCE) as era:
             await ready(era)
             yield era
@@ -268,7 +268,7 @@ async def test_lost_server_is_a_fault_and_comes_back_disarmed(
             await until_state(era, "FAULT", "COMM_LOST")
             assert not (await era.status()).drive
             with jack_server(name, outputs=CHANNELS):
-                await daemons_until(lambda: "open again" in amp.log, patience=SERVER_BACK)
+                await until_seen(lambda: "open again" in amp.log, patience=SERVER_BACK)
                 await until_state(era, "FAULT", "COMM_LOST", READY)
                 assert not (await era.status()).drive
                 await ready(era)
@@ -303,7 +303,7 @@ async def stop_by_new_client(daemon: DaemonProcess) -> None:
                     break
             except (RpcError, Unreachable, ConnectionError):  # too many clients
                 await asyncio.sleep(0.05)
-    await daemons_until(lambda: loudness(daemon.far) == 0)
+    await until_seen(lambda: loudness(daemon.far) == 0)
 
 
 @pytest.mark.long
@@ -444,7 +444,7 @@ async def test_running_daemon_keeps_configuration_when_reload_is_invalid(
         check_daemon(config)
 
 
-MANY_ERAS_CHANNELS = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
+CHANNELS_OF = {"eight_eras": [4, 4], "car_display": [4, 4, 4], "table": [4, 4, 4, 4]}
 SCHEDULE = ((1, 0.1, 0.9, 0.30, 0.35), (2, 0.15, 0.9, 0.80, 0.70))
 """Fingers: id, down and up [s], place in TUIO's coordinates."""
 
@@ -456,7 +456,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_schedule(path, SCHEDULE, 1.0)
 
 
-@pytest.mark.parametrize("name", shortly(MANY_ERAS_CHANNELS, ["eight_eras", "car_display"]))
+@pytest.mark.parametrize("name", shortly(CHANNELS_OF, ["eight_eras", "car_display"]))
 def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     """All ERAs on all amplifiers play, and the fingers feel at least the promised contrast.
 
@@ -466,7 +466,7 @@ def test_finger_feels_what_many_eras_promise(name: str, capture: Path) -> None:
     file = EXAMPLES / f"{name}.yaml"
     rig = load_rig(file)
     counts = Counter(wire.amplifier for wire in rig.wiring.values())
-    assert [counts[amplifier] for amplifier in rig.amplifiers] == MANY_ERAS_CHANNELS[name]
+    assert [counts[amplifier] for amplifier in rig.amplifiers] == CHANNELS_OF[name]
     table = build_table(rig, frequencies=np.array([120.0, 160.0, 200.0]), drive_mode="phased")
     rows = run_virtual(
         run_demo(
@@ -523,7 +523,7 @@ def test_three_people_each_feel_their_own_content_while_one_slides_and_one_leave
         assert row.as_json()["fingers"]
 
 
-@pytest.mark.parametrize("name", MANY_ERAS_CHANNELS)
+@pytest.mark.parametrize("name", CHANNELS_OF)
 def test_layout_lies_on_its_plate(name: str) -> None:
     """Every control is where a finger can be, and no control covers the middle of another."""
     plate = load_rig(EXAMPLES / f"{name}.yaml").plate
@@ -713,7 +713,7 @@ def test_identified_plate_is_the_one_on_the_desk(plate: Desk) -> None:
 def moved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     """The same plate with one sensor of 2 g, which is moved to the twelve places."""
     folder = tmp_path_factory.mktemp("moved")
-    text = (SESSION_EXAMPLES / "sensors.csv").read_text("utf-8")
+    text = (DESK_EXAMPLES / "sensors.csv").read_text("utf-8")
     head, *lines = text.splitlines()
     rows = (line.split(",") for line in lines)
     one = [",".join([*row[:3], "1", *row[4:], "2"]) for row in rows]

@@ -393,10 +393,10 @@ def test_felt_part_of_slow_samples_is_all_of_them() -> None:
     assert felt_part(np.zeros((0, 3)), 10_000.0).shape == (0, 3)
 
 
-PERCEPTION_PLATE = Plate(0.6, 0.2, 0.002, Material("steel", 210e9, 7850.0, 0.3))
+STEEL_PLATE = Plate(0.6, 0.2, 0.002, Material("steel", 210e9, 7850.0, 0.3))
 
 
 def test_grid_numbers_cells_along_x_first():
     """Three by two cells of 200 x 100 mm."""
     centres = [[x, y] for y in (0.05, 0.15) for x in (0.1, 0.3, 0.5)]
-    np.testing.assert_allclose(Grid(3, 2).centres(PERCEPTION_PLATE), centres)
+    np.testing.assert_allclose(Grid(3, 2).centres(STEEL_PLATE), centres)

@@ -22,9 +22,9 @@ from drivers.playing import AmplifierTone, Voice, VoiceTransition
 from drivers.protocol.definition import READING_STATES
 from drivers.protocol.records import Refusal, Values
 from drivers.protocol.sets import Command, LayerSet, pack_layers, parts
-from firmware_machine import SESSION as FIRMWARE_MACHINE_SESSION
-from firmware_machine import bench_driving_arm, keep_alive
-from firmware_machine import play as firmware_machine_play
+from firmware_machine import SESSION as BENCH_SESSION
+from firmware_machine import arm_bench, keep_alive
+from firmware_machine import play as play_at_once
 from model.arrays import FloatArray
 from model.fem import assemble
 from model.finger import fingertip_points
@@ -85,7 +85,7 @@ def test_tone_goes_on_where_the_clock_goes_round(coarse_rig: Rig) -> None:
     """A steady tone of 110.05 Hz has no step and no new phase at 20 s and at 40 s."""
     bench = Bench(coarse_rig, now=18.0)
     bench.place_fingers({"a": AT}, now=18.0)
-    firmware_machine_play(bench, AmplifierTone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
+    play_at_once(bench, AmplifierTone(0, 110.05, 0.5), now=18.0, watchdog=2.0, ramp=0.02)
     before, over, after = phases(bench, (19.9, 20.4, 40.3), 110.05)
     assert before == pytest.approx(over, abs=1e-5)
     assert before == pytest.approx(after, abs=1e-5)
@@ -97,7 +97,7 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
     bench = Bench(two_amplifiers, now=0.0, imperfections=Imperfections(crystals=crystals))
     bench.place_fingers({"a": AT}, now=0.0)
     for name, frequency in (("left", 110.0), ("right", 170.0)):
-        firmware_machine_play(
+        play_at_once(
             bench, AmplifierTone(0, frequency, 0.5), now=0.0, name=name, watchdog=2.0, ramp=0.02
         )
     found = phases(bench, (3.0, 5.0), 110.0, 170.0)
@@ -107,7 +107,7 @@ def test_crystals_drift_apart_at_the_plate(two_amplifiers: Rig) -> None:
         bench.exchange(
             "left",
             "Ping",
-            {"session": FIRMWARE_MACHINE_SESSION, "rate": -700},
+            {"session": BENCH_SESSION, "rate": -700},
             now=5.05 + step / 20,
         )
     steered = phases(bench, (15.5,), 110.0)[0, 0] - found[1, 0]
@@ -122,9 +122,9 @@ def test_shift_is_of_the_phase(coarse_rig: Rig) -> None:
     for shift in (0, 5):
         bench = Bench(coarse_rig, now=0.0)
         bench.place_fingers({"a": AT}, now=0.0)
-        values = {"session": FIRMWARE_MACHINE_SESSION, "watchdog": 2000, "shift": shift}
+        values = {"session": BENCH_SESSION, "watchdog": 2000, "shift": shift}
         bench.exchange("main", "Arm", values, now=0.0)
-        firmware_machine_play(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
+        play_at_once(bench, AmplifierTone(0, 110.0, 0.5), now=0.1)
         found.append(phases(bench, (3.0,), 110.0)[0, 0])
     assert math.degrees(found[1] - found[0]) == pytest.approx(360 * 110 * 5 * 20 / 65536, abs=1e-3)
 
@@ -286,10 +286,8 @@ def test_bench_watchdog_silences_at_its_time(coarse_rig: Rig) -> None:
     prompt, late = Bench(coarse_rig, now=START), Bench(coarse_rig, now=START)
     for bench in (prompt, late):
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        bench_driving_arm(bench, 0.25, now=START)
-        firmware_machine_play(
-            bench, AmplifierTone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02
-        )
+        arm_bench(bench, 0.25, now=START)
+        play_at_once(bench, AmplifierTone(1, 110.0, 1.0), now=START + 0.1, token=1, ramp=0.02)
     for step in range(1, 401):
         prompt.advance(START + 0.1 + step * 0.005)
     for bench in (prompt, late):
@@ -323,12 +321,12 @@ def test_bench_record_is_independent_of_when_it_is_read(coarse_rig: Rig) -> None
     for is_read in (True, False):
         bench = Bench(coarse_rig, now=START)
         bench.place_fingers({"a": (0.1, 0.1)}, now=START)
-        bench_driving_arm(bench, 2.0, now=START)
+        arm_bench(bench, 2.0, now=START)
         for step in range(1, 101):
             now = START + 0.003 * step
             if step in (20, 45, 70):  # at 20 abruptly
                 tone = AmplifierTone(step % 4, 100.0 + step, 1.0)
-                firmware_machine_play(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
+                play_at_once(bench, tone, now=now, token=step, ramp=0.001 * (step - 20))
             bench.advance(now)
             if step == 60:
                 listener = Listener(bench)
@@ -354,8 +352,8 @@ def test_bench_skips_a_long_pause(coarse_rig: Rig) -> None:
     """A process that was paused for a day comes back to a silent plate, ten seconds recorded."""
     bench = Bench(coarse_rig, now=0.0)
     bench.place_fingers({"a": (0.1, 0.1)}, now=0.0)
-    bench_driving_arm(bench, 0.25, now=0.0)
-    firmware_machine_play(bench, AmplifierTone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
+    arm_bench(bench, 0.25, now=0.0)
+    play_at_once(bench, AmplifierTone(1, 110.0, 1.0), now=0.1, token=1, ramp=0.02)
     bench.advance(86_400.0)
     felt = bench.felt(86_400.0 - 9.9, 86_400.0)
     assert felt["a"].peak.max() < 1e-9
@@ -382,7 +380,7 @@ def test_bench_observers_have_no_weight(coarse_rig: Rig) -> None:
     bare.place_fingers({"a": A, "b": B}, now=0.0)
     observed.place_fingers({"a": A, "b": B}, now=0.0, observers={"a", "b"})
     for bench in (bare, observed):
-        firmware_machine_play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+        play_at_once(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
         keep_alive(bench, 4.0)
         (amplitude,) = bench.felt(3.5, 4.0)["a"].amplitude
         assert apart(amplitude, expected(coarse_rig, ())) < 0.01
@@ -394,7 +392,7 @@ def test_bench_sensors_read_through_a_touch(coarse_rig: Rig) -> None:
     bench = Bench(replace(coarse_rig, fingertip=tip), now=0.0)
     sensors = Accelerometers(bench)
     sensors.place([Accelerometer("P1", 0.2, 0.03)])
-    firmware_machine_play(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
+    play_at_once(bench, FULL_STROKE, now=bench.time, ramp=0.02, watchdog=2.0)
     keep_alive(bench, 1.0)
     bench.place_fingers({"b": B}, now=1.0)
     keep_alive(bench, 4.0)
@@ -438,9 +436,7 @@ def driven(rig: Rig, place: Callable[[Bench], None]) -> Bench:
     """A bench that plays on through a touch at 0.5 s, up to 1.2 s."""
     bench = Bench(rig, now=0.0)
     bench.place_fingers({"a": PLACE_A}, now=0.0)
-    firmware_machine_play(
-        bench, AmplifierTone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0
-    )
+    play_at_once(bench, AmplifierTone(1, 210.0, 1.0), now=bench.time, ramp=0.02, watchdog=2.0)
     keep_alive(bench, 0.5)
     place(bench)
     keep_alive(bench, 1.2)

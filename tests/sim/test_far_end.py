@@ -331,24 +331,24 @@ def test_a_line_has_one_link_and_a_network_none(tmp_path: Path, terminal: str) -
     assert not any(path.is_symlink() for path in tmp_path.iterdir())
 
 
-PROGRAMS_RATE = 16_000.0
+PROGRAM_RATE = 16_000.0
 
 
 @pytest.mark.parametrize("frequency", [40.0, 128.45, 270.0, 499.95])
 def test_frequency_of_a_steady_tone_is_found_to_the_step_of_the_wire(frequency: float) -> None:
     """In a quarter of a second, on channels of other levels and phases; silent ones have none."""
-    t = np.arange(4000) / PROGRAMS_RATE
+    t = np.arange(4000) / PROGRAM_RATE
     tones = [0.9 * np.sin(2 * np.pi * frequency * t), 0.01 * np.cos(2 * np.pi * frequency * t)]
     samples = np.column_stack([*tones, np.zeros((len(t), 2))])
-    assert frequencies_in(samples, rate=PROGRAMS_RATE) == pytest.approx([frequency], abs=0.051)
+    assert frequencies_in(samples, rate=PROGRAM_RATE) == pytest.approx([frequency], abs=0.051)
 
 
 def test_frequencies_of_channels_and_of_a_cross_fade_are_told_apart() -> None:
     """Two channels with a tone each, one of which changes to another."""
-    t = np.arange(4000) / PROGRAMS_RATE
+    t = np.arange(4000) / PROGRAM_RATE
     changing = np.where(t < 0.12, np.sin(2 * np.pi * 100 * t), 0.5 * np.sin(2 * np.pi * 180 * t))
     samples = np.column_stack([changing, np.sin(2 * np.pi * 130 * t)])
-    assert frequencies_in(samples, rate=PROGRAMS_RATE) == pytest.approx([100, 130, 180], abs=0.5)
+    assert frequencies_in(samples, rate=PROGRAM_RATE) == pytest.approx([100, 130, 180], abs=0.5)
 
 
 def test_missing_firmware_is_told_with_the_remedy(

@@ -23,7 +23,7 @@ from sim.bench.amplifier_device import AmplifierDevice
 from sim.faults import FaultKind, Faults, FaultWindow, load_faults
 from sim.memory_line import MemoryPort
 from sim.process.simulation import STEP, SteppedLoop
-from sim.transport.simulated_line import SimulatedLine as SimulatedLineLine
+from sim.transport.simulated_line import SimulatedLine as MemoryLine
 from virtual_lines import in_virtual_time
 
 
@@ -238,7 +238,7 @@ def test_line_delivers_frames_at_its_speed_until_closed(is_closed: bool) -> None
         loop = asyncio.get_running_loop()
         assert isinstance(loop, SteppedLoop)
         arrived: list[float] = []
-        line = SimulatedLineLine(
+        line = MemoryLine(
             lambda data, now: arrived.append(loop.time()),
             toward="host",
             faults=Faults(),

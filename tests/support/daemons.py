@@ -544,7 +544,7 @@ def tell(what: str, seconds: float) -> None:
     sys.stdout.write(f"\nmeasured: {what}: {1e3 * seconds:.1f} ms\n")
 
 
-FAR_END_PROCESS_PATIENCE = 180  # s; for a loaded machine, not an expectation
+PROCESS_PATIENCE = 180  # s; for a loaded machine, not an expectation
 
 
 @dataclass
@@ -560,14 +560,14 @@ class FarEndProcess:
     async def ask(self, op: str, **request: Any) -> dict[str, Any]:
         """One line of control and the answer to it, errors among them."""
         self.writer.write(json.dumps({"op": op, **request}).encode() + b"\n")
-        line = await asyncio.wait_for(self.reader.readline(), FAR_END_PROCESS_PATIENCE)
+        line = await asyncio.wait_for(self.reader.readline(), PROCESS_PATIENCE)
         answer: dict[str, Any] = json.loads(line)
         return answer
 
     async def end(self, number: signal.Signals = signal.SIGTERM) -> tuple[int | None, str]:
         """Tell it to end; its exit status and what it still said on standard output."""
         self.process.send_signal(number)
-        out, _ = await asyncio.wait_for(self.process.communicate(), FAR_END_PROCESS_PATIENCE)
+        out, _ = await asyncio.wait_for(self.process.communicate(), PROCESS_PATIENCE)
         return self.process.returncode, out.decode()
 
 
@@ -584,9 +584,7 @@ async def far_end_process(rig: Path, *options: str) -> AsyncIterator[FarEndProce
         )
         try:
             assert process.stdout is not None
-            line = (
-                await asyncio.wait_for(process.stdout.readline(), FAR_END_PROCESS_PATIENCE)
-            ).decode()
+            line = (await asyncio.wait_for(process.stdout.readline(), PROCESS_PATIENCE)).decode()
             name, _, url = line.strip().partition(": ")
             reader, writer = await asyncio.open_unix_connection(control, limit=1 << 24)
             try:

@@ -362,7 +362,7 @@ def replay(
 _Q = QUANTITIES
 
 
-def bench_driving_arm(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:
+def arm_bench(bench: Bench, watchdog: float, *, now: float, name: str = "main") -> None:
     """Arm an amplifier at a time [s], with a watchdog [s]."""
     values = {"session": SESSION, "watchdog": _Q["watchdog"].to_wire(watchdog), "shift": 0}
     bench.exchange(name, "Arm", values, now=now)
@@ -379,7 +379,7 @@ def play(
 ) -> None:
     """Play tones in layer 0 at a time [s]; watchdog [s]: arm before, None where it is armed."""
     if watchdog is not None:
-        bench_driving_arm(bench, watchdog, now=now, name=name)
+        arm_bench(bench, watchdog, now=now, name=name)
     commands = [
         Command(
             tone.channel,

@@ -96,7 +96,7 @@ def with_strokes(table: LocalizationTable, factor: float) -> LocalizationTable:
     return replace(table, eras=eras)
 
 
-PAPER_TABLE_FREQUENCIES = np.linspace(40.0, 500.0, 27)
+SMALL_TABLE_HZ = np.linspace(40.0, 500.0, 27)
 
 
 def smooth_rig() -> Rig:
@@ -117,7 +117,7 @@ def forms_of(table: LocalizationTable, placed: Placement, level_db_sl: float = 2
 @cache
 def smooth_table() -> LocalizationTable:
     """Its table at 27 frequencies from 40 to 500 Hz."""
-    return build_table(smooth_rig(), frequencies=PAPER_TABLE_FREQUENCIES)
+    return build_table(smooth_rig(), frequencies=SMALL_TABLE_HZ)
 
 
 def contact_sets(count: int, *, fingers: int, seed: int) -> list[list[tuple[float, float]]]:

@@ -258,7 +258,7 @@ Numbered = Mapping[int, AmplifierDevice]
 
 
 @dataclass
-class WordWiresFarSide:
+class WordFarSide:
     """Amplifiers by number on a wire; url: of one of them."""
 
     amplifiers: Mapping[int, SimulatedAmplifier]
@@ -277,13 +277,13 @@ class WordWiresFarSide:
         return self.amplifiers[number].playback.level(0, now)
 
 
-def _far_side(count: int, url: Callable[[int], str]) -> WordWiresFarSide:
+def _far_side(count: int, url: Callable[[int], str]) -> WordFarSide:
     """So many of three amplifiers, with one channel each."""
     rig = make_rig("123", GuardLimits(20.0, 1000.0, 1.0))
     wiring = {era: Channel(name, 0) for era, name in zip(rig.wiring, "123", strict=True)}
     bench, devices = make_bench(replace(rig, wiring=wiring))
     shown = {int(name): name for name in "123"[:count]}
-    return WordWiresFarSide(
+    return WordFarSide(
         {number: bench.amplifiers[name] for number, name in shown.items()},
         {number: devices[name] for number, name in shown.items()},
         url,
@@ -305,7 +305,7 @@ async def _served(
     make_end: Callable[..., Any],
     url: Callable[[Any, int], str],
     count: int,
-) -> AsyncIterator[WordWiresFarSide]:
+) -> AsyncIterator[WordFarSide]:
     """Serve amplifiers on a pseudo-terminal or a TCP port, to one host after another."""
     far = _far_side(count, lambda number: url(served.port, number))
     async with end(far.devices[1], partial(make_end, far.devices)) as served:
@@ -319,7 +319,7 @@ _server = partial(_served, TcpEnd)
 @asynccontextmanager
 async def _python_can(
     count: int, interface: str, channel: str, **options: int
-) -> AsyncIterator[WordWiresFarSide]:
+) -> AsyncIterator[WordFarSide]:
     """Serve amplifiers on a bus of python-can, which a thread reads."""
     loop = asyncio.get_running_loop()
     adapter = can.Bus(interface=interface, channel=channel, **options)

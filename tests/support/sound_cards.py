@@ -117,7 +117,7 @@ def host(url: str, channels: int) -> Iterator["subprocess.Popen[str]"]:
             process.send_signal(signal.SIGKILL)
 
 
-DESK_CARD_BLOCK = 4800
+MEMORY_BLOCK = 4800
 
 
 class DeskCard(SoundCard):
@@ -157,7 +157,7 @@ class DeskCard(SoundCard):
         self.loudest = np.maximum(self.loudest, np.abs(played).max(axis=0))
         amplified = np.column_stack([self._amplified(played[:, :-1], self.runs), played[:, -1]])
         blocks = np.split(
-            amplified[:, self._on_outputs], range(DESK_CARD_BLOCK, len(played), DESK_CARD_BLOCK)
+            amplified[:, self._on_outputs], range(MEMORY_BLOCK, len(played), MEMORY_BLOCK)
         )
         heard = np.concatenate([self._plate.advance(block) for block in blocks])
         if self.runs in self._lost:

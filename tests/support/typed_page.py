@@ -430,7 +430,7 @@ def _is_about(shown: str, printed: str) -> bool:
 _PROGRESS = re.compile(r"^\d+ of \d+ [a-z ]+\n", re.MULTILINE)
 """Lines that appear where a command takes long; how many depends on the machine."""
 
-PAGE_READER_PATIENCE = 300.0  # s; for one command, on a machine that is busy with other things
+READER_PATIENCE = 300.0  # s; for one command, on a machine that is busy with other things
 LOOK_AGAIN = 0.05  # s
 PORTS = {
     "3333": socket.SOCK_DGRAM,
@@ -547,7 +547,7 @@ class Reader:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
-                timeout=PAGE_READER_PATIENCE,
+                timeout=READER_PATIENCE,
                 check=False,
             )
             printed, status = printed + _PROGRESS.sub("", done.stdout), done.returncode
@@ -576,7 +576,7 @@ class Reader:
 
     def _wait_for(self, line: int, terminal: str, shown: str) -> None:
         process, output = self._terminals[terminal]
-        latest = time.monotonic() + PAGE_READER_PATIENCE
+        latest = time.monotonic() + READER_PATIENCE
         while True:
             ended = process.poll() is not None or time.monotonic() > latest
             printed = output.read_text(encoding="utf-8")
@@ -602,7 +602,7 @@ class Reader:
         process, output = self._terminals[step.terminal]
         os.killpg(process.pid, signal.SIGINT)
         try:
-            process.wait(PAGE_READER_PATIENCE)
+            process.wait(READER_PATIENCE)
         except subprocess.TimeoutExpired:
             raise PageError(f"line {step.line}: goes on\n{output.read_text('utf-8')}") from None
 

@@ -724,7 +724,7 @@ JUDGED_LINE_KINDS = tuple(PROTOCOLS)
 CLIENTS = {kind: BY_PROTOCOL[protocol] for kind, protocol in PROTOCOLS.items()}
 """Clients of the kinds of wires."""
 DELAY = 0.0002  # s; of bytes on their way
-_JUDGED_LINE_MOMENT = 1e-9  # s; between what is sent at once
+_APART = 1e-9  # s; between what is sent at once
 _TURN = 0.0005  # s; between looks at what is due
 
 Judged: TypeAlias = SimulatedAmplifier | Callable[[Callable[[bytes], None]], FarEnd]
@@ -755,9 +755,7 @@ class JudgedLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes to the amplifier."""
-        self._arrival = max(
-            self._loop.time() + DELAY, self._arrival + _JUDGED_LINE_MOMENT
-        )  # in their order
+        self._arrival = max(self._loop.time() + DELAY, self._arrival + _APART)  # in their order
         self._loop.call_at(self._arrival, lambda: self._end.receive(data, self._loop.time()))
 
     def close(self) -> None:
@@ -765,9 +763,7 @@ class JudgedLine:
         self._ticking.cancel()
 
     def _send(self, data: bytes) -> None:
-        self._due = max(
-            self._loop.time() + DELAY, self._due + _JUDGED_LINE_MOMENT
-        )  # in their order
+        self._due = max(self._loop.time() + DELAY, self._due + _APART)  # in their order
         self._loop.call_at(self._due, self.client.received, data)
 
     async def _tick(self) -> None:

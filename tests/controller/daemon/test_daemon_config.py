@@ -277,7 +277,7 @@ DEFAULTS = {
 
 
 @pytest.fixture
-def daemon_reload_folder(tmp_path: Path) -> Path:
+def reload_folder(tmp_path: Path) -> Path:
     """A folder with two rigs, two layouts and a table."""
     rig = example_rig_path().read_text("utf-8")
     (tmp_path / "rig.yaml").write_text(rig, "utf-8")
@@ -291,9 +291,9 @@ def daemon_reload_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def config(daemon_reload_folder: Path, **changes: str) -> DaemonConfig:
+def config(reload_folder: Path, **changes: str) -> DaemonConfig:
     """The default configuration with other values at some keys."""
-    path = daemon_reload_folder / "daemon.yaml"
+    path = reload_folder / "daemon.yaml"
     text = "".join(f"{key}: {value}\n" for key, value in (DEFAULTS | changes).items())
     path.write_text(text, "utf-8")
     return load_daemon_config(path)
@@ -307,12 +307,10 @@ def problem(old: DaemonConfig, new: DaemonConfig, *, is_armed: bool) -> str:
 @pytest.mark.parametrize("is_armed", [False, True])
 @pytest.mark.parametrize("change", [{}, {"level_db_sl": "19"}, {"layouts": "{a: 10.yaml}"}])
 def test_reload_applies_a_layout(
-    daemon_reload_folder: Path, change: dict[str, str], is_armed: bool
+    reload_folder: Path, change: dict[str, str], is_armed: bool
 ) -> None:
     """Armed or not, one that is not stronger."""
-    assert not problem(
-        config(daemon_reload_folder), config(daemon_reload_folder, **change), is_armed=is_armed
-    )
+    assert not problem(config(reload_folder), config(reload_folder, **change), is_armed=is_armed)
 
 
 @pytest.mark.parametrize(
@@ -330,31 +328,27 @@ def test_reload_applies_a_layout(
     ],
 )
 def test_reload_is_refused_when_anything_else_changes(
-    daemon_reload_folder: Path, key: str, value: str
+    reload_folder: Path, key: str, value: str
 ) -> None:
     """A layout that changed with it is not applied either; the key is named."""
-    new = config(daemon_reload_folder, level_db_sl="10", **{key: value})
-    assert key in problem(config(daemon_reload_folder), new, is_armed=False)
+    new = config(reload_folder, level_db_sl="10", **{key: value})
+    assert key in problem(config(reload_folder), new, is_armed=False)
 
 
-def test_reload_is_refused_when_rig_file_was_edited(daemon_reload_folder: Path) -> None:
+def test_reload_is_refused_when_rig_file_was_edited(reload_folder: Path) -> None:
     """The file's content counts, not its name, for limits may have changed in it."""
-    old = config(daemon_reload_folder)
-    text = (daemon_reload_folder / "rig.yaml").read_text("utf-8")
-    (daemon_reload_folder / "rig.yaml").write_text(
-        text.replace("level: 1.0", "level: 0.9"), "utf-8"
-    )
-    assert problem(old, config(daemon_reload_folder), is_armed=False)
+    old = config(reload_folder)
+    text = (reload_folder / "rig.yaml").read_text("utf-8")
+    (reload_folder / "rig.yaml").write_text(text.replace("level: 1.0", "level: 0.9"), "utf-8")
+    assert problem(old, config(reload_folder), is_armed=False)
 
 
 @pytest.mark.parametrize(
     "change", [{"level_db_sl": "21"}, {"layouts": "{a: 10.yaml, b: neighbours.yaml}"}]
 )
-def test_reload_raises_no_level_while_armed(
-    daemon_reload_folder: Path, change: dict[str, str]
-) -> None:
+def test_reload_raises_no_level_while_armed(reload_folder: Path, change: dict[str, str]) -> None:
     """From 20 dB SL to 21, or to whatever the neighbours allow, in use or not, once disarmed."""
-    old, new = config(daemon_reload_folder), config(daemon_reload_folder, **change)
+    old, new = config(reload_folder), config(reload_folder, **change)
     assert problem(old, new, is_armed=True)
     assert not problem(old, new, is_armed=False)
 
@@ -428,7 +422,7 @@ def test_reading_a_configuration_in_a_child_is_bounded_in_time(
 
 
 def test_plugin_installed_meanwhile_needs_a_restart(
-    daemon_reload_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reload_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the child reads by a plug-in that this process cannot load is bad input."""
     package = tmp_path / "installed"
@@ -440,14 +434,10 @@ def test_plugin_installed_meanwhile_needs_a_restart(
         "from controller.effects.kinds import Click\nclass Late(Click):\n    kind = 'late'\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(package))  # of children started from now on
-    (daemon_reload_folder / "layout.yaml").write_text(
-        "effects: {tap: {kind: late}}\nelsewhere: null\n"
-    )
-    (daemon_reload_folder / "daemon.yaml").write_text(
-        "rig: rig.yaml\nlayouts: {panel: layout.yaml}\n"
-    )
+    (reload_folder / "layout.yaml").write_text("effects: {tap: {kind: late}}\nelsewhere: null\n")
+    (reload_folder / "daemon.yaml").write_text("rig: rig.yaml\nlayouts: {panel: layout.yaml}\n")
     with pytest.raises(InputError, match="restart the daemon"):
-        read_in_child(daemon_reload_folder / "daemon.yaml", FREQUENCIES)
+        read_in_child(reload_folder / "daemon.yaml", FREQUENCIES)
 
 
 def test_child_ends_by_none_of_the_daemons_own_signals() -> None:

@@ -33,7 +33,7 @@ from model.rig.rig_file import load_rig, parse_rig
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from several_fingers import ABOVE, LEFT, RIGHT, Fingers, fingers_on
-from several_fingers import table as several_fingers_table
+from several_fingers import table as paper_table
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time, run_virtual
 
@@ -53,9 +53,9 @@ async def test_of_a_buzz_and_a_file_the_later_is_felt_then_what_is_left_of_the_o
 
     The buzz of the finger that rests goes on once both are over.
     """
-    short, file = Buzz(level=14.0, duration=0.5), file_of(SWELL, several_fingers_table())
+    short, file = Buzz(level=14.0, duration=0.5), file_of(SWELL, paper_table())
     layout = SurfaceLayout(effects={"it": file, "short": short, "buzz": Buzz()}, elsewhere="buzz")
-    async with fingers_on(several_fingers_table(), layout, at={1: LEFT}, held=0.5) as fingers:
+    async with fingers_on(paper_table(), layout, at={1: LEFT}, held=0.5) as fingers:
 
         def felt() -> tuple[str | None, float]:
             (target,) = fingers.applied[-1].targets
@@ -81,10 +81,8 @@ async def test_of_a_buzz_and_a_file_the_later_is_felt_then_what_is_left_of_the_o
 async def test_a_file_has_its_level_at_the_edge_and_in_corners(at: tuple[float, float]) -> None:
     """14 dB SL as a mean over the tip where it has risen slowly; nothing is refused."""
     pattern = Pattern(2.0, ((0.0, 0.01), (0.3, 1.0), (2.0, 1.0)), ((0.0, 0.5),))
-    layout = SurfaceLayout(
-        effects={"it": file_of(pattern, several_fingers_table())}, elsewhere="it"
-    )
-    async with fingers_on(several_fingers_table(), layout, at={1: at}, held=1.0) as fingers:
+    layout = SurfaceLayout(effects={"it": file_of(pattern, paper_table())}, elsewhere="it")
+    async with fingers_on(paper_table(), layout, at={1: at}, held=1.0) as fingers:
         ((_, weights, own, _),) = fingers.reached()
         level = 20 * np.log10(own @ weights / weights.sum())
         assert level == pytest.approx([14.0], abs=0.1)
@@ -337,7 +335,7 @@ async def test_nothing_plays_that_a_protected_finger_would_notice() -> None:
     16 dB SL would need 26 dB of contrast there, of which four ERAs promise fewer than 20.
     """
     async with fingers_on(
-        several_fingers_table(), LAYOUT, breaks="touch", at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
+        paper_table(), LAYOUT, breaks="touch", at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=0.6
     ) as fingers:
         assert fingers.levels_db_sl()[3] < -10
         silenced = fingers.silenced[-1]
@@ -364,7 +362,7 @@ async def test_one_content_beside_a_protected_finger(effect: Buzz | Click, is_pl
     """Played if at most -10 dB SL reach that finger, of a click over its duration; else silent."""
     layout = replace(LAYOUT, effects={**LAYOUT.effects, "left": effect})
     async with fingers_on(
-        several_fingers_table(), layout, breaks="touch", at={3: ABOVE}, held=0.2
+        paper_table(), layout, breaks="touch", at={3: ABOVE}, held=0.2
     ) as fingers:
         fingers.at[1] = LEFT
         await fingers.hold(1.0)
@@ -382,7 +380,7 @@ async def test_a_protected_finger_feels_its_own_effect() -> None:
     above = Region("above", UPPER, on_press="above", is_protected=True, priority=0)
     left = replace(LAYOUT.regions[0], priority=5)
     async with fingers_on(
-        several_fingers_table(),
+        paper_table(),
         replace(LAYOUT, regions=(left, above)),
         at={1: LEFT, 3: ABOVE},
         held=1.0,
@@ -399,7 +397,7 @@ async def test_a_region_with_its_own_is_never_mixed() -> None:
     for is_own in (False, True):
         regions = (*LAYOUT.regions[:2], replace(third, is_own=is_own))
         async with fingers_on(
-            several_fingers_table(),
+            paper_table(),
             replace(LAYOUT, regions=regions),
             at={1: LEFT, 2: RIGHT, 3: ABOVE},
             held=1.0,
@@ -420,7 +418,7 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
         Region("right", Rectangle(0.15, 0.0, 0.15, 0.12), "right", may_share=True, priority=1),
     )
     async with fingers_on(
-        several_fingers_table(),
+        paper_table(),
         replace(LAYOUT, regions=regions),
         at={1: (0.138, 0.06), 2: (0.165, 0.06)},
         held=1.0,
@@ -436,7 +434,7 @@ async def test_fingers_that_may_share_say_whose_content_they_feel() -> None:
 @in_virtual_time
 async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_that() -> None:
     """The click has a layer of its own, and each finger is told once what it feels."""
-    async with fingers_on(several_fingers_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
+    async with fingers_on(paper_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
         owner, other = (contact for contact, _ in one.content.targets)
         count, sent = len(fingers.applied), len(fingers.committed)
@@ -456,7 +454,7 @@ async def test_who_shares_the_content_of_a_finger_feels_it_through_a_click_of_th
 @in_virtual_time
 async def test_a_click_that_is_refused_leaves_what_others_share() -> None:
     """Of the finger whose content it is: only the click is left out."""
-    async with fingers_on(several_fingers_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
+    async with fingers_on(paper_table(), SHARED, at=AT_ONE_CONTENT, held=1.0) as fingers:
         ((shared, one),) = fingers.applied[-1].contents.items()
         sent = len(fingers.committed)
         fingers.refuse(
@@ -489,7 +487,7 @@ def statuses(fingers: Fingers) -> dict[int, float]:
         Contact(ContactKey("panel", id), *at, since=0.0) for id, at in fingers.at.items()
     )
     view = PlateView(lambda key: None, contacts, fingers.applied[-1])
-    found = {each.id: each.leak_db_sl for each in view.statuses_now(several_fingers_table())}
+    found = {each.id: each.leak_db_sl for each in view.statuses_now(paper_table())}
     return {id: -math.inf if level is None else level for id, level in found.items()}
 
 
@@ -497,7 +495,7 @@ def statuses(fingers: Fingers) -> dict[int, float]:
 async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
     """Slowly, by less than 8 mm, no weights change: within a decibel of what is measured there."""
     async with fingers_on(
-        several_fingers_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2
+        paper_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.2
     ) as fingers:
         rested = statuses(fingers)
         assert rested == pytest.approx(fingers.levels_db_sl(foreign=True), abs=1.0)
@@ -518,7 +516,7 @@ async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
 async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
     """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""
     async with fingers_on(
-        several_fingers_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0
+        paper_table(), LEAKING, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.0
     ) as fingers:
         rested, count = statuses(fingers)[3], len(fingers.applied)
         on_the_way = []
@@ -539,6 +537,6 @@ async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
 @in_virtual_time
 async def test_nothing_leaks_without_fingers() -> None:
     """The status is read when the last has lifted and its silence is not confirmed yet."""
-    async with fingers_on(several_fingers_table(), LEAKING, at={1: LEFT}, held=0.3) as fingers:
+    async with fingers_on(paper_table(), LEAKING, at={1: LEFT}, held=0.3) as fingers:
         view = PlateView(lambda key: None, (), fingers.applied[-1])
-        assert view.statuses_now(several_fingers_table()) == []
+        assert view.statuses_now(paper_table()) == []

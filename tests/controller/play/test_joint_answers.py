@@ -51,7 +51,6 @@ from plates import contact_sets, smooth_rig
 from real_wires import on_two_amplifiers
 from several_fingers import LAYOUT, LEFT, RIGHT, Fingers, chosen_for, fingers_on, playable
 from several_fingers import table as paper_table
-from several_fingers import table as several_fingers_table
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import in_virtual_time, run_virtual
 
@@ -265,9 +264,7 @@ def fingers(contacts: Sequence[Contact]) -> list[Finger]:
 def test_a_moving_finger_is_answered_for_the_next_8_mm() -> None:
     """At 0.2 m/s 20 ms until it plays and 20 until weights have half changed: 8, 12, 16 mm on."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
-    middle, other, first, last = with_ways(
-        fingers(contacts), contacts, NOW, several_fingers_table().plate
-    )
+    middle, other, first, last = with_ways(fingers(contacts), contacts, NOW, paper_table().plate)
     assert [each.at[0] - MOVER[0] for each in (first, middle, last)] == pytest.approx(
         [0.008, 0.012, 0.016]
     )
@@ -282,7 +279,7 @@ def test_a_moving_finger_is_answered_for_the_next_8_mm() -> None:
         (MOVER, 0.02, Stimulus(14.0), 2),  # slower than 50 mm/s
         (MOVER, 0.2, None, 4),  # as quiet for all others
         (
-            (several_fingers_table().plate.length - 0.005, 0.08),
+            (paper_table().plate.length - 0.005, 0.08),
             0.2,
             Stimulus(14.0),
             2,
@@ -298,22 +295,20 @@ def test_ends_of_ways_are_fingers_where_they_can_be(
     """Else the finger alone, on the plate; any of these is answered."""
     contacts = [contact(1, at, vx=vx), contact(2, OTHER)]
     given = [Finger(at, stimulus), fingers(contacts)[1]]
-    found = with_ways(given, contacts, NOW, several_fingers_table().plate)
+    found = with_ways(given, contacts, NOW, paper_table().plate)
     assert len(found) == count
-    assert len(answer(several_fingers_table(), found, drive_mode="phased").fingers) == count
+    assert len(answer(paper_table(), found, drive_mode="phased").fingers) == count
 
 
 def test_what_is_promised_is_the_least_on_the_way_and_2_db_less() -> None:
     """Of three places that are answered as fingers of their own; beside it 2 dB less as well."""
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     targets = [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
-    found = answered(several_fingers_table(), targets, (), playable(), before={}, now=NOW)
+    found = answered(paper_table(), targets, (), playable(), before={}, now=NOW)
     middle, other, *ends = found.fingers
     promised = [each.promised_contrast_db or 0.0 for each in (middle, *ends)]
     levels = [each.promised_level_db_sl for each in (middle, *ends)]
-    moving, resting = selection_of(
-        several_fingers_table(), found, targets, (), before={}
-    ).predictions
+    moving, resting = selection_of(paper_table(), found, targets, (), before={}).predictions
     assert moving.promised_contrast_db == pytest.approx(min(promised) - MARGIN_DB)
     assert moving.level_db_sl == pytest.approx(min(levels))
     assert resting.promised_contrast_db == pytest.approx((other.promised_contrast_db or 0) - 2.0)
@@ -329,20 +324,20 @@ def test_a_promise_for_a_way_holds_at_places_between() -> None:
     """
     contacts = [contact(1, MOVER, vx=0.2), contact(2, OTHER)]
     targets = [(each, Target(each.key, 14.0, content=str(each.key.id))) for each in contacts]
-    found = answered(several_fingers_table(), targets, (), playable(), before={}, now=NOW)
-    moving, _ = selection_of(several_fingers_table(), found, targets, (), before={}).predictions
+    found = answered(paper_table(), targets, (), playable(), before={}, now=NOW)
+    moving, _ = selection_of(paper_table(), found, targets, (), before={}).predictions
     least = []
     for way in [*(0.008 + 0.001 * step for step in range(9)), -0.022]:
         at = (MOVER[0] + way, MOVER[1])
         own, foreign = (
             max(
                 abs(
-                    several_fingers_table().amplitudes(
+                    paper_table().amplitudes(
                         layer.excitation, np.array([at]), contacts=[at, OTHER]
                     )[1]
                 ).ravel()
             )
-            / float(several_fingers_table().thresholds[found.tones.rows[number]])
+            / float(paper_table().thresholds[found.tones.rows[number]])
             for number, layer in enumerate(found.layers)
         )
         least.append(20 * math.log10(own / foreign))
@@ -354,9 +349,9 @@ def test_a_finger_that_rests_is_answered_where_it_is() -> None:
     """Also one that moved until 60 ms ago, of which its source says nothing since."""
     moved = contact(1, MOVER, vx=0.2)
     contacts = [moved, replace(contact(2, OTHER), motion=Motion())]
-    assert with_ways(
-        fingers(contacts), contacts, NOW + 0.06, several_fingers_table().plate
-    ) == fingers(contacts)
+    assert with_ways(fingers(contacts), contacts, NOW + 0.06, paper_table().plate) == fingers(
+        contacts
+    )
 
 
 @pytest.mark.parametrize(("way", "count"), [(0.2, 1), (0.04, 0)])
@@ -365,9 +360,7 @@ async def test_a_finger_that_sets_out_is_answered_before_it_has_gone_8_mm(
     way: float, count: int
 ) -> None:
     """At 0.2 m/s its slope over 60 ms is 3 mm after 20 ms; at 40 mm/s it rests."""
-    async with fingers_on(
-        several_fingers_table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5
-    ) as fingers:
+    async with fingers_on(paper_table(), LAYOUT, at={1: LEFT, 2: RIGHT}, held=1.5) as fingers:
         before = len(fingers.applied)
 
         def move(since: float) -> None:
@@ -418,7 +411,7 @@ async def test_fingers_that_land_apart_come_to_the_promise_of_those_that_land_to
     """Within 1 dB, a content at a time; all that sounds at once is 30 Hz apart, and it is felt."""
     targets = tuple((each, Target(each.key, 14.0)) for each in contacts_at(FIRST, SECOND))
     together = chosen_for(targets, playable())
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         await apart(fingers, then=1.5)
         landed, *steps = fingers.applied[1:]
         promised = min(each.promised_contrast_db or 0.0 for each in together.predictions)
@@ -435,7 +428,7 @@ async def test_fingers_that_land_apart_come_to_the_promise_of_those_that_land_to
 @in_virtual_time
 async def test_one_content_rises_in_a_layer_of_its_own_and_the_other_falls_later() -> None:
     """Along 300 ms both, the other 81 ms later, to below any threshold; then it has ended."""
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         count = await apart(fingers, then=0.6)
         fades = [each for each in fingers.committed[count:] if each[2][0].ramp == 300]
         (rising, _, (new,)), (falling, _, (old,)), *_ = fades
@@ -454,7 +447,7 @@ async def test_a_finger_that_lifts_amid_a_crossfade_is_silent_at_once(
     amid: float, within: float
 ) -> None:
     """Along the ending of 40 ms of what plays in full yet, and a ramp of 20 of what falls."""
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         await apart(fingers, then=amid)
         assert frequencies(fingers.applied[-1]) == {1: 140.0, 2: 190.0}
         del fingers.at[1]
@@ -470,7 +463,7 @@ async def test_a_finger_that_lifts_amid_a_crossfade_is_silent_at_once(
 @in_virtual_time
 async def test_a_touch_amid_a_crossfade_is_answered_at_once() -> None:
     """The next set has all three; the tone that fell ends with it, and nothing is led meanwhile."""
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         await apart(fingers, then=0.25)
         count, touched = len(fingers.committed), asyncio.get_running_loop().time()
         fingers.at[3] = (0.05, 0.19)
@@ -490,7 +483,7 @@ async def test_a_click_amid_a_crossfade_keeps_from_all_that_sounds() -> None:
     Of its band that leaves 100 and 110 Hz, without what falls 220 to 240 as well.
     """
     layout = replace(WHOLE, effects={**WHOLE.effects, "click": Click(band=(100.0, 240.0))})
-    async with fingers_on(several_fingers_table(), layout) as fingers:
+    async with fingers_on(paper_table(), layout) as fingers:
         await apart(fingers, then=0.25)
         before, count = fingers.applied[-1], len(fingers.committed)
         assert frequencies(before) == {1: 140.0, 2: 190.0}  # after 230
@@ -507,7 +500,7 @@ async def test_a_click_amid_a_crossfade_keeps_from_all_that_sounds() -> None:
 @in_virtual_time
 async def test_where_no_layer_is_free_nothing_is_led_over() -> None:
     """Of two layers both play, and stay as they are."""
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         fingers.controller.cycle.planner.layers._count = 2
         count = await apart(fingers, then=1.5)
         sent = [one for _, _, layers in fingers.committed[count:] for one in layers]
@@ -519,7 +512,7 @@ async def test_where_no_layer_is_free_nothing_is_led_over() -> None:
 @in_virtual_time
 async def test_a_finger_that_moves_again_within_a_second_is_not_led_again() -> None:
     """The last step, and the first of the next way, are a second apart or more."""
-    async with fingers_on(several_fingers_table(), WHOLE) as fingers:
+    async with fingers_on(paper_table(), WHOLE) as fingers:
         await apart(fingers, then=1.1)
         steps = [each.time for each in fingers.applied[2:]]
         assert len(steps) == 2
@@ -533,7 +526,7 @@ async def test_a_finger_that_moves_again_within_a_second_is_not_led_again() -> N
 async def test_after_a_leave_weights_are_led_within_their_layers() -> None:
     """Of three fingers one leaves: the others keep frequency, phase and layer, along 300 ms."""
     places = {1: (0.206, 0.015), 2: (0.151, 0.098), 3: (0.07, 0.077)}
-    async with fingers_on(several_fingers_table(), WHOLE, at=places, held=1.5) as fingers:
+    async with fingers_on(paper_table(), WHOLE, at=places, held=1.5) as fingers:
         before = fingers.applied[-1]
         del fingers.at[3]
         await fingers.hold(0.09)
@@ -553,7 +546,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
     """Twelve sets of three fingers anywhere, of whom the third has come last, or has left."""
     rng, found = np.random.default_rng(5), 0
     for number in range(12):
-        places = random_contacts(rng, 3, several_fingers_table().plate, margin=0.013)
+        places = random_contacts(rng, 3, paper_table().plate, margin=0.013)
         targets = [(each, Target(each.key, 14.0)) for each in contacts_at(*places)]
         before = chosen_for(targets[:2], playable()) if number % 2 else None
         playing = {each.key: each for each in before.contents} if before else {}
@@ -565,7 +558,7 @@ def test_every_step_keeps_30_hz_between_all_that_sounds() -> None:
             continue
         beside = {each.contact.key: each.frequency or 0.0 for each in landed.predictions}
         beside = {key: beside[key] for key in keys}
-        for step in Crossfades(several_fingers_table(), resting, (), playable(), felt).steps():
+        for step in Crossfades(paper_table(), resting, (), playable(), felt).steps():
             after = {each.contact.key: each.frequency or 0.0 for each in step.predictions}
             changed = [key for key in keys if after[key] != beside[key]]
             assert len(changed) <= 1
@@ -591,8 +584,8 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
     limited = replace(
         playable(), limits=Limits((40.0, 320.0), {n: 1.2 * each for n, each in drives.items()})
     )
-    assert Crossfades(several_fingers_table(), targets, (), playable(), felt).steps()
-    assert not Crossfades(several_fingers_table(), targets, (), limited, felt).steps()
+    assert Crossfades(paper_table(), targets, (), playable(), felt).steps()
+    assert not Crossfades(paper_table(), targets, (), limited, felt).steps()
     moving = {
         key: [
             replace(one, promised_contrast_db=one.promised_contrast_db - 2.0)
@@ -602,7 +595,7 @@ def test_what_does_not_fit_beside_what_plays_is_not_led_to() -> None:
         for key, each in felt.items()
     }
     felt = {key: replace(each, predictions=tuple(moving[key])) for key, each in felt.items()}
-    (rested,) = Crossfades(several_fingers_table(), targets, (), limited, felt).steps()
+    (rested,) = Crossfades(paper_table(), targets, (), limited, felt).steps()
     assert rested.contents == landed.contents
     for one, other in zip(rested.predictions, landed.predictions, strict=True):
         assert one.promised_contrast_db == pytest.approx(other.promised_contrast_db, abs=0.1)

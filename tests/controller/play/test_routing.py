@@ -254,7 +254,7 @@ def halves() -> Rig:
 
 
 @cache
-def unheld_clocks_table() -> LocalizationTable:
+def clock_table() -> LocalizationTable:
     """Its table at 29 frequencies."""
     return build_table(halves(), frequencies=np.linspace(40.0, 320.0, 29))
 
@@ -264,10 +264,8 @@ async def two_fingers(*, is_stated: bool = True) -> AsyncIterator[Fingers]:
     """Two fingers, each with a content, once armed; is_stated: that b's clock is not steered."""
     rig = halves()
     drawn = replace(draw_imperfections(rig, seed=1), crystals=CRYSTALS)
-    options = {"intent_source": EffectPlayer(LAYOUT), "timing": Timing(unheld_clocks_table())}
-    async with Fingers.on(
-        WIRE, rig, unheld_clocks_table(), imperfections=drawn, **options
-    ) as fingers:
+    options = {"intent_source": EffectPlayer(LAYOUT), "timing": Timing(clock_table())}
+    async with Fingers.on(WIRE, rig, clock_table(), imperfections=drawn, **options) as fingers:
         if is_stated:
             fingers.far.bench.amplifiers["b"].capabilities["clock_error"] = CLOCK_UNKNOWN
         await fingers.open()
@@ -358,8 +356,8 @@ async def test_status_of_several_amplifiers_eliminates_no_plate(
         return eliminate(plate, *counts)
 
     monkeypatch.setattr(PlateOnEras, "of", noted)
-    rig, fresh = halves(), replace(unheld_clocks_table())
-    options = {"intent_source": EffectPlayer(LAYOUT), "timing": Timing(unheld_clocks_table())}
+    rig, fresh = halves(), replace(clock_table())
+    options = {"intent_source": EffectPlayer(LAYOUT), "timing": Timing(clock_table())}
     async with Fingers.on(WIRE, rig, fresh, **options) as fingers:
         await fingers.open()
         assert eliminated
@@ -398,7 +396,7 @@ class Opened:
         self.ledger = Ledger(LIMITS, self.capabilities)
 
 
-def capabilities_rig() -> Rig:
+def paired_rig() -> Rig:
     """Two ERAs on the left amplifier, one on the right."""
     return Rig(
         plate=Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33)),
@@ -431,7 +429,7 @@ def test_capabilities_choose_the_best_common_drive_mode(
 ) -> None:
     """By the steps of level (1e-4) and phase (0.01 degrees) of each amplifier."""
     left, right = (Opened(level_step=level, phase_step=phase) for level, phase in steps)
-    found = playback_capabilities(capabilities_rig(), both(left, right))
+    found = playback_capabilities(paired_rig(), both(left, right))
     assert found.drive_mode == mode
     assert found.playable[-1] == mode
 
@@ -440,17 +438,16 @@ def test_capabilities_refuse_an_unplayable_drive_mode() -> None:
     """With those that can be played."""
     plain = both(Opened(phase_step=18_000), Opened(phase_step=18_000))
     assert (
-        playback_capabilities(capabilities_rig(), plain, drive_mode="switched").drive_mode
-        == "switched"
+        playback_capabilities(paired_rig(), plain, drive_mode="switched").drive_mode == "switched"
     )
     with pytest.raises(InputError, match=r"switched.*phased"):
-        playback_capabilities(capabilities_rig(), plain, drive_mode="phased")
+        playback_capabilities(paired_rig(), plain, drive_mode="phased")
 
 
 def test_capabilities_are_the_tightest_limits() -> None:
     """Of the rig and all amplifiers: 50 Hz and half of full level, and 300 Hz."""
     left = Opened(frequency_min=1000, level_max=5000)
-    found = playback_capabilities(capabilities_rig(), both(left, Opened(frequency_max=6000)))
+    found = playback_capabilities(paired_rig(), both(left, Opened(frequency_max=6000)))
     assert found.limits.frequencies == (50.0, 300.0)
     assert found.limits.amplitudes == pytest.approx({"A": 5e-5, "B": 1e-4, "C": 8e-5})
 
@@ -480,7 +477,7 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
     """
     lines = [Line(Wire(0.010 / (words + 0.5))) for _ in range(2)]
     left, right = (Opened(lines[0 if is_shared else number]) for number in range(2))
-    assert envelope_support(capabilities_rig(), both(left, right)) == EnvelopeSupport(*expected)
+    assert envelope_support(paired_rig(), both(left, right)) == EnvelopeSupport(*expected)
 
 
 @pytest.mark.parametrize(
@@ -495,7 +492,7 @@ def test_envelopes_have_as_many_knots_as_wires_carry(
 )
 def test_envelopes_need_capabilities(changed: dict[str, int], expected: tuple[int, int]) -> None:
     """Knots, steps of 5 ms and words of a set, of every amplifier."""
-    found = envelope_support(capabilities_rig(), both(Opened(**changed)))
+    found = envelope_support(paired_rig(), both(Opened(**changed)))
     assert found == EnvelopeSupport(*expected)
 
 
@@ -535,7 +532,7 @@ def test_thinned_envelope_follows_the_same_lines() -> None:
 
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))
-CAPABILITIES_RIG = Rig(
+PAIRED_RIG = Rig(
     plate=PLATE,
     mesh=Mesh(4, 4, 0.3, 0.2),
     eras=tuple(
@@ -556,7 +553,7 @@ def test_route_by_hand() -> None:
     """20 of 100 µm is level 0.2, 20 of 50 is 0.4; pi/2 is 90°; other channels are silent."""
     layers = route(
         {"SW": Tone(110.0, 20e-6, math.pi / 2), "SE": Tone(250.0, 20e-6)},
-        CAPABILITIES_RIG,
+        PAIRED_RIG,
         ramp=0.02,
     )
     played = Played(1, 110.0, pytest.approx(0.2), pytest.approx(90.0))
@@ -581,13 +578,13 @@ def test_route_by_hand() -> None:
 )
 def test_route_wraps_phases(radians: float, degrees: float) -> None:
     """Phases lie within half a turn, of which both ends are one."""
-    command = route({"SE": Tone(100.0, 1e-6, radians)}, CAPABILITIES_RIG, ramp=0)["right"].tones[0]
+    command = route({"SE": Tone(100.0, 1e-6, radians)}, PAIRED_RIG, ramp=0)["right"].tones[0]
     assert command.phase == pytest.approx(degrees)
 
 
 def test_route_applies_no_limits() -> None:
     """More than full stroke and NaN reach the ledger unchanged."""
-    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, CAPABILITIES_RIG, ramp=0)["right"].tones[0]
+    over = route({"SE": Tone(1e9, 1e-4, math.nan)}, PAIRED_RIG, ramp=0)["right"].tones[0]
     assert over.frequency == 1e9
     assert over.level == pytest.approx(2.0)
     assert math.isnan(over.phase)
@@ -596,7 +593,7 @@ def test_route_applies_no_limits() -> None:
 def test_route_refuses_an_unknown_era() -> None:
     """A pattern of another rig is refused as a whole."""
     with pytest.raises(InputError, match="got NW"):
-        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, CAPABILITIES_RIG, ramp=0)
+        route({"SW": Tone(100.0, 1e-6), "NW": Tone(100.0, 1e-6)}, PAIRED_RIG, ramp=0)
 
 
 @pytest.mark.parametrize(
@@ -614,14 +611,14 @@ def test_route_refuses_an_unknown_era() -> None:
 def test_route_keeps_phase_only_if_all_eras_continue(wanted: Excitation, kept: set[str]) -> None:
     """A frequency restarts if an ERA joins it."""
     playing = {name: Played(0, 110.0, 0.5) for name in ("SW", "SE")}
-    layers = route(wanted, CAPABILITIES_RIG, ramp=0, playing=playing)
+    layers = route(wanted, PAIRED_RIG, ramp=0, playing=playing)
     assert {
         name
-        for name, channel in CAPABILITIES_RIG.wiring.items()
+        for name, channel in PAIRED_RIG.wiring.items()
         for tone in layers[channel.amplifier].tones
         if tone.channel == channel.number and tone.keep_phase
     } == kept
-    first = route(wanted, CAPABILITIES_RIG, ramp=0)
+    first = route(wanted, PAIRED_RIG, ramp=0)
     assert not any(tone.keep_phase for each in first.values() for tone in each.tones)
 
 
@@ -631,7 +628,7 @@ def test_drive_of_eras_by_hand() -> None:
         "left": [LayerSet(0, 20, 0, (Command(0, 800, 0, 0), Command(1, 2201, 1999, -9000)))],
         "right": [LayerSet(0, 20, 0, (Command(0, 5000, 4000, 0),))],
     }
-    assert tones_by_era(achieved, CAPABILITIES_RIG) == {
+    assert tones_by_era(achieved, PAIRED_RIG) == {
         "SW": Played(1, 110.05, 0.1999, -90.0),
         "SE": Played(0, 250.0, 0.4),
     }

@@ -28,7 +28,7 @@ from drivers.urls import with_address
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.check import ConformanceReport
 from model.rig.rig_file import example_rig_path
-from real_wires import WORD_WIRES, WordWiresFarSide
+from real_wires import WORD_WIRES, WordFarSide
 from registry.limits import GuardLimits
 
 LIMITS = GuardLimits(20.0, 1000.0, 1.0)
@@ -37,7 +37,7 @@ ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(OF_CONNECTIONS)]
 """Wires whose far end lasts: the others have one for each connection, at the first addresses."""
 
 
-async def leave_playing(far: WordWiresFarSide, number: int = 1) -> None:
+async def leave_playing(far: WordFarSide, number: int = 1) -> None:
     """Play at half level, as a host that then ends without a word."""
     lines = Lines()
     amplifier = await lines.amplifier(far.url(number), LIMITS, name="a", is_output=None)
@@ -218,7 +218,7 @@ async def test_discovery_only_identifies(tmp_path: Path) -> None:
     assert set(requests) <= {"Hello", "GetCaps", "GetStatus"}
 
 
-COMMANDS_LIMITS = GuardLimits(40.0, 500.0, 0.5)
+WIDE_LIMITS = GuardLimits(40.0, 500.0, 0.5)
 DRAWN = f"sim://{example_rig_path()}"
 
 
@@ -235,7 +235,7 @@ def loop_threads() -> list[str]:
 
 def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
     """Arm, play, stop, clear; layers that are not given end, and nothing is left running."""
-    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+    with BlockingAmplifier(DRAWN, limits=WIDE_LIMITS) as amplifier:
         assert amplifier.identity["serial_number"] == "SIM-main"
         assert amplifier.capabilities["channels"] == 4
         assert amplifier.arm(2.0)["state"] == "OPERATION_ENABLED"
@@ -258,7 +258,7 @@ def test_blocking_amplifier_plays_and_ends_disarmed() -> None:
 
 def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
     """Over a window longer than the watchdog; the ERA that plays moves its own foot most."""
-    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+    with BlockingAmplifier(DRAWN, limits=WIDE_LIMITS) as amplifier:
         amplifier.arm(1.0)
         amplifier.apply([layer(2, 110.0, 0.2)])
         reading = amplifier.measure([110.0], 1.2)
@@ -271,7 +271,7 @@ def test_blocking_amplifier_measures_while_it_feeds_the_watchdog() -> None:
 def test_play_raises_when_the_watchdog_has_tripped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error names fault and remedy."""
     monkeypatch.setattr("drivers.by_hand.actions.HEARTBEAT", 0.15)
-    with BlockingAmplifier(DRAWN, limits=COMMANDS_LIMITS) as amplifier:
+    with BlockingAmplifier(DRAWN, limits=WIDE_LIMITS) as amplifier:
         amplifier.arm(0.1)
         with pytest.raises(CommandRefused, match=r"WATCHDOG.*clear"):
             amplifier.play([layer(0, 110.0, 0.2)], duration=1.0)
@@ -281,7 +281,7 @@ def test_blocking_amplifier_ends_its_thread_when_opening_fails() -> None:
     """The error reaches the script, and the loop's thread has ended."""
     with (
         pytest.raises(CommandError),
-        BlockingAmplifier("sim://no-such-rig.yaml", limits=COMMANDS_LIMITS),
+        BlockingAmplifier("sim://no-such-rig.yaml", limits=WIDE_LIMITS),
     ):
         pass
     assert loop_threads() == []

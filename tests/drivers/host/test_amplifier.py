@@ -45,8 +45,8 @@ from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, run_virtual
-from virtual_lines import LIMITS as VIRTUAL_LINES_LIMITS
-from virtual_lines import unaltered as virtual_lines_unaltered
+from virtual_lines import LIMITS as WIRE_LIMITS
+from virtual_lines import unaltered as unaltered_reply
 
 FREQUENCIES = [110.0, 173.5]
 ROW = {"unit": 1, "channel": 255, "x": 1000, "y": 2000, "range": 512.0, "frequency_max": 20_000}
@@ -249,7 +249,7 @@ async def test_full_level_must_be_what_the_rig_says(wire: str, is_output: bool) 
     """A linear amplifier where the rig has a stiff source, and the other way round."""
     end = MemoryLine(wire, "a")
     end.far["a"].capabilities = capabilities(2, is_output=not is_output)
-    host = Amplifier(end.line, 1, VIRTUAL_LINES_LIMITS, name="a", is_output=is_output)
+    host = Amplifier(end.line, 1, WIRE_LIMITS, name="a", is_output=is_output)
     with pytest.raises(LinkError, match="full level"):
         await host.open()
     end.far["a"].capabilities = capabilities(2, is_output=is_output)
@@ -273,7 +273,7 @@ def test_request_that_waits_on_a_busy_machine_contradicts_nothing(wire: str) -> 
             end.outward = lambda name, data: []
             with pytest.raises(LinkTimeout):
                 await host.ping()
-        end.inward = end.outward = virtual_lines_unaltered
+        end.inward = end.outward = unaltered_reply
         for _ in range(2):
             await host.read_status()
             await asyncio.sleep(0.02)

@@ -293,7 +293,7 @@ def serial(baud: int) -> tuple[str, Callable[[], Wire], int, float]:
     return "serial", lambda: SerialWire(baud, sequence=0), 10, 0.0
 
 
-LINE_TIMES_LINES = {
+TIMED_LINES = {
     **{f"rtu at {baud}": rtu(baud) for baud in (9600, 19_200, 38_400, 57_600, 115_200)},
     **{f"serial at {baud}": serial(baud) for baud in (9600, 19_200, 115_200)},
 }
@@ -301,13 +301,13 @@ LINE_TIMES_LINES = {
 
 async def armed(name: str, *amplifiers: str) -> tuple[Group, MemoryLine, Paced]:
     """An armed group on one line with the times of its characters."""
-    kind, make, bits, gap = LINE_TIMES_LINES[name]
+    kind, make, bits, gap = TIMED_LINES[name]
     end = MemoryLine(kind, *amplifiers, wire=make())
     paced = Paced(end, int(name.split()[-1]), bits, gap)
     return await group_of(end, watchdog=2.0), end, paced
 
 
-@pytest.mark.parametrize("name", LINE_TIMES_LINES)
+@pytest.mark.parametrize("name", TIMED_LINES)
 @in_virtual_time
 async def test_replies_that_begin_as_late_as_they_may_are_awaited(name: str) -> None:
     """9.9 ms after each request, on Modbus after write and read: nothing is repeated."""
@@ -318,7 +318,7 @@ async def test_replies_that_begin_as_late_as_they_may_are_awaited(name: str) -> 
     assert end.retries == 0
 
 
-@pytest.mark.parametrize("name", [name for name in LINE_TIMES_LINES if "115" not in name])
+@pytest.mark.parametrize("name", [name for name in TIMED_LINES if "115" not in name])
 @in_virtual_time
 async def test_time_of_a_broadcast_is_no_time_of_the_next_reply(name: str) -> None:
     """The status behind the commit of two is awaited longer, and a stop keeps off its reply."""

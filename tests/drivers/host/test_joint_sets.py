@@ -37,11 +37,11 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.modbus import ModbusWire
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Wire
-from group_stops import LINES as GROUP_STOPS_LINES
+from group_stops import LINES as STOPPED_LINES
 from group_stops import PER_CHAIN, PROGRAMMES, Tally
-from group_stops import play as group_stops_play
+from group_stops import play as play_stops
 from late_taps import AMPLIFIERS, play
-from late_taps import WIRES as LATE_TAPS_WIRES
+from late_taps import WIRES as LATE_WIRES
 from sim.amplifier.readings import AmplifierClock, Crystal
 from virtual_lines import KINDS, MemoryLine, group_of, in_virtual_time, unaltered
 
@@ -382,7 +382,7 @@ async def test_amplifier_that_was_left_out_for_long_takes_the_next_set(
     assert [ends[0].levels("a")[0], ends[1].levels("b")[0]] == [0.0, 0.0]
 
 
-_ROWS = [(wire, amplifiers, 1) for wire in LATE_TAPS_WIRES for amplifiers in AMPLIFIERS]
+_ROWS = [(wire, amplifiers, 1) for wire in LATE_WIRES for amplifiers in AMPLIFIERS]
 _FOUND = [("modbus", 3, 12), ("modbus", 3, 64)]
 """Three on a line that were not fed in time; one that replied again and was not heard."""
 
@@ -449,11 +449,11 @@ def test_stop_is_true(programme: str, share: int, least: float) -> None:
     """
     tally = Tally()
     for seed in range(FIRST, FIRST + STOPS // share):
-        group_stops_play(programme, seed, tally)
+        play_stops(programme, seed, tally)
     assert tally.found == []
     assert tally.total("confirmed") > tally.total("stops") * least
     if programme.startswith("frames"):
-        assert all(tally.counts[wire, "may play"] for wire in GROUP_STOPS_LINES)
+        assert all(tally.counts[wire, "may play"] for wire in STOPPED_LINES)
         assert tally.total("raised") == 0
 
 

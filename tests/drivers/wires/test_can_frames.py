@@ -166,7 +166,7 @@ def test_frames_of_number_0_begin_anew_with_each_first() -> None:
     assert whole.add(second, 0.0) == CanMessage(0, 30, (4, 0, 255, 1))
 
 
-BUS_PORT_SET = [CanFrame(0x201, bytes([number])) for number in range(22)]
+BURST = [CanFrame(0x201, bytes([number])) for number in range(22)]
 STOP = [CanFrame(0x201, b"stop")]
 COMMIT = [CanFrame(0x200, b"commit")]
 
@@ -222,20 +222,20 @@ async def until(condition: Callable[[], bool]) -> None:
 async def test_long_set_is_sent_as_the_queue_takes_it() -> None:
     """All 22 frames in order, of which there is room for ten; blocked until then."""
     async with opened() as (port, adapter, losses):
-        port.write(pack_frames(BUS_PORT_SET))
+        port.write(pack_frames(BURST))
         assert port.is_blocked
         while port.is_blocked:
             await asyncio.sleep(0)
             adapter.room = 1
-        assert adapter.taken == [frame.data for frame in BUS_PORT_SET]
+        assert adapter.taken == [frame.data for frame in BURST]
         assert not losses
 
 
 async def test_stop_replaces_the_rest_of_a_set_but_no_broadcast() -> None:
     """Ten frames of the set were taken; of the others only the commit of all precedes the stop."""
     async with opened() as (port, adapter, _):
-        port.write(pack_frames(BUS_PORT_SET))
-        for frames in (COMMIT, BUS_PORT_SET, STOP):
+        port.write(pack_frames(BURST))
+        for frames in (COMMIT, BURST, STOP):
             port.write(pack_frames(frames))
         adapter.room = 30
         await until(lambda: not port.is_blocked)
@@ -246,7 +246,7 @@ async def test_frames_of_a_stuck_queue_are_dropped() -> None:
     """Nobody acknowledges on the bus: what waited is not sent when it is mended much later."""
     async with opened() as (port, adapter, losses):
         adapter.room = 0
-        port.write(pack_frames(COMMIT + BUS_PORT_SET))
+        port.write(pack_frames(COMMIT + BURST))
         await until(lambda: not port._unsent)
         assert port.is_blocked
         adapter.room = 30
@@ -316,7 +316,7 @@ def _unplugged(msg: can.Message, timeout: float | None = None) -> None:
     raise can.CanOperationError("No such device", error_code=errno.ENODEV)
 
 
-TEXT_ADAPTERS_FRAME = CanFrame(0x185, bytes.fromhex("0102030405060708"))
+FRAME_AS_TEXT = CanFrame(0x185, bytes.fromhex("0102030405060708"))
 ELEMENT = b"< frame 185 1.000000 0102030405060708 >"
 SLCAN_SPOKEN = b"\rC\rS5\rO\rt18580102030405060708\r\rC\r"
 
@@ -374,7 +374,7 @@ async def test_frames_amid_the_greeting_do_not_disturb_it() -> None:
     greeting = (b"< hi >", ELEMENT + long + b"< ok >", ELEMENT + b"< ok >" + ELEMENT)
     async with server(*greeting) as url:
         await open_port(url, lambda data: heard.extend(unpack_frames(data)))
-    assert heard == [TEXT_ADAPTERS_FRAME] * 3
+    assert heard == [FRAME_AS_TEXT] * 3
 
 
 @pytest.mark.parametrize(
@@ -416,7 +416,7 @@ async def test_slcan_is_closed_then_opened_at_its_bit_rate_and_closed_at_the_end
     try:
         url = f"can+slcan://{os.ttyname(slave)}?bitrate=250000#5"
         port = await address_of(url).open_port(lambda data: None, lambda cause: None)
-        port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+        port.write(pack_frames([FRAME_AS_TEXT]))
         port.close()
         await port.wait_closed()
         text = b""
@@ -447,13 +447,13 @@ async def test_slcan_adapter_that_restarts_is_opened_again_until_it_speaks() -> 
     port = TextPort(SLCAN, lambda data: heard.extend(unpack_frames(data)), hello=b"O\r")
     port.below = below = Below()  # type: ignore[assignment]
     for came in (b"\r\nrst:0x1 (POWERON_RESET)\r\n", b"\r\x07", b"t18580102030405060708\r", b"\r"):
-        port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+        port.write(pack_frames([FRAME_AS_TEXT]))
         port.received(came)
     await asyncio.sleep(1.1)
-    port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+    port.write(pack_frames([FRAME_AS_TEXT]))
     sent = b"t18580102030405060708\r"
     assert below.written == 3 * (b"O\r" + sent) + sent + b"O\r" + sent
-    assert heard == [CanFrame(0x800, b"\r\x07"), TEXT_ADAPTERS_FRAME]
+    assert heard == [CanFrame(0x800, b"\r\x07"), FRAME_AS_TEXT]
 
 
 async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
@@ -475,7 +475,7 @@ async def test_text_that_no_adapter_replies_with_is_an_error() -> None:
     )
     replies = b"V1013\rNA123\r\nF40\rz\r\r\nT0000018100\rr1230\rt18580102030405060708\r\n"
     port.received(replies)  # type: ignore[attr-defined]
-    assert heard == [TEXT_ADAPTERS_FRAME]
+    assert heard == [FRAME_AS_TEXT]
     port.received(b"AT\r\nERROR\r\n")  # type: ignore[attr-defined]
     assert [(frame.id, frame.data) for frame in heard[1:]] == [(0x800, b"AT"), (0x800, b"ERROR")]
 
@@ -492,5 +492,5 @@ async def test_line_that_was_cut_off_is_ended_before_the_next_frame() -> None:
 
     port = TextPort(SLCAN, lambda data: None, cut_off=b"\r")
     port.below = below = Blocked()  # type: ignore[assignment]
-    port.write(pack_frames([TEXT_ADAPTERS_FRAME]))
+    port.write(pack_frames([FRAME_AS_TEXT]))
     assert below.written == b"\rt18580102030405060708\r"

@@ -23,7 +23,7 @@ from model.finger import detection_threshold
 from model.study.verification import Plates, draw_plates, harmonics_on, powers_on
 from model.table.table import read_fingertips
 from model.table.table_file import build_table, save_table
-from plates import PAPER_TABLE_FREQUENCIES, contact_sets, smooth_rig, smooth_table
+from plates import SMALL_TABLE_HZ, contact_sets, smooth_rig, smooth_table
 from set_table import drives, only, wants
 from set_table import phased as answer
 
@@ -152,7 +152,7 @@ def test_what_plays_already_is_kept_away_from(duration):
     (layer,) = answer(table, [own], [FAR]).layers
     avoided = layer.frequency
     found = answer(table, [own], [FAR], avoided_hz=[avoided])
-    left = PAPER_TABLE_FREQUENCIES[np.abs(PAPER_TABLE_FREQUENCIES - avoided) >= 30]
+    left = SMALL_TABLE_HZ[np.abs(SMALL_TABLE_HZ - avoided) >= 30]
     expected = answer(build_table(smooth_rig(), frequencies=left), [own], [FAR])
     f = found.layers[0].frequency
     assert f == expected.layers[0].frequency

@@ -24,7 +24,7 @@ from model.answer.plan import query
 from model.answer.stimulus import Finger, Placement
 from model.arrays import lattice
 from model.cli import app
-from model.commands.table_cli import query as table_cli_query
+from model.commands.table_cli import query as query_command
 from model.errors import InputError
 from model.finger import detection_threshold, fingertip_points, is_beyond
 from model.reduction.reduced_plate import reduce_plate
@@ -309,7 +309,7 @@ def test_batch_is_not_blamed_where_its_reader_closes(table_file, tmp_path, monke
     broken = Mock(side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
     monkeypatch.setattr("builtins.print", broken)
     with pytest.raises(BrokenPipeError):
-        table_cli_query(table_file, batch=batch)
+        query_command(table_file, batch=batch)
 
 
 def test_batch_takes_options_as_defaults_of_its_lines(table_file, tmp_path):

@@ -37,7 +37,7 @@ from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Excitation, Tone, base_amplitudes
 from plates import contact_sets, small_table, smooth_rig, smooth_table
 from set_table import drives, wants
-from set_table import phased as set_table_answer
+from set_table import phased as set_answer
 
 TARGET, QUIET = (0.09, 0.07), (0.24, 0.17)
 ALONE = Placement((TARGET,))
@@ -283,9 +283,9 @@ def test_a_hand_of_three_contents_silences_nobody(first):
     order = [0, 1, 2, 3] if first == "hand" else [3, 0, 1, 2]
     would = 0
     for places in hands(8):
-        alike = set_table_answer(table(), fingers(places, is_one=True))
+        alike = set_answer(table(), fingers(places, is_one=True))
         would += is_served(alike.fingers[3])
-        found = set_table_answer(table(), [fingers(places)[each] for each in order])
+        found = set_answer(table(), [fingers(places)[each] for each in order])
         *hand, far = [found.fingers[order.index(each)] for each in range(4)]
         assert is_served(far) or not is_served(alike.fingers[3])
         assert [each.verdict for each in hand[1:]] == ["shared", "shared"]
@@ -302,17 +302,17 @@ def test_a_hand_that_may_not_share_gives_way():
     """
     for places in hands(8):
         asked = fingers(places, sharing=NEVER)
-        found = set_table_answer(table(), asked)
+        found = set_answer(table(), asked)
         assert is_served(found.fingers[3])
         assert [each.verdict for each in found.fingers[:3]] == ["held back"] * 3
-    assert "mixed" in {each.verdict for each in set_table_answer(table(), asked[:3]).fingers}
+    assert "mixed" in {each.verdict for each in set_answer(table(), asked[:3]).fingers}
 
 
 def test_a_content_beside_a_quiet_finger_of_its_hand_gives_way():
     """Two fingers of a hand that feel nothing: the third's content is held back, nobody else's."""
     for places in hands(8):
         own = fingers(places)
-        found = set_table_answer(table(), [own[0], own[3]], [Finger(at) for at in places[1:3]])
+        found = set_answer(table(), [own[0], own[3]], [Finger(at) for at in places[1:3]])
         assert found.fingers[0].verdict == "held back"
         assert is_served(found.fingers[1])
 
@@ -321,7 +321,7 @@ def test_fingers_that_can_be_apart_do_not_share():
     """Of another name 9 cm away: what does not fit is held back, the newest first."""
     places = [(0.03, 0.03), (0.15, 0.03), (0.27, 0.03), (0.03, 0.12), (0.15, 0.12), (0.27, 0.12)]
     asked = [Finger(at, Stimulus(14, name=str(n))) for n, at in enumerate(places)]
-    found = set_table_answer(table(), asked)
+    found = set_answer(table(), asked)
     verdicts = [each.verdict for each in found.fingers]
     assert "shared" not in verdicts
     served = [n for n, verdict in enumerate(verdicts) if verdict != "held back"]
@@ -331,13 +331,13 @@ def test_fingers_that_can_be_apart_do_not_share():
         before = [each for each in served if each < n]
         trial = [asked[each] for each in (*before, n)]
         quiet = [Finger(each.at) for each in asked if each not in trial]
-        assert set_table_answer(table(), trial, quiet, min_contrast_db=-99).promised_worst_db < 6
+        assert set_answer(table(), trial, quiet, min_contrast_db=-99).promised_worst_db < 6
 
 
 def test_what_may_share_and_is_near_is_one_drive():
     """Fingers that allow any content have one, as those that cannot be kept apart."""
     places = hands(1)[0]
-    may, near = (set_table_answer(table(), fingers(places, sharing=how)) for how in (ANY, BY_NAME))
+    may, near = (set_answer(table(), fingers(places, sharing=how)) for how in (ANY, BY_NAME))
     assert drives(may) == drives(near)
 
 
@@ -346,7 +346,7 @@ ONE_EACH = [wants((0.09, 0.07)), wants((0.25, 0.18))]
 
 
 @cache
-def thresholds_table(*sets: str) -> LocalizationTable:
+def faint_table(*sets: str) -> LocalizationTable:
     """Of the paper's rig, whose promises hold by these sets of thresholds."""
     rig = replace(smooth_rig(), promised_thresholds=sets)
     return build_table(rig, frequencies=np.linspace(40.0, 320.0, 29))
@@ -399,7 +399,7 @@ def test_nine_of_ten_plates_keep_the_promise_by_every_set():
         )
 
         def shares(of, requests=requests, quiet=places[2], plates=plates):
-            found = set_table_answer(of, requests, [Finger(quiet)], min_contrast_db=-99)
+            found = set_answer(of, requests, [Finger(quiet)], min_contrast_db=-99)
             promised = [[each.promised_contrast_db] for each in found.fingers[:2]]
             level = [[each.foreign_level_db_sl] for each in found.fingers]
             each = [felt(of, found, plates, name) for name in THRESHOLDS]
@@ -407,10 +407,10 @@ def test_nine_of_ten_plates_keep_the_promise_by_every_set():
             levels = np.array([(one <= level).mean(axis=1) for _, one in each])
             return contrasts.min(axis=0), levels.min(axis=0)
 
-        of_all = shares(thresholds_table(*THRESHOLDS))
+        of_all = shares(faint_table(*THRESHOLDS))
         kept.append(of_all[0])
         heard.append(of_all[1])
-        by_one.append(shares(thresholds_table(PROBE))[0])
+        by_one.append(shares(faint_table(PROBE))[0])
     assert 0.86 <= np.mean(kept) <= 0.95
     assert 0.86 <= np.mean(heard) <= 0.96
     assert np.mean(by_one) < 0.8
@@ -421,11 +421,11 @@ def test_searching_for_the_least_costs_less_than_promising_it():
     cost, unsearched = [], []
     for places in contact_sets(24, fingers=2, seed=8):
         requests = [wants(at, level_db_sl=12) for at in places]
-        one = set_table_answer(thresholds_table(PROBE), requests, min_contrast_db=-99)
-        every = set_table_answer(thresholds_table(*THRESHOLDS), requests, min_contrast_db=-99)
+        one = set_answer(faint_table(PROBE), requests, min_contrast_db=-99)
+        every = set_answer(faint_table(*THRESHOLDS), requests, min_contrast_db=-99)
         bands = [(layer.frequency, layer.frequency) for layer in one.layers]
         same = [wants(at, band, 12) for at, band in zip(places, bands, strict=True)]
-        kept = set_table_answer(thresholds_table(*THRESHOLDS), same, min_contrast_db=-99)
+        kept = set_answer(faint_table(*THRESHOLDS), same, min_contrast_db=-99)
         cost.append(one.promised_worst_db - every.promised_worst_db)
         unsearched.append(one.promised_worst_db - kept.promised_worst_db)
     assert np.median(cost) >= 0
@@ -439,10 +439,10 @@ def test_an_only_content_has_the_frequency_that_promises_most_by_every_set():
 
     Of a tone its harmonic alone depends on the set: that of 50 Hz is felt by pressing fingertips.
     """
-    of, quiet = thresholds_table(*THRESHOLDS), [Finger((0.16, 0.06))]
-    found = set_table_answer(of, [wants((0.08, 0.06))], quiet)
+    of, quiet = faint_table(*THRESHOLDS), [Finger((0.16, 0.06))]
+    found = set_answer(of, [wants((0.08, 0.06))], quiet)
     each = {
-        hertz: set_table_answer(of, [wants((0.08, 0.06), (hertz, hertz))], quiet).promised_worst_db
+        hertz: set_answer(of, [wants((0.08, 0.06), (hertz, hertz))], quiet).promised_worst_db
         for hertz in of.frequencies.tolist()
     }
     assert found.promised_worst_db > max(each.values()) - 0.5
@@ -452,8 +452,8 @@ def test_an_only_content_has_the_frequency_that_promises_most_by_every_set():
 def test_levels_are_above_the_rigs_own_thresholds():
     """Another set beside it changes neither the level nor, of one content alone, the contrast."""
     one, every = (
-        set_table_answer(of, ONE_EACH[:1], [Finger((0.16, 0.20))])
-        for of in (thresholds_table(PROBE), thresholds_table(*THRESHOLDS))
+        set_answer(of, ONE_EACH[:1], [Finger((0.16, 0.20))])
+        for of in (faint_table(PROBE), faint_table(*THRESHOLDS))
     )
     assert every.layers[0].excitation == one.layers[0].excitation
     assert every.fingers[0].level_db_sl == pytest.approx(one.fingers[0].level_db_sl, abs=1e-3)
@@ -467,10 +467,10 @@ def test_levels_are_above_the_rigs_own_thresholds():
 
 def test_bounds_that_fingers_state_are_above_the_rigs_own_thresholds():
     """What holds by one set holds where others are promised, too: what is asked is by that set."""
-    alone = set_table_answer(thresholds_table(PROBE), ONE_EACH[:1], [Finger((0.16, 0.20))])
+    alone = set_answer(faint_table(PROBE), ONE_EACH[:1], [Finger((0.16, 0.20))])
     bound = alone.fingers[1].foreign_level_db_sl + 0.1
-    found = set_table_answer(
-        thresholds_table(*THRESHOLDS), ONE_EACH[:1], [Finger((0.16, 0.20), max_foreign_db_sl=bound)]
+    found = set_answer(
+        faint_table(*THRESHOLDS), ONE_EACH[:1], [Finger((0.16, 0.20), max_foreign_db_sl=bound)]
     )
     assert found.fingers[0].verdict == OWN
     assert found.fingers[1].foreign_level_db_sl > bound + 20
@@ -500,8 +500,8 @@ def test_a_texture_is_mixed_where_a_steady_content_is_own():
     """
     of = known_table()
     requests = [wants((0.09, 0.07)), wants((0.25, 0.18))]
-    steady = set_table_answer(of, requests)
-    found = set_table_answer(of, [wants((0.09, 0.07), modulation_hz=20.0), requests[1]])
+    steady = set_answer(of, requests)
+    found = set_answer(of, [wants((0.09, 0.07), modulation_hz=20.0), requests[1]])
     assert found.layers[0].side_bands
     assert [each.pauses for each in found.fingers] == [True, False]
     assert all(each.is_foreign_felt for each in (*steady.fingers, *found.fingers))

@@ -39,7 +39,7 @@ from model.transients.base_motion import BaseEnvelope, rise, shaped
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.vibration import Tone, base_amplitudes
 from plates import (
-    PAPER_TABLE_FREQUENCIES,
+    SMALL_TABLE_HZ,
     contact_sets,
     forms_of,
     small_table,
@@ -586,7 +586,7 @@ def test_frequencies_are_those_of_the_band():
             band_hz=(150.0, 250.0),
         )
         assert all(150 <= tone.frequency <= 250 for tone in layer.excitation.values())
-    end = float(PAPER_TABLE_FREQUENCIES[9])
+    end = float(SMALL_TABLE_HZ[9])
     layer, _ = only(smooth_table(), Placement((FINGERS_TARGET,), FINGERS_QUIET), band_hz=(end, end))
     assert layer.frequency == end
 

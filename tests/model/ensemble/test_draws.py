@@ -209,7 +209,7 @@ OF = np.array([0, 1, 0, 1])
 
 
 @cache
-def delays_table() -> LocalizationTable:
+def late_table() -> LocalizationTable:
     """The paper's plate after an identification."""
     rig = replace(smooth_rig(), uncertainty=IDENTIFIED)
     return build_table(rig, frequencies=np.arange(40.0, 321.0, 10.0), drive_mode="phased")
@@ -277,7 +277,7 @@ def test_nothing_changes_where_no_clock_is_off(
     """All ERAs on one amplifier, however bad its clock is; or clocks that agree: the same table."""
     found = ClockErrors.of(ERAS, wiring, errors)
     assert found == EXACT_CLOCKS
-    assert delays_table().with_clocks(found) is delays_table()
+    assert late_table().with_clocks(found) is late_table()
 
 
 @pytest.mark.parametrize("errors", [{"a": 1e-6}, {"a": 1e-6, "b": math.nan}, {"a": 0, "b": -1e-6}])
@@ -293,8 +293,8 @@ def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
 
     Which is smaller by exp(-p² / 2), p = 2 pi f times 0.2 ms; all else is certain.
     """
-    exact = np.zeros_like(delays_table().discretisation_error)
-    known = replace(delays_table(), uncertainty=Uncertainty.none(), discretisation_error=exact)
+    exact = np.zeros_like(late_table().discretisation_error)
+    known = replace(late_table(), uncertainty=Uncertainty.none(), discretisation_error=exact)
     off = known.with_clocks(clocks(a=2e-4, b=2e-4))
     fingers = FingersOnPlate.of(off, [(0.09, 0.07), (0.25, 0.18)], ())
     rows, n = np.array([3, 12, 25]), 4
@@ -313,15 +313,15 @@ def test_expected_power_is_the_mean_square_of_delayed_drives() -> None:
 def kept(found: Answer, delays: Callable[[], FloatArray], *, seed: int, count: int = 100) -> float:
     """Share of exactly solved plates that keep the worst finger's promise; delays (d, 2) [s]."""
     rng, places = np.random.default_rng(seed), [each.finger.at for each in found.fingers]
-    plates = draw_plates(rng, IDENTIFIED, of=delays_table(), count=count, contact_count=len(places))
-    late, weights = delays()[:, OF], read_fingertips(delays_table(), places).fine_weights
+    plates = draw_plates(rng, IDENTIFIED, of=late_table(), count=count, contact_count=len(places))
+    late, weights = delays()[:, OF], read_fingertips(late_table(), places).fine_weights
     power = []
     for layer in found.layers:
         (frequency,) = {tone.frequency for tone in layer.excitation.values()}
         turned = replace(plates, gain=plates.gain * np.exp(-2j * math.pi * frequency * late))
         placed = Placement((places[0],), tuple(places[1:]))
-        _, (one,) = powers_on(delays_table(), placed, layer.excitation, turned)
-        threshold = delays_table().thresholds[delays_table().rows_of(np.array([frequency]))[0]]
+        _, (one,) = powers_on(late_table(), placed, layer.excitation, turned)
+        threshold = late_table().thresholds[late_table().rows_of(np.array([frequency]))[0]]
         power.append(one.reshape(len(places), -1, count) / float(threshold) ** 2)
     worst = np.full(count, math.inf)
     for number, layer in enumerate(found.layers):
@@ -345,9 +345,9 @@ def test_promises_count_the_delays_and_are_kept() -> None:
 
     Plates and delays are drawn here, by numpy alone.
     """
-    off = delays_table().with_clocks(clocks(a=50e-6, b=50e-6))
+    off = late_table().with_clocks(clocks(a=50e-6, b=50e-6))
     shares = []
-    for of in (off, delays_table()):
+    for of in (off, late_table()):
         each = []
         for seed, places in enumerate(contact_sets(12, fingers=2, seed=3)):
             rng = np.random.default_rng(seed)
@@ -361,7 +361,7 @@ def test_promises_count_the_delays_and_are_kept() -> None:
 @pytest.mark.usefixtures("kernels_or_numpy")
 def test_an_amplifier_whose_clock_is_not_held_plays_contents_of_its_own() -> None:
     """Each content is of one amplifier's ERAs, and kept whatever the phases between these are."""
-    off = delays_table().with_clocks(clocks(a=math.inf, b=math.inf))
+    off = late_table().with_clocks(clocks(a=math.inf, b=math.inf))
     each = []
     for seed, places in enumerate(contact_sets(8, fingers=2, seed=4)):
         found = two(off, places)
@@ -385,7 +385,7 @@ def test_amplifiers_that_are_held_play_together_beside_one_that_is_not() -> None
 
 def test_clocks_change_nothing_else() -> None:
     """Errors of a femtosecond change no promise, where the places of ERAs are uncertain, too."""
-    known = replace(delays_table(), uncertainty=replace(IDENTIFIED, place=0.003))
+    known = replace(late_table(), uncertainty=replace(IDENTIFIED, place=0.003))
     places = next(iter(contact_sets(1, fingers=2, seed=5)))
     exact = two(known, places).promised_worst_db
     off = two(known.with_clocks(clocks(a=1e-15, b=1e-15)), places).promised_worst_db

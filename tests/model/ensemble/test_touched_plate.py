@@ -319,26 +319,24 @@ def test_every_stage_is_that_of_numpy(rig, count):
 
 
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
-PLACES_FREQUENCIES = np.array([60.0, 145.0, 260.0])
-PLACES_PLACES = ((0.05, 0.04), (0.26, 0.06), (0.24, 0.19), (0.13, 0.12))
+SHIFTED_HZ = np.array([60.0, 145.0, 260.0])
+SHIFTED_AT = ((0.05, 0.04), (0.26, 0.06), (0.24, 0.19), (0.13, 0.12))
 STEP, STIFFER = 1e-4, 1e-3  # m, relative
 
 
 def test_places_that_are_off_change_fields_as_much_as_stiffnesses_do() -> None:
     """All fields over the plate, mean square: an ERA off by 1 mm along x and y, and its spring."""
     plain = smooth_rig()
-    eras = tuple(
-        replace(era, x=x, y=y) for era, (x, y) in zip(plain.eras, PLACES_PLACES, strict=True)
-    )
+    eras = tuple(replace(era, x=x, y=y) for era, (x, y) in zip(plain.eras, SHIFTED_AT, strict=True))
     known = replace(Uncertainty.none(), stiffness=0.01, place=0.001)
     rig = replace(plain, eras=eras, uncertainty=known)
-    table = build_table(rig, frequencies=PLACES_FREQUENCIES)
+    table = build_table(rig, frequencies=SHIFTED_HZ)
     matrices = assemble(rig.plate, rig.mesh)
 
     def changed(number: int, **values: float) -> ComplexArray:
         other = replace(rig.eras[number], **values)
         every = [*rig.eras[:number], other, *rig.eras[number + 1 :]]
-        return direct_acceleration(matrices, every, PLACES_FREQUENCIES, table.raster.points)
+        return direct_acceleration(matrices, every, SHIFTED_HZ, table.raster.points)
 
     for number, era in enumerate(rig.eras):
         moved = [

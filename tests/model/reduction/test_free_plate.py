@@ -451,44 +451,36 @@ def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
     )
 
 
-MODE_DEVIATIONS_FREQUENCIES = np.array([65.0, 150.0, 240.0, 430.0])
+DEVIATING_HZ = np.array([65.0, 150.0, 240.0, 430.0])
 DEVIATIONS = ((0.02, 0.3), (0.0, 0.0), (-0.03, -0.4))
-MODE_DEVIATIONS_POINTS = np.array([[0.05, 0.04], [0.2, 0.11]])
+DEVIATING_POINTS = np.array([[0.05, 0.04], [0.2, 0.11]])
 
 
 @pytest.fixture(scope="module")
-def mode_deviations_rig() -> Rig:
+def deviating_rig() -> Rig:
     """The paper's plate with three modes off its theory, and a loss that rises with frequency."""
     rig = load_rig(example_rig_path())
     plate = replace(rig.plate, loss_exponent=0.4, mode_deviations=DEVIATIONS)
     return replace(rig, plate=plate)
 
 
-def test_only_the_modes_named_change_the_receptance(mode_deviations_rig: Rig) -> None:
+def test_only_the_modes_named_change_the_receptance(deviating_rig: Rig) -> None:
     """The receptance changes by that of three oscillators with stiffness and loss of their own."""
-    plain = replace(
-        mode_deviations_rig, plate=replace(mode_deviations_rig.plate, mode_deviations=())
-    )
+    plain = replace(deviating_rig, plate=replace(deviating_rig.plate, mode_deviations=()))
     solved = [
         solve_free_plate(each.plate, each.mesh, frequency_max=500.0)
-        for each in (mode_deviations_rig, plain)
+        for each in (deviating_rig, plain)
     ]
     found, before = (
-        free.receptances(
-            MODE_DEVIATIONS_POINTS, MODE_DEVIATIONS_POINTS, MODE_DEVIATIONS_FREQUENCIES
-        )[0]
-        for free in solved
+        free.receptances(DEVIATING_POINTS, DEVIATING_POINTS, DEVIATING_HZ)[0] for free in solved
     )
     modes = solved[0].modes
     elastic = np.sort(modes.eigenvalues)[3:6]
-    omega = 2 * np.pi * MODE_DEVIATIONS_FREQUENCIES
-    eta = (
-        mode_deviations_rig.plate.loss_factor
-        * (MODE_DEVIATIONS_FREQUENCIES / LOSS_FREQUENCY) ** 0.4
-    )
+    omega = 2 * np.pi * DEVIATING_HZ
+    eta = deviating_rig.plate.loss_factor * (DEVIATING_HZ / LOSS_FREQUENCY) ** 0.4
     expected = before.copy()
     for eigenvalue, (shift, loss) in zip(elastic, DEVIATIONS, strict=True):
-        phi = modes.shapes_at(MODE_DEVIATIONS_POINTS)[
+        phi = modes.shapes_at(DEVIATING_POINTS)[
             :, np.flatnonzero(modes.eigenvalues == eigenvalue)[0]
         ]
         for factor, more, sign in ((np.exp(shift), np.exp(loss), 1), (1.0, 1.0, -1)):
@@ -497,53 +489,45 @@ def test_only_the_modes_named_change_the_receptance(mode_deviations_rig: Rig) ->
     np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
 
 
-def test_loss_varies_alike_in_modes_and_in_a_direct_solution(mode_deviations_rig: Rig) -> None:
+def test_loss_varies_alike_in_modes_and_in_a_direct_solution(deviating_rig: Rig) -> None:
     """Modal and direct accelerations agree where the loss factor rises with frequency."""
-    plate = replace(mode_deviations_rig.plate, mode_deviations=())
-    assert isinstance(mode_deviations_rig.mesh, SpectralMesh)
+    plate = replace(deviating_rig.plate, mode_deviations=())
+    assert isinstance(deviating_rig.mesh, SpectralMesh)
     direct = direct_spectral_acceleration(
         plate,
-        mode_deviations_rig.mesh,
-        mode_deviations_rig.eras,
-        MODE_DEVIATIONS_FREQUENCIES,
-        MODE_DEVIATIONS_POINTS,
+        deviating_rig.mesh,
+        deviating_rig.eras,
+        DEVIATING_HZ,
+        DEVIATING_POINTS,
     )
-    free = solve_free_plate(plate, mode_deviations_rig.mesh, frequency_max=500.0)
-    found = free.acceleration(
-        mode_deviations_rig.eras, MODE_DEVIATIONS_FREQUENCIES, MODE_DEVIATIONS_POINTS
-    )
+    free = solve_free_plate(plate, deviating_rig.mesh, frequency_max=500.0)
+    found = free.acceleration(deviating_rig.eras, DEVIATING_HZ, DEVIATING_POINTS)
     np.testing.assert_allclose(found, direct, atol=1e-4 * np.abs(direct).max())
 
 
-def test_a_table_is_verified_with_them(mode_deviations_rig: Rig) -> None:
+def test_a_table_is_verified_with_them(deviating_rig: Rig) -> None:
     """Its fields and one answer are those of the plate anew, not of the plate in theory."""
-    table = build_table(mode_deviations_rig)
-    assert verify_table(table, mode_deviations_rig, samples=1).failed_count == 0
-    other = replace(
-        mode_deviations_rig, plate=replace(mode_deviations_rig.plate, mode_deviations=())
-    )
+    table = build_table(deviating_rig)
+    assert verify_table(table, deviating_rig, samples=1).failed_count == 0
+    other = replace(deviating_rig, plate=replace(deviating_rig.plate, mode_deviations=()))
     checks = verify_table(table, other, samples=1).content
     assert not any(check.is_passed for check in checks)
 
 
-def test_plate_in_time_has_them(mode_deviations_rig: Rig) -> None:
+def test_plate_in_time_has_them(deviating_rig: Rig) -> None:
     """Steady vibration of the viscous plate in time is that of the hysteretic one within 1 %."""
     reduced = reduce_plate(
-        mode_deviations_rig.plate, mode_deviations_rig.mesh, footprints_of(mode_deviations_rig.eras)
+        deviating_rig.plate, deviating_rig.mesh, footprints_of(deviating_rig.eras)
     )
-    M, C, K = modal_matrices(reduced, mode_deviations_rig.eras)
-    free = solve_free_plate(
-        mode_deviations_rig.plate, mode_deviations_rig.mesh, frequency_max=500.0
-    )
-    expected = free.acceleration(
-        mode_deviations_rig.eras, MODE_DEVIATIONS_FREQUENCIES, MODE_DEVIATIONS_POINTS
-    )[:, 0]
-    era = mode_deviations_rig.eras[0]
-    forces = reduced.at(footprints_of(mode_deviations_rig.eras[:1]))[0]
-    for row, omega in enumerate(2 * np.pi * MODE_DEVIATIONS_FREQUENCIES):
+    M, C, K = modal_matrices(reduced, deviating_rig.eras)
+    free = solve_free_plate(deviating_rig.plate, deviating_rig.mesh, frequency_max=500.0)
+    expected = free.acceleration(deviating_rig.eras, DEVIATING_HZ, DEVIATING_POINTS)[:, 0]
+    era = deviating_rig.eras[0]
+    forces = reduced.at(footprints_of(deviating_rig.eras[:1]))[0]
+    for row, omega in enumerate(2 * np.pi * DEVIATING_HZ):
         base = (era.stiffness + 1j * omega * era.damping) * era.stroke
         moved = np.linalg.solve(K + 1j * omega * C - omega**2 * M, forces * base)
-        found = -(omega**2) * (reduced.at(MODE_DEVIATIONS_POINTS) @ moved)
+        found = -(omega**2) * (reduced.at(DEVIATING_POINTS) @ moved)
         error = np.linalg.norm(found - expected[row]) / np.linalg.norm(expected[row])
         assert error < 0.01
 
@@ -556,7 +540,7 @@ def test_rig_file_refuses_what_is_no_deviation(wrong: str) -> None:
         parse_rig("rig.yaml", text.replace("loss_factor:", f"{wrong}\n  loss_factor:"))
 
 
-MODE_DEVIATIONS_PLATE = replace(make_paper_rig(12, 9).plate, loss_factor=0.0)
+LOSSLESS = replace(make_paper_rig(12, 9).plate, loss_factor=0.0)
 PLACES = np.array([(0.13, 0.11, 0), (0.17, 0, 0), (LENGTH, WIDTH, 0), (0.05, 0.06, 0.01)])
 
 # ln 10 / (2 pi kappa G h) with kappa 5/6 and G = 70 GPa / 2.66, at a point inside; on an edge and
@@ -567,9 +551,7 @@ DECADES = DECADE * np.array([1, 2, 4, 0])
 
 def plates():
     """The paper's plate without damping in polynomials, and the softer one."""
-    free = solve_free_plate(
-        MODE_DEVIATIONS_PLATE, SpectralMesh(12, 9, LENGTH, WIDTH), frequency_max=500.0
-    )
+    free = solve_free_plate(LOSSLESS, SpectralMesh(12, 9, LENGTH, WIDTH), frequency_max=500.0)
     assert isinstance(free.modes, SpectralModes)
     return free, replace(free, modes=free.modes.softer())
 
@@ -581,9 +563,7 @@ def test_softer_plate_gives_way_by_a_fifth_and_a_decade_more():
         plate.receptances(PLACES, PLACES, np.array([5.0])) for plate in (free, softer)
     )
     assert pytest.approx(1.1e-8, rel=0.05) == DECADE
-    expected = 0.2 * local_compliance(MODE_DEVIATIONS_PLATE, (12, 9), PLACES, PLACES) + np.diag(
-        DECADES
-    )
+    expected = 0.2 * local_compliance(LOSSLESS, (12, 9), PLACES, PLACES) + np.diag(DECADES)
     np.testing.assert_allclose((soft - stiff)[0].real, expected, rtol=1e-3, atol=1e-13)
     np.testing.assert_allclose(
         (to_softer_points - to_points)[0].real, expected, rtol=1e-3, atol=1e-13

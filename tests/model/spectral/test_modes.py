@@ -30,7 +30,7 @@ from model.spectral.direct_solution import (
     stiffness_slopes,
 )
 from model.spectral.modes import Band, SpectralMesh, SpectralPlate, local_compliance
-from model.spectral.polynomials import CLASSES as POLYNOMIALS_CLASSES
+from model.spectral.polynomials import CLASSES as PARITY_CLASSES
 from model.spectral.polynomials import EVEN, EdgedFunctions, air_motion
 from model.structure.attachments import Era, PointLoad, footprints_of
 from model.structure.plate import (
@@ -82,7 +82,7 @@ def test_a_layer_that_polynomials_resolve_is_left_out():
 
 
 GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.22)
-SHAPE_STIFFNESS_PLATE = Plate(0.3, 0.21, 0.001, GLASS)
+THIN_PLATE = Plate(0.3, 0.21, 0.001, GLASS)
 LAYERS = (
     LaminateLayer(GLASS, 0.0004),
     LaminateLayer(Material("glue", E=50e6, rho=1000.0, nu=0.45), 0.0002),
@@ -132,8 +132,8 @@ def changed(plate, number, change):
     ("plate", "mesh"),
     [
         *(
-            (SHAPE_STIFFNESS_PLATE, SPECTRAL),
-            (SHAPE_STIFFNESS_PLATE, ELEMENTARY),
+            (THIN_PLATE, SPECTRAL),
+            (THIN_PLATE, ELEMENTARY),
             (SANDWICH, SPECTRAL),
         ),
         *((BOARD, SPECTRAL), (BOARD, ELEMENTARY)),
@@ -170,23 +170,23 @@ def test_a_thin_plate_scales_with_the_fourth_power_of_its_size():
 
     Kirchhoff's theory, without boundary layers as wide as the plate is thick.
     """
-    eigenvalues, (length, width, _) = slopes_of(SHAPE_STIFFNESS_PLATE, SPECTRAL)
+    eigenvalues, (length, width, _) = slopes_of(THIN_PLATE, SPECTRAL)
     size = np.sqrt(np.outer(eigenvalues, eigenvalues))
     np.testing.assert_allclose(
         (length + width) / size,
         -4 * np.eye(len(size)),
-        atol=SHAPE_STIFFNESS_PLATE.thickness / SHAPE_STIFFNESS_PLATE.width,
+        atol=THIN_PLATE.thickness / THIN_PLATE.width,
     )
 
 
-AIR_GAP_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
-AIR_GAP_PLATE = Plate(0.375, 0.225, 2.5e-3, AIR_GAP_GLASS)
+PANE_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
+PANE = Plate(0.375, 0.225, 2.5e-3, PANE_GLASS)
 CLASSES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 def force_of(gap, frequency, parity, degrees=(12, 10)):
     """Matrix of the air's dynamic stiffness [N/m per m²] in the polynomials of a class."""
-    plate = replace(AIR_GAP_PLATE, air_gap=gap)
+    plate = replace(PANE, air_gap=gap)
     of = SpectralPlate(plate, degrees, 150.0).functions(parity)
     air, m = air_motion(of, gap), of.deflections
     full = gap.bulk_modulus(frequency) * air.stiffness.astype(complex)
@@ -207,19 +207,16 @@ def test_air_equals_finite_differences(closed, parity, depth, frequency):
     """Its force on the first two deflections of each symmetry, to 1.5 %, far from any resonance."""
     gap = AirGap(depth, closed=closed)
     of, found = force_of(gap, frequency, parity)
-    x, y = cell_middles(AIR_GAP_PLATE.length, AIR_GAP_PLATE.width, (100, 60))
-    area = AIR_GAP_PLATE.length * AIR_GAP_PLATE.width / x.size
+    x, y = cell_middles(PANE.length, PANE.width, (100, 60))
+    area = PANE.length * PANE.width / x.size
     first = [(1 - each) // 2 for each in parity]
     shapes = [
-        polynomial(first[0] + 2 * i, x, AIR_GAP_PLATE.length)
-        * polynomial(first[1], y, AIR_GAP_PLATE.width)
+        polynomial(first[0] + 2 * i, x, PANE.length) * polynomial(first[1], y, PANE.width)
         for i in range(2)
     ]
     numbers = [i * of.of_w[1] for i in range(2)]
     for shape, number in zip(shapes, numbers, strict=True):
-        pressure = air_pressure(
-            gap, shape, frequency, length=AIR_GAP_PLATE.length, width=AIR_GAP_PLATE.width
-        )
+        pressure = air_pressure(gap, shape, frequency, length=PANE.length, width=PANE.width)
         # p pushes towards larger w; the dynamic stiffness resists it.
         expected = [-(other * pressure).sum() * area for other in shapes]
         scale = abs(found[number, number])
@@ -229,7 +226,7 @@ def test_air_equals_finite_differences(closed, parity, depth, frequency):
 def test_a_slow_square_squeezes_as_reynolds_equation_says():
     """Damping of a rigid square in an open film, 0.4217 mu L⁴ / d³ (Bao and Yang 2007, Eq. 21)."""
     side, depth, frequency = 0.02, 0.1e-3, 1.0
-    plate = Plate(side, side, 1e-3, AIR_GAP_GLASS, air_gap=AirGap(depth))
+    plate = Plate(side, side, 1e-3, PANE_GLASS, air_gap=AirGap(depth))
     of = SpectralPlate(plate, (24, 24), 150.0).functions((1, 1))
     air, m, gap = air_motion(of, plate.air_gap), of.deflections, plate.air_gap
     omega = 2 * np.pi * frequency
@@ -265,8 +262,8 @@ def test_a_free_plate_over_a_sealed_gap_moves_up_and_down_on_its_air():
 @pytest.mark.parametrize("closed", [False, True])
 def test_modes_over_air_answer_as_the_direct_solution(closed):
     """Response over 5 mm of air within 1 % of the one at each frequency, relative L2."""
-    plate = replace(AIR_GAP_PLATE, air_gap=AirGap(5e-3, closed=closed), loss_factor=0.02)
-    mesh = SpectralMesh(10, 8, AIR_GAP_PLATE.length, AIR_GAP_PLATE.width)
+    plate = replace(PANE, air_gap=AirGap(5e-3, closed=closed), loss_factor=0.02)
+    mesh = SpectralMesh(10, 8, PANE.length, PANE.width)
     eras = [
         Era(name, x, y, stiffness=17e3, damping=1.0, bolt_mass=0.0, stroke=1e-4)
         for name, x, y in (("a", 0, 0), ("b", 0.375, 0), ("c", 0, 0.225), ("d", 0.375, 0.225))
@@ -282,17 +279,17 @@ def test_modes_over_air_answer_as_the_direct_solution(closed):
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "glass_panel.yaml"
 COVER = Material("cover", E=71.5e9, rho=2420.0, nu=0.21)
-LAYERED_PLATE_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
+LAYER_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ADHESIVE = Material("adhesive", E=1e6, rho=1000.0, nu=0.49)
 PANEL = (
     LaminateLayer(COVER, 1.8e-3),
     LaminateLayer(ADHESIVE, 0.2e-3),
-    LaminateLayer(LAYERED_PLATE_GLASS, 0.7e-3),
+    LaminateLayer(LAYER_GLASS, 0.7e-3),
 )
 THIN = (
-    LaminateLayer(LAYERED_PLATE_GLASS, 0.7e-3),
+    LaminateLayer(LAYER_GLASS, 0.7e-3),
     LaminateLayer(ADHESIVE, 0.1e-3),
-    LaminateLayer(LAYERED_PLATE_GLASS, 0.7e-3),
+    LaminateLayer(LAYER_GLASS, 0.7e-3),
 )
 
 
@@ -418,7 +415,7 @@ def test_finite_elements_refuse_layers():
 
 RIG = make_paper_rig(12, 9)
 PAPER = RIG.plate
-SPECTRAL_PLATE_GLASS = Material("glass", E=72e9, rho=2500.0, nu=0.23)
+STIFF_GLASS = Material("glass", E=72e9, rho=2500.0, nu=0.23)
 
 # Converged Reissner-Mindlin values [Hz] of the paper's plate: NGSolve, order 5 with resolved edge
 # layers; scikit-fem agrees to 0.0013 %.
@@ -495,8 +492,8 @@ def test_reduction_equals_direct_solution(layout, foot):
 
 PLATES = {
     "paper": PAPER,
-    "glass panel": Plate(0.36, 0.22, 0.0011, SPECTRAL_PLATE_GLASS),
-    "strip": Plate(0.5, 0.1, 0.0015, SPECTRAL_PLATE_GLASS),
+    "glass panel": Plate(0.36, 0.22, 0.0011, STIFF_GLASS),
+    "strip": Plate(0.5, 0.1, 0.0015, STIFF_GLASS),
 }
 
 
@@ -515,7 +512,7 @@ def test_modes_are_those_of_a_full_eigen_solution(plate, degrees, frequency):
         cutoff_frequency=frequency,
         frequency_max=frequency,
     )
-    every = np.concatenate([_all_eigenvalues(of, degrees, each) for each in POLYNOMIALS_CLASSES])
+    every = np.concatenate([_all_eigenvalues(of, degrees, each) for each in PARITY_CLASSES])
     expected = np.sqrt(np.maximum(every, 0)) / (2 * math.pi)
     found = np.sqrt(np.sort(modes.eigenvalues)) / (2 * math.pi)
     np.testing.assert_allclose(found, np.sort(expected[expected < frequency]), rtol=1e-5, atol=0.1)
@@ -577,7 +574,7 @@ def test_more_accuracy_and_stiffer_eras_take_higher_degrees():
 
 def test_plate_of_many_wavelengths_takes_one_high_degree():
     """4 m of glass 0.7 mm thick and 0.1 m wide have 34 wavelengths: high along it, low across."""
-    mesh = mesh_of("auto", Plate(4.0, 0.1, 0.0007, SPECTRAL_PLATE_GLASS), frequency_max=500.0)
+    mesh = mesh_of("auto", Plate(4.0, 0.1, 0.0007, STIFF_GLASS), frequency_max=500.0)
     assert isinstance(mesh, SpectralMesh)
     assert mesh.nx > 110
     assert mesh.ny < 20
@@ -587,7 +584,7 @@ def test_plate_of_many_wavelengths_takes_one_high_degree():
 def test_meshes_that_would_take_minutes_or_all_memory_are_refused(text):
     """Ten metres square of glass 2 mm thick, and meshes that are named."""
     with pytest.raises(InputError):
-        mesh_of(text, Plate(10.0, 10.0, 0.002, SPECTRAL_PLATE_GLASS), frequency_max=500.0)
+        mesh_of(text, Plate(10.0, 10.0, 0.002, STIFF_GLASS), frequency_max=500.0)
 
 
 @pytest.mark.parametrize(

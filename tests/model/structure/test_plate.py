@@ -274,15 +274,15 @@ def test_plates_of_no_meaning_are_refused(made, said):
         made()
 
 
-LAMINATE_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
+PLY_GLASS = Material("glass", E=70e9, rho=2500.0, nu=0.2)
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
 STEEL = Material("steel", E=210e9, rho=7850.0, nu=0.3)
 FOAM = Material("foam", E=70e6, rho=100.0, nu=0.33)
 ADHESIVE = Material("adhesive", E=1e6, rho=1000.0, nu=0.49)
 PANEL = (
-    LaminateLayer(LAMINATE_GLASS, 1.8e-3),
+    LaminateLayer(PLY_GLASS, 1.8e-3),
     LaminateLayer(ADHESIVE, 0.2e-3),
-    LaminateLayer(LAMINATE_GLASS, 0.7e-3),
+    LaminateLayer(PLY_GLASS, 0.7e-3),
 )
 
 
@@ -295,7 +295,7 @@ def test_bonded_layers_equal_laminate_theory():
     """D* = D - B A⁻¹ B with the full 3x3 matrices, from any reference plane."""
     layers = [
         LaminateLayer(STEEL, 0.5e-3),
-        LaminateLayer(LAMINATE_GLASS, 2e-3),
+        LaminateLayer(PLY_GLASS, 2e-3),
         LaminateLayer(FOAM, 1e-3),
     ]
     A, B, D = (np.zeros((3, 3)) for _ in range(3))
@@ -334,7 +334,7 @@ def test_equivalent_plate_keeps_rigidity_nu_and_mass(bond):
 
 def test_equivalent_plate_keeps_rotary_inertia():
     """Bonded glass: rho H³ / 12 of the whole; sliding: of each; a sandwich: faces at their arms."""
-    three = (LaminateLayer(LAMINATE_GLASS, 1e-3),) * 3
+    three = (LaminateLayer(PLY_GLASS, 1e-3),) * 3
     assert of_plate(Laminate(three)).thickness == pytest.approx(3e-3, rel=1e-3)
     assert of_plate(Laminate(three, Bond.NONE)).thickness == pytest.approx(1e-3, rel=1e-9)
     stiff = replace(FOAM, E=7e9)
@@ -367,7 +367,7 @@ def test_waves_equal_elasticity(modulus, frequency):
 def test_waves_on_two_adhesives_equal_elasticity():
     """Cover, sensor and display glass on two different adhesives, frequency within 0.1 %."""
     other = Material("other", E=3e6, rho=1000.0, nu=0.49)
-    layers = (*PANEL, LaminateLayer(other, 0.1e-3), LaminateLayer(LAMINATE_GLASS, 1.1e-3))
+    layers = (*PANEL, LaminateLayer(other, 0.1e-3), LaminateLayer(PLY_GLASS, 1.1e-3))
     k = wavenumber_of(Laminate(layers), 150.0).real
     assert k == pytest.approx(wave_number(layers, 150.0), rel=5e-4)
 
@@ -413,10 +413,10 @@ def test_modulus_by_frequency_is_a_power_law_between_rows():
 
 def test_sliding_layers_add_their_rigidities():
     """Two equal layers are twice one, a quarter of the bonded pair; others add up by hand."""
-    two = [LaminateLayer(LAMINATE_GLASS, 1e-3), LaminateLayer(LAMINATE_GLASS, 1e-3)]
+    two = [LaminateLayer(PLY_GLASS, 1e-3), LaminateLayer(PLY_GLASS, 1e-3)]
     assert freely_sliding(two).rigidity == pytest.approx(2 * 70 / (12 * 0.96), rel=1e-12)
     assert perfectly_bonded(two).rigidity / freely_sliding(two).rigidity == pytest.approx(4)
-    mixed = freely_sliding([LaminateLayer(STEEL, 1e-3), LaminateLayer(LAMINATE_GLASS, 2e-3)])
+    mixed = freely_sliding([LaminateLayer(STEEL, 1e-3), LaminateLayer(PLY_GLASS, 2e-3)])
     steel, glass = 210 / (12 * 0.91), 560 / (12 * 0.96)
     assert mixed.rigidity == pytest.approx(steel + glass, rel=1e-12)
     assert mixed.nu == pytest.approx((0.3 * steel + 0.2 * glass) / (steel + glass), rel=1e-12)

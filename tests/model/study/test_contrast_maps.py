@@ -267,7 +267,7 @@ MODES = ("switched", "phased")
 
 
 @pytest.fixture(scope="module")
-def contrast_map_table() -> era.LocalizationTable:
+def map_table() -> era.LocalizationTable:
     """A small table of the paper's plate, cells of 61 x 76 mm."""
     return build_table(
         make_paper_rig(12, 9),
@@ -278,13 +278,13 @@ def contrast_map_table() -> era.LocalizationTable:
 
 
 @pytest.fixture(scope="module")
-def found(contrast_map_table: era.LocalizationTable) -> era.ContrastMap:
+def found(map_table: era.LocalizationTable) -> era.ContrastMap:
     """Both drive modes, side by side."""
-    return era.contrast_map(contrast_map_table, QUIET, drive_modes=MODES)
+    return era.contrast_map(map_table, QUIET, drive_modes=MODES)
 
 
 def test_map_has_the_answer_of_every_place(
-    contrast_map_table: era.LocalizationTable, found: era.ContrastMap
+    map_table: era.LocalizationTable, found: era.ContrastMap
 ) -> None:
     """Promised and nominal contrast of a query there; none where the quiet finger itself is."""
     for row, y in enumerate(found.y):
@@ -294,9 +294,7 @@ def test_map_has_the_answer_of_every_place(
                 promised = found.promised_db[mode][row, column]
                 assert np.isfinite(promised) == far
                 if far:
-                    felt = era.query(
-                        contrast_map_table, (x, y), quiet=[QUIET], drive_mode=mode
-                    ).fingers[0]
+                    felt = era.query(map_table, (x, y), quiet=[QUIET], drive_mode=mode).fingers[0]
                     assert promised == pytest.approx(felt.promised_contrast_db, abs=1e-3)
                     nominal = found.nominal_db[mode][row, column]
                     assert nominal == pytest.approx(felt.contrast_db, abs=1e-3)
@@ -312,11 +310,11 @@ def test_frame_has_a_row_a_place(found: era.ContrastMap) -> None:
 
 
 def test_command_prints_and_writes_the_map(
-    contrast_map_table: era.LocalizationTable, found: era.ContrastMap, tmp_path: Path
+    map_table: era.LocalizationTable, found: era.ContrastMap, tmp_path: Path
 ) -> None:
     """JSON with null for no answer, a CSV file of a row a place, a PDF of the size in cm."""
     file = tmp_path / "t.npz"
-    era.save_table(contrast_map_table, file)
+    era.save_table(map_table, file)
     quiet = ["table", "map", str(file), "--quiet", f"{QUIET[0]},{QUIET[1]}"]
     both = [*quiet, "--modes", ",".join(MODES)]
 
@@ -345,10 +343,10 @@ def test_command_prints_and_writes_the_map(
     ],
 )
 def test_bad_input_is_refused(
-    contrast_map_table: era.LocalizationTable, tmp_path: Path, options: list[str], cause: str
+    map_table: era.LocalizationTable, tmp_path: Path, options: list[str], cause: str
 ) -> None:
     """A finger off the plate, an unknown mode, a size without height, an unknown ending."""
-    era.save_table(contrast_map_table, tmp_path / "t.npz")
+    era.save_table(map_table, tmp_path / "t.npz")
     result = CliRunner().invoke(app, ["table", "map", str(tmp_path / "t.npz"), *options])
     assert isinstance(result.exception, era.InputError)
     assert cause in str(result.exception)

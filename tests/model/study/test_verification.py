@@ -18,7 +18,7 @@ from model.study.verification import AnswerCheck, Plates, draw_plates, felt_on, 
 from model.table.table_file import build_table, load_table, save_table, solve_table
 from model.vibration import base_amplitudes, tone_fields
 from plates import (
-    PAPER_TABLE_FREQUENCIES,
+    SMALL_TABLE_HZ,
     contact_sets,
     make_paper_rig,
     small_problem,
@@ -189,10 +189,10 @@ ON_FEET = replace(
 @cache
 def table_on_feet():
     """The table of that rig."""
-    return build_table(ON_FEET, frequencies=PAPER_TABLE_FREQUENCIES)
+    return build_table(ON_FEET, frequencies=SMALL_TABLE_HZ)
 
 
-PLACES_OFF = np.array([[1.0, 0.5], [-1.0, 0.8], [-0.6, -1.2], [0.9, -0.7]])  # inwards
+DISPLACED = np.array([[1.0, 0.5], [-1.0, 0.8], [-0.6, -1.2], [0.9, -0.7]])  # inwards
 
 PLATES = Plates(
     thickness=np.array([1.0, 1.02, 0.98]),
@@ -206,7 +206,7 @@ PLATES = Plates(
     ),
     deviation=np.zeros((3, 3), dtype=complex),
     modulus=np.array([1.0, 0.96, 1.03]),
-    places=1e-3 * np.array([np.zeros((4, 2)), PLACES_OFF, -0.5 * PLACES_OFF]),
+    places=1e-3 * np.array([np.zeros((4, 2)), DISPLACED, -0.5 * DISPLACED]),
     harmonic=np.zeros((3, 4), dtype=complex),
     feet=np.array([[1.0, 1.0], [0.6, 1.4], [1.5, 0.8]]),
 )
@@ -395,9 +395,7 @@ def test_answers_reach_what_an_independent_optimum_does(known, percent, expected
     The optimum climbed the percentile itself on other sets of the same plate, on another model of
     it; medians over so few sets move by a decibel.
     """
-    table = build_table(
-        replace(smooth_rig(), uncertainty=known), frequencies=PAPER_TABLE_FREQUENCIES
-    )
+    table = build_table(replace(smooth_rig(), uncertainty=known), frequencies=SMALL_TABLE_HZ)
     rng = np.random.default_rng(8)
     for quiet, optimum in zip((1, 2, 3), expected, strict=True):
         found = []

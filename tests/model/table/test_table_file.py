@@ -231,13 +231,13 @@ def test_build_refuses_an_unknown_drive_mode(problem):
         solve_table(problem, drive_mode="loud")
 
 
-def table_cache_quick_rig(nx, ny):
+def quick_rig_on(nx, ny):
     """The paper's plate up to 100 Hz: five frequencies, solved quickly."""
     rig = make_paper_rig(nx, ny)
     return replace(rig, limits=replace(rig.limits, frequency_min=60.0, frequency_max=100.0))
 
 
-RIG = table_cache_quick_rig(12, 9)
+RIG = quick_rig_on(12, 9)
 FEW = {"frequencies": np.array([70.0, 80.0]), "grid": Grid(2, 2)}
 STIFFER = replace(RIG, eras=(replace(RIG.eras[0], stiffness=18000.0), *RIG.eras[1:]))
 
@@ -277,7 +277,7 @@ def test_cached_table_is_built_for_each_rig_and_choice(builds):
     choices = [
         (RIG, {}),
         (STIFFER, {}),
-        (table_cache_quick_rig(16, 12), {}),
+        (quick_rig_on(16, 12), {}),
         (replace(RIG, limits=replace(RIG.limits, frequency_max=200.0)), {}),
         (RIG, {"frequencies": np.array([70.0])}),
         (RIG, {"frequencies": np.array([70.0, 90.0])}),

@@ -300,11 +300,11 @@ FRAME = CanFrame(0x181, bytes.fromhex("0102030405060708"))
 class Member:
     """A member of the bus, with the frames `heard`."""
 
-    def __init__(self, can_adapters_bus: CanBus) -> None:
+    def __init__(self, bus_of_adapters: CanBus) -> None:
         self.heard: list[CanFrame] = []
-        self._bus = can_adapters_bus
+        self._bus = bus_of_adapters
         self._listener = self.heard.append
-        can_adapters_bus.join(self._listener)
+        bus_of_adapters.join(self._listener)
 
     def send(self, frame: CanFrame) -> None:
         """To all others."""
@@ -319,16 +319,16 @@ class Member:
 
 
 @pytest.fixture
-def can_adapters_bus() -> CanBus:
+def bus_of_adapters() -> CanBus:
     """A bus without members."""
     return CanBus()
 
 
 @pytest.fixture
-async def server(can_adapters_bus: CanBus, coarse_rig: Rig) -> AsyncIterator[TcpEnd]:
+async def server(bus_of_adapters: CanBus, coarse_rig: Rig) -> AsyncIterator[TcpEnd]:
     """A socketcand server on a free port."""
     device = make_bench(coarse_rig)[1]["main"]
-    async with TcpEnd(device, partial(SocketcandClient, can_adapters_bus), faults=Faults()) as end:
+    async with TcpEnd(device, partial(SocketcandClient, bus_of_adapters), faults=Faults()) as end:
         yield end
 
 
@@ -363,9 +363,9 @@ async def talk(server: TcpEnd) -> AsyncIterator[Talk]:
     talk.writer.close()
 
 
-async def test_socketcand_session(can_adapters_bus: CanBus, talk: Talk) -> None:
+async def test_socketcand_session(bus_of_adapters: CanBus, talk: Talk) -> None:
     """Greeting, open, raw mode, frames each way, echo; elements in pieces and in a row."""
-    member = Member(can_adapters_bus)
+    member = Member(bus_of_adapters)
     await talk.open()
     await talk.ask("< send 123 2 1 F")
     await talk.ask("F >< send 7FF 0 >< echo >", "< echo >")
@@ -393,10 +393,10 @@ async def test_socketcand_session(can_adapters_bus: CanBus, talk: Talk) -> None:
     ],
 )
 async def test_socketcand_ignores_malformed_frames(
-    can_adapters_bus: CanBus, talk: Talk, nonsense: str
+    bus_of_adapters: CanBus, talk: Talk, nonsense: str
 ) -> None:
     """Whatever is wrong with an element, no frame comes of it, and the next is understood."""
-    member = Member(can_adapters_bus)
+    member = Member(bus_of_adapters)
     await talk.open()
     await talk.ask(nonsense + " >")
     async with asyncio.timeout(TIMEOUT):
@@ -413,16 +413,16 @@ async def test_socketcand_refuses_another_bus(talk: Talk) -> None:
 
 
 @pytest.fixture
-async def adapter(can_adapters_bus: CanBus, coarse_rig: Rig) -> AsyncIterator[TerminalEnd]:
+async def adapter(bus_of_adapters: CanBus, coarse_rig: Rig) -> AsyncIterator[TerminalEnd]:
     """A serial adapter."""
     device = make_bench(coarse_rig)[1]["main"]
-    async with TerminalEnd(device, partial(SlcanAdapter, can_adapters_bus), faults=Faults()) as end:
+    async with TerminalEnd(device, partial(SlcanAdapter, bus_of_adapters), faults=Faults()) as end:
         yield end
 
 
-async def test_slcan_serves_python_can(can_adapters_bus: CanBus, adapter: TerminalEnd) -> None:
+async def test_slcan_serves_python_can(bus_of_adapters: CanBus, adapter: TerminalEnd) -> None:
     """Its own interface sets the bit rate, opens the channel, sends and hears."""
-    member = Member(can_adapters_bus)
+    member = Member(bus_of_adapters)
 
     def connect() -> can.BusABC:
         return can.Bus(
@@ -472,7 +472,7 @@ def answers(adapter_bus: CanBus, text: bytes) -> tuple[bytes, list[CanFrame]]:
     ],
 )
 def test_slcan_replies_like_lawicel(
-    can_adapters_bus: CanBus, text: bytes, written: bytes, sent: list[CanFrame]
+    bus_of_adapters: CanBus, text: bytes, written: bytes, sent: list[CanFrame]
 ) -> None:
     """CR for what was done, BELL for what makes no sense, z and Z for frames that were sent."""
-    assert answers(can_adapters_bus, text) == (written, sent)
+    assert answers(bus_of_adapters, text) == (written, sent)

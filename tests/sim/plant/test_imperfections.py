@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 from benchmarks.direct_plate import direct_acceleration
 from drivers.playing import AmplifierTone, Playback, Voice, VoiceTransition
 from drivers.protocol.sets import Command, Envelope, LayerSet
-from firmware_machine import bench_driving_arm, keep_alive, play
+from firmware_machine import arm_bench, keep_alive, play
 from model.answer.answer import Layer
 from model.answer.stimulus import Placement, Stimulus, together
 from model.arrays import FloatArray
@@ -40,9 +40,9 @@ from plates import FINGERTIP, lock_in
 from plates import motion_of as sampled
 from sim.amplifier.readings import StraightClock
 from sim.bench.bench import Bench
-from sim.plant.excited_plate import PlatePlayback as ExcitedPlatePlayback
+from sim.plant.excited_plate import PlatePlayback as TonePlayback
 from sim.plant.excited_plate import Vibration
-from sim.plant.excited_plate import play as excited_plate_play
+from sim.plant.excited_plate import play as play_excitation
 from sim.plant.fingers import FingerRecord, Fingers, measure_vibration
 from sim.plant.imperfections import (
     ChannelErrors,
@@ -80,7 +80,7 @@ def played(
     bench = Bench(rig, now=0.0, imperfections=imperfections)
     bench.place_fingers({"a": AT}, now=0.0)
     for name, wanted in commands.items():
-        bench_driving_arm(bench, 2.0, now=0.0, name=name)
+        arm_bench(bench, 2.0, now=0.0, name=name)
         play(bench, *wanted, now=0.01, name=name, ramp=0.02)
     if stop is not None:
         for name in commands:
@@ -148,7 +148,7 @@ def test_imperfections_latency_keeps_the_order_of_commands(two_amplifiers: Rig) 
             two_amplifiers, now=0.0, imperfections=Imperfections(delays={"left": latency})
         )
         bench.place_fingers({"a": AT}, now=0.0)
-        bench_driving_arm(bench, 2.0, now=0.0, name="left")
+        arm_bench(bench, 2.0, now=0.0, name="left")
         for token, (frequency, now) in enumerate([(110.0, 0.1), (170.0, 0.12)], start=1):
             play(bench, AmplifierTone(0, frequency, 0.5), now=now, name="left", token=token)
         bench.advance(0.4)
@@ -448,7 +448,7 @@ def test_playback_steady_measures_agree_with_the_frequency_domain(
     """Level and contrast by a direct solve, within 0.1 dB, fingers that load the plate or not."""
     rig = replace(coarse_rig, fingertip=fingertip)
     fingers = replace(FINGERS, loads=pressed)
-    played = excited_plate_play(
+    played = play_excitation(
         rig, reduced, [Layer(EXCITATION)], together(fingers, Stimulus()), duration=None
     )
     tips = [fingertip.scaled(each) for each in pressed or (1, 1)] if fingertip else []
@@ -479,12 +479,12 @@ def test_playback_measures_of_several_targets() -> None:
     quiet.accelerations[:1000] *= 10.0  # louder while it starts
     at_targets = record(3.0, 5.0), record(2.0, 2.0)
     vibration = Vibration((100.0,), (0, 1), (*at_targets, quiet))
-    played = ExcitedPlatePlayback((vibration,), settled=0.1)
+    played = TonePlayback((vibration,), settled=0.1)
     assert played.contrast_db == pytest.approx(20 * math.log10(2 / 0.2), abs=1e-6)
     assert played.transient_contrast_db == pytest.approx(20 * math.log10(1.0 / 1.0), abs=0.01)
     assert played.quiet_level_db_sl is not None
     assert played.level_db_sl - played.quiet_level_db_sl == pytest.approx(20.0, abs=1e-6)
-    alone = ExcitedPlatePlayback((Vibration((100.0,), (0,), at_targets[:1]),), settled=0.1)
+    alone = TonePlayback((Vibration((100.0,), (0,), at_targets[:1]),), settled=0.1)
     assert (alone.contrast_db, alone.transient_contrast_db, alone.quiet_level_db_sl) == (None,) * 3
 
 
@@ -497,7 +497,7 @@ def test_playback_with_an_onset_envelope(coarse_rig: Rig, reduced: ReducedPlate)
     }
     rig = replace(coarse_rig, fingertip=None)
     layer = Layer(excitation, onset=onset)
-    played = excited_plate_play(rig, reduced, [layer], together(FINGERS, Stimulus()), duration=None)
+    played = play_excitation(rig, reduced, [layer], together(FINGERS, Stimulus()), duration=None)
     assert played.settled == pytest.approx(0.015)
     transients = Transients(plate_in_time(reduced, coarse_rig.eras))
     for record in (*played.targets, *played.quiet):
@@ -522,7 +522,7 @@ def test_playback_refuses_invalid_input(
 ) -> None:
     """Times in which nothing settles or that fill the memory, and fingers beside the plate."""
     with pytest.raises(InputError, match=says):
-        excited_plate_play(
+        play_excitation(
             coarse_rig,
             reduced,
             [Layer(EXCITATION)],
@@ -536,6 +536,6 @@ def test_playback_reads_steady_measures_at_the_end() -> None:
     times = np.arange(10_000) / 10_000.0
     tone = np.where(times < 0.75, 10.0, 1.0) * np.sin(2 * np.pi * 100.0 * times)
     record = FingerRecord(np.array([[0.1, 0.1]]), np.ones(1), times, tone[:, None])
-    playback = ExcitedPlatePlayback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
+    playback = TonePlayback((Vibration((100.0,), (0,), (record,)),), settled=0.04)
     expected = -20 * np.log10(detection_threshold(np.array([100.0]))[0])
     assert playback.level_db_sl == pytest.approx(expected, abs=0.01)

@@ -30,7 +30,7 @@ from model.structure.plate import Material, Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
 from model.transients.shaping import ONSET_WINDOW
-from plates import BASES as PLATES_BASES
+from plates import BASES as MOVED_BASES
 from plates import (
     FINGERTIP,
     Base,
@@ -42,7 +42,7 @@ from plates import (
     resting,
     shaped_base,
 )
-from plates import STROKE as PLATES_STROKE
+from plates import STROKE as BASE_STROKE
 from set_table import only
 from sim.plant.excited_plate import play
 from sim.plant.plant import Plant, SampledPlant
@@ -320,7 +320,7 @@ def test_bases_given_as_samples_move_the_plate_as_their_formulas(
     assert_allclose(found, expected, rtol=0, atol=0.01 * np.abs(expected).max())
 
 
-EXCITERS_RATE = 10_000.0
+COARSE_RATE = 10_000.0
 AT = np.array([[0.11, 0.09]])
 
 
@@ -335,7 +335,7 @@ def settled(plant: Plant, until: float, frequency: float) -> complex:
     """Amplitude at a point in the last fifth of a second up to a time."""
     plant.skip(until - 0.2)
     shapes = plant.reduced.at(AT)
-    times, felt = plant.advance(until, sample_rate=EXCITERS_RATE, shapes=shapes)
+    times, felt = plant.advance(until, sample_rate=COARSE_RATE, shapes=shapes)
     return complex(lock_in(times, felt, frequency)[0])
 
 
@@ -498,7 +498,7 @@ def whole_plate(plate: Plate, mesh: Mesh, eras: Sequence[Era]) -> WholePlate:
     return WholePlate(matrices, tuple(eras), M, C, K, hold)
 
 
-PLANT_AGAINST_THE_WHOLE_PLATE_RATE = 100_000.0
+FINE_RATE = 100_000.0
 FIRST, SECOND, MOVED = (0.11, 0.07), (0.25, 0.15), (0.19, 0.12)
 COMING_AND_GOING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
     (0.0312, resting(FIRST)),
@@ -510,7 +510,7 @@ COMING_AND_GOING: list[tuple[float, Mapping[str, FingertipLoad]]] = [
 
 
 @pytest.fixture(scope="module")
-def plant_against_the_whole_plate_rig() -> Rig:
+def whole_rig() -> Rig:
     """The paper's plate on a mesh for a stepping solver; no two ERAs damp alike."""
     coarse = make_paper_rig(8, 6)
     unlike = zip(coarse.eras, (0.5, 3.5, 10.0, 20.0), (0.0, 0.005, 0.01, 0.02), strict=True)
@@ -518,22 +518,22 @@ def plant_against_the_whole_plate_rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def whole(plant_against_the_whole_plate_rig: Rig) -> WholePlate:
+def whole(whole_rig: Rig) -> WholePlate:
     """All its degrees of freedom."""
     return whole_plate(
-        plant_against_the_whole_plate_rig.plate,
-        plant_against_the_whole_plate_rig.mesh,
-        plant_against_the_whole_plate_rig.eras,
+        whole_rig.plate,
+        whole_rig.mesh,
+        whole_rig.eras,
     )
 
 
 @pytest.fixture(scope="module")
-def plant_against_the_whole_plate_reduced(plant_against_the_whole_plate_rig: Rig) -> ReducedPlate:
+def whole_reduced(whole_rig: Rig) -> ReducedPlate:
     """A few dozen coordinates of it, as the bench takes them."""
     return reduce_plate(
-        plant_against_the_whole_plate_rig.plate,
-        plant_against_the_whole_plate_rig.mesh,
-        footprints_of(plant_against_the_whole_plate_rig.eras),
+        whole_rig.plate,
+        whole_rig.mesh,
+        footprints_of(whole_rig.eras),
     )
 
 
@@ -545,35 +545,29 @@ def set_bases(plant: Plant, bases: Sequence[Base]) -> None:
 
 def felt(samples: FloatArray) -> FloatArray:
     """What lies below 1 kHz, all that a finger can feel and more, without delay."""
-    return np.asarray(
-        sosfiltfilt(
-            butter(6, 1000.0, fs=PLANT_AGAINST_THE_WHOLE_PLATE_RATE, output="sos"), samples, axis=0
-        )
-    )
+    return np.asarray(sosfiltfilt(butter(6, 1000.0, fs=FINE_RATE, output="sos"), samples, axis=0))
 
 
 def test_plant_with_changing_contacts_agrees_with_newmark(
-    plant_against_the_whole_plate_rig: Rig,
+    whole_rig: Rig,
     whole: WholePlate,
-    plant_against_the_whole_plate_reduced: ReducedPlate,
+    whole_reduced: ReducedPlate,
 ) -> None:
     """Ramps, an envelope and two fingers: displacement, velocity and what can be felt within 1 %.
 
     Over the plate, and under the fingers, in every stretch between two changes.
     """
-    plant = Plant(plant_against_the_whole_plate_reduced, plant_against_the_whole_plate_rig.eras)
-    set_bases(plant, PLATES_BASES)
-    points = np.vstack([plant_against_the_whole_plate_rig.mesh.nodes, [FIRST, SECOND, MOVED]])
+    plant = Plant(whole_reduced, whole_rig.eras)
+    set_bases(plant, MOVED_BASES)
+    points = np.vstack([whole_rig.mesh.nodes, [FIRST, SECOND, MOVED]])
     pieces, states = [], []
     for until, contacts in [*COMING_AND_GOING, (0.12, None)]:
         shapes = plant.reduced.at(points)
-        pieces.append(
-            plant.advance(until, sample_rate=PLANT_AGAINST_THE_WHOLE_PLATE_RATE, shapes=shapes)[1]
-        )
+        pieces.append(plant.advance(until, sample_rate=FINE_RATE, shapes=shapes)[1])
         states.append([shapes @ part[: shapes.shape[1]] for part in plant.state])
         if contacts is not None:
             plant.set_contacts(contacts)
-    motions = [base.motion for base in PLATES_BASES]
+    motions = [base.motion for base in MOVED_BASES]
     stepped = whole.stepped(motions, COMING_AND_GOING, until=0.12, step=1e-5, every=1)
     touch = whole.matrices.deflection_at(points)
     u, v, a = ((touch @ part.T).T for part in stepped)
@@ -583,7 +577,7 @@ def test_plant_with_changing_contacts_agrees_with_newmark(
     for finger in (-3, -2, -1):
         assert apart(found[:, finger], expected[:, finger]) < 0.01
     for (until, _), state in zip([*COMING_AND_GOING, (0.12, None)], states, strict=True):
-        row = round(until * PLANT_AGAINST_THE_WHOLE_PLATE_RATE) - 1
+        row = round(until * FINE_RATE) - 1
         assert apart(state[0], u[row]) < 0.01
         assert apart(state[1], v[row]) < 0.01
 
@@ -595,7 +589,7 @@ def phasors(
     times, samples = plant.advance(
         since + 0.2, sample_rate=10_000.0, shapes=plant.reduced.at(points)
     )
-    return lock_in(times, samples, frequency) / PLATES_STROKE
+    return lock_in(times, samples, frequency) / BASE_STROKE
 
 
 def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
@@ -614,7 +608,7 @@ def test_plant_viscous_equivalent_agrees_with_the_loss_factor() -> None:
     off = []
     for row, frequency in enumerate(frequencies):
         begin = plant.time
-        plant.set_input(0, [Term(begin, np.inf, 2 * np.pi * frequency, PLATES_STROKE)])
+        plant.set_input(0, [Term(begin, np.inf, 2 * np.pi * frequency, BASE_STROKE)])
         plant.skip(begin + 20.0)
         found = phasors(plant, fine.mesh.nodes, 0, float(frequency), begin + 20.0)
         off.append(apart(np.abs(found), np.abs(direct[row, 0]) / eras[0].stroke))

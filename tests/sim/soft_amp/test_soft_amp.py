@@ -48,8 +48,8 @@ from sim.soft_amp.settings import (
     SoftAmplifierSettings,
     terminal_place,
 )
-from sound_cards import BLOCK as SOUND_CARDS_BLOCK
-from sound_cards import RATE as SOUND_CARDS_RATE
+from sound_cards import BLOCK as CARD_BLOCK
+from sound_cards import RATE as CARD_RATE
 from sound_cards import SoftAmp, capture_on, host, jack_server
 from steady_host import WATCHDOG, linear_amplifier
 from typed_page import ERA
@@ -77,7 +77,7 @@ async def test_amplifier_waits_for_its_server_and_plays_by_the_clock_of_that(
     await asyncio.sleep(1.5)  # two more attempts
     with jack_server(name, rate=RATE):
         capture = capture_on(name, "card", CHANNELS)
-        wait_for(lambda: f"{RATE} Hz, blocks of {SOUND_CARDS_BLOCK} frames" in amp.log)
+        wait_for(lambda: f"{RATE} Hz, blocks of {CARD_BLOCK} frames" in amp.log)
         assert amp.log.count("no server is running") == 1
         assert (await amplifier.read_status())["state"] == STATES["FAULT"]
         assert (await amplifier.clear())["state"] == STATES["SWITCH_ON_DISABLED"]
@@ -104,7 +104,7 @@ def test_devices_are_listed_with_outputs_inputs_rate_and_block() -> None:
         found = _listed(server.environment)["devices"]
         capture.close()
     by_name = {each["device"]: each for each in found if each["host"] == "JACK"}
-    common = {"host": "JACK", "rate_hz": RATE, "block_frames": SOUND_CARDS_BLOCK}
+    common = {"host": "JACK", "rate_hz": RATE, "block_frames": CARD_BLOCK}
     assert by_name["jack"] == common | {
         "device": "jack", "name": "hardware", "outputs": 4, "inputs": 3,
     }  # fmt: skip
@@ -382,7 +382,7 @@ def test_stream_that_does_not_start_is_closed(monkeypatch: pytest.MonkeyPatch) -
     assert _Busy.is_closed
 
 
-SOFT_AMP_SOUND_CHANNELS = 3
+PLAYED_CHANNELS = 3
 SETTINGS = SoftAmplifierSettings(
     device="jack:card", channels=2, protocol=Protocol.SERIAL, serial_number="S"
 )
@@ -394,7 +394,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Capture, d
     """A client that captures, and the environment in which its server is found."""
     name = f"era{os.getpid()}"
     with jack_server(name) as server:
-        capture = capture_on(name, "card", SOFT_AMP_SOUND_CHANNELS)
+        capture = capture_on(name, "card", PLAYED_CHANNELS)
         yield capture, server.environment
         capture.close()
 
@@ -409,7 +409,7 @@ def amp(
         "--device",
         "jack:card",
         "--channels",
-        str(SOFT_AMP_SOUND_CHANNELS),
+        str(PLAYED_CHANNELS),
         "--link",
         str(folder / "amp"),
     )
@@ -423,11 +423,11 @@ def amp(
 def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], amp: SoftAmp) -> None:
     """Level x sin(2 pi f t + phase) within 0.1 dB, and within 0.1 degrees between channels."""
     capture, _ = sound
-    with host(amp.url, SOFT_AMP_SOUND_CHANNELS) as playing:
+    with host(amp.url, PLAYED_CHANNELS) as playing:
         wait_for(capture.is_sounding)
         _wait_for_samples(capture, 0.3)  # 0.2 s of soft start and ramp
-        samples = capture.samples(SOUND_CARDS_RATE // 10)
-        turning = np.exp(-2j * np.pi * 1000 * np.arange(len(samples)) / SOUND_CARDS_RATE)
+        samples = capture.samples(CARD_RATE // 10)
+        turning = np.exp(-2j * np.pi * 1000 * np.arange(len(samples)) / CARD_RATE)
         amplitudes = 2 * (samples * turning[:, None]).mean(axis=0)
         np.testing.assert_allclose(20 * np.log10(np.abs(amplitudes) / 0.5), 0, atol=0.1)
         steps = np.degrees(np.angle(amplitudes[1:] / amplitudes[:-1]))
@@ -435,7 +435,7 @@ def test_samples_are_those_of_the_page(sound: tuple[Capture, dict[str, str]], am
         playing.kill()
         killed = capture.position
         wait_for(lambda: not capture.is_sounding())
-        assert capture.end_of_sound() - killed < SOUND_CARDS_RATE * (WATCHDOG + SILENCE)
+        assert capture.end_of_sound() - killed < CARD_RATE * (WATCHDOG + SILENCE)
 
 
 @pytest.mark.real_time
@@ -446,13 +446,13 @@ async def test_killed_or_stopped_player_is_silent_and_then_in_fault(
 ) -> None:
     """No sound once it is gone; its line stays, reports the fault, and is disarmed once cleared."""
     capture, _ = sound
-    with host(amp.url, SOFT_AMP_SOUND_CHANNELS):
+    with host(amp.url, PLAYED_CHANNELS):
         wait_for(capture.is_sounding)
         player, reopened = amp.player, amp.log.count("open again")
         os.kill(player, how)
         done = capture.position
         wait_for(lambda: amp.log.count("open again") > reopened)
-        assert capture.end_of_sound() - done < SOUND_CARDS_RATE * SILENCE
+        assert capture.end_of_sound() - done < CARD_RATE * SILENCE
         assert amp.player != player
     lines = Lines()
     amplifier = await linear_amplifier(lines, amp.url)
@@ -505,9 +505,9 @@ async def test_silence_is_an_open_output_of_zeros(
 @pytest.mark.parametrize(
     ("changed", "key"),
     [
-        ({"channels": SOFT_AMP_SOUND_CHANNELS + 1}, "--device"),
+        ({"channels": PLAYED_CHANNELS + 1}, "--device"),
         ({"rate": 96_000}, "--rate"),
-        ({"block": 2 * SOUND_CARDS_BLOCK}, "--block"),
+        ({"block": 2 * CARD_BLOCK}, "--block"),
         ({"device": "jack:nothing"}, "--device"),
         ({"device": "jack:crad"}, "did you mean jack:card"),
     ],
@@ -540,18 +540,18 @@ def test_all_of_it_killed_is_silent(
         wait_for(capture.is_sounding)
         player = Path(f"/proc/{soft_amp.player}")
         _wait_for_samples(capture, 1.2)  # 0.2 s of soft start and ramp
-        forces = 2 * capture.samples(SOUND_CARDS_RATE) ** 2 - 1  # u = sqrt((1 + force) / 2)
-        windows = forces.reshape(20, SOUND_CARDS_RATE // 20, 2)
-        levels = np.abs(np.fft.rfft(windows, axis=1)[:, 1000 // 20]) / (SOUND_CARDS_RATE // 40)
+        forces = 2 * capture.samples(CARD_RATE) ** 2 - 1  # u = sqrt((1 + force) / 2)
+        windows = forces.reshape(20, CARD_RATE // 20, 2)
+        levels = np.abs(np.fft.rfft(windows, axis=1)[:, 1000 // 20]) / (CARD_RATE // 40)
         np.testing.assert_allclose(np.median(levels, axis=0), 0.5, rtol=0.011)
         soft_amp.process.kill()
         killed = capture.position
         wait_for(lambda: not player.exists())
-        assert capture.end_of_sound() - killed < SOUND_CARDS_RATE * SILENCE
+        assert capture.end_of_sound() - killed < CARD_RATE * SILENCE
     soft_amp.end()
     capture.close()
 
 
 def _wait_for_samples(capture: Capture, seconds: float) -> None:
-    end = capture.position + SOUND_CARDS_RATE * seconds
+    end = capture.position + CARD_RATE * seconds
     wait_for(lambda: capture.position > end)

@@ -48,7 +48,7 @@ from model.transients.shaping import SAMPLE_RATE, Transients
 from plates import smooth_rig
 from set_table import phased, wants
 from several_fingers import playable
-from several_fingers import table as several_fingers_table
+from several_fingers import table as paper_table
 
 SIZE = 0.03
 WEST, EAST, NEXT, NORTH = (0.03, 0.06), (0.2448, 0.06), (0.075, 0.06), (0.1374, 0.18)
@@ -76,7 +76,7 @@ def promised_by_the_loop(contacts: Sequence[Contact], intent: HapticIntent) -> l
 
     async def predicted() -> tuple[Prediction, ...]:
         arrived = asyncio.Event()
-        selector = Selector(Chooser(several_fingers_table()), arrived=arrived.set)
+        selector = Selector(Chooser(paper_table()), arrived=arrived.set)
         selector.select(contacts, intent, playable())
         if selector.is_choosing:
             await arrived.wait()
@@ -91,7 +91,7 @@ def test_mirrored_regions_are_promised_the_same() -> None:
     """The plate and its ERAs are symmetric: east and west of north alike, but for the draws."""
     found = check_together(
         layout(region("west", WEST), region("east", EAST), region("north", NORTH)),
-        several_fingers_table(),
+        paper_table(),
     )
     worst = {each.regions: each.worst_db for each in found}
     assert len(worst) == 4
@@ -103,14 +103,14 @@ def test_mirrored_regions_are_promised_the_same() -> None:
 def test_places_are_the_worst_of_their_regions() -> None:
     """Within both, and promised less than the centres, if anything; nearer regions less."""
     west, near, east = region("west", WEST), region("near", NEXT), region("east", EAST)
-    found = check_together(layout(west, near, east), several_fingers_table())
+    found = check_together(layout(west, near, east), paper_table())
     by_name = {each.regions: each for each in found}
     for pair, each in by_name.items():
         shapes = [one.shape for one in (west, near, east) if one.name in pair]
         assert all(shape.contains(*at) for shape, at in zip(shapes, each.at, strict=True))
         if len(pair) == 2:
             fingers = [wants(shape.centre, level_db_sl=14.0) for shape in shapes]
-            centred = phased(several_fingers_table(), fingers, min_contrast_db=-math.inf)
+            centred = phased(paper_table(), fingers, min_contrast_db=-math.inf)
             assert centred.promised_worst_db is not None
             assert each.worst_db <= centred.promised_worst_db
             assert each.worst_db <= min(each.contrasts)
@@ -130,12 +130,12 @@ def test_pairs_that_are_felt_as_one_are_named() -> None:
 def test_verdicts_follow_the_rule_and_what_regions_say() -> None:
     """Below 12 dB mixed; where a region requires its own or is protected another is held back."""
     near = region("near", (0.12, 0.06))
-    (mixed,) = check_together(layout(region("west", WEST), near), several_fingers_table())
+    (mixed,) = check_together(layout(region("west", WEST), near), paper_table())
     assert 6 < mixed.worst_db < 12
     assert "mixed" in mixed.verdicts
     for said in (replace(near, is_own=True), replace(near, is_protected=True)):
         (found,) = check_together(
-            layout(region("west", WEST), replace(said, priority=1)), several_fingers_table()
+            layout(region("west", WEST), replace(said, priority=1)), paper_table()
         )
         assert found.verdicts[0] == "held back"
         assert (found.at, found.worst_db) == (mixed.at, mixed.worst_db)
@@ -148,9 +148,7 @@ def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effec
     """Side bands and short effects leak more than a steady tone, by what a selection says."""
     steady = layout(region("west", WEST), region("north", NORTH))
     changed = replace(steady, effects={**steady.effects, "west": effect})
-    (before,), (found,) = (
-        check_together(each, several_fingers_table()) for each in (steady, changed)
-    )
+    (before,), (found,) = (check_together(each, paper_table()) for each in (steady, changed))
     assert found.at == before.at
     assert found.worst_db < before.worst_db - 0.2
     contacts, player = fingers_at(found.at), EffectPlayer(changed)
@@ -162,7 +160,7 @@ def test_what_comes_and_goes_is_promised_as_the_daemon_promises_it(effect: Effec
 def test_matrix_has_two_below_and_three_above_the_diagonal() -> None:
     """Of three above it the least with any third."""
     regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
-    found = check_together(layout(*regions), several_fingers_table())
+    found = check_together(layout(*regions), paper_table())
     names, promised = matrix_of(found)
     assert names == [*"abcd"]
     assert np.isnan(np.diag(promised)).all()
@@ -182,7 +180,7 @@ def test_of_many_regions_the_nearest_are_checked(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(layout_picture, "MAX_TRIPLES", 0)
     regions = [region(name, at) for name, at in zip("abcd", (WEST, EAST, NEXT, NORTH), strict=True)]
     silent = Region("silent", Rectangle(0.03, 0.10, SIZE, SIZE))
-    (found,) = check_together(layout(*regions, silent), several_fingers_table())
+    (found,) = check_together(layout(*regions, silent), paper_table())
     assert found.regions == ("a", "c")
 
 

@@ -47,7 +47,7 @@ def neighbours_of(kind: str) -> dict[int, Neighbour]:
     return {each: Neighbour(f"at {each}") for each in (NEXT, HIGHEST.get(kind, 247))}
 
 
-REACHING_OTHERS = [
+OTHER_ADDRESSES = [
     "damaged_frames",
     "doubled_frames",
     "broadcasts",
@@ -62,7 +62,7 @@ REACHING_OTHERS = [
 """Checks that send what others hear, or listen to what all may say; and one that is skipped."""
 
 
-@pytest.mark.parametrize("names", shortly([[], REACHING_OTHERS], [REACHING_OTHERS]))
+@pytest.mark.parametrize("names", shortly([[], OTHER_ADDRESSES], [OTHER_ADDRESSES]))
 @pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
 def test_conforming_amplifier_passes_on_a_shared_line(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch

@@ -190,7 +190,7 @@ def test_what_is_no_exciter_is_refused() -> None:
 
 
 RATE = 48_000
-IMPEDANCE_RUN_WEIGHT = 1e3 * (ExciterCircuit.COIL + ExciterCircuit.MAGNET)  # g
+EXCITER_GRAMS = 1e3 * (ExciterCircuit.COIL + ExciterCircuit.MAGNET)  # g
 PARTS = {
     "resistance": ExciterCircuit.RESISTANCE,
     "force_factor": ExciterCircuit.FORCE_FACTOR,
@@ -243,7 +243,7 @@ def test_parts_come_from_two_runs_and_a_scale(
     circuit = ExciterCircuit(is_glued=True, rate=RATE)
     status, told = measured(
         monkeypatch, MemoryCard(circuit, [0], [1]), "-o", glued, "--free", free, "--weight",
-        IMPEDANCE_RUN_WEIGHT, "--inputs", "1", "--series-error", "0.1", typed="\n\n",
+        EXCITER_GRAMS, "--inputs", "1", "--series-error", "0.1", typed="\n\n",
     )  # fmt: skip
     assert status == 0
     _check(json.loads(told))
@@ -321,9 +321,7 @@ def test_parts_are_found_through_a_real_server(
                 circuit = ExciterCircuit(is_glued=is_glued, rate=RATE)
                 plate = JackPlate(client, circuit)  # type: ignore[arg-type]  # called by JACK
                 plate.start()
-                more = (
-                    ("--free", "0.csv", "--weight", str(IMPEDANCE_RUN_WEIGHT)) if is_glued else ()
-                )
+                more = ("--free", "0.csv", "--weight", str(EXCITER_GRAMS)) if is_glued else ()
                 done = subprocess.run(
                     [ERA, "measure", "--impedance", "--device", "jack:desk", "--json", "-o",
                      f"{is_glued:d}.csv", "--series-error", "0.1", "--input-error", "0.1", *more],

@@ -186,7 +186,7 @@ def test_said_channels_are_written(
         assert answer["missing"] == ["NE"]
 
 
-STEPPED_FILE_RATE = 12_000
+FILE_RATE = 12_000
 TONES = (61.0, 151.5, 311.0)
 PLACES = ((0.03, 0.05), (0.20, 0.11))
 FIXED = tuple(WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(PLACES, start=1))
@@ -201,7 +201,7 @@ def ratio(tone: int, era: int, sensor: int) -> complex:
 def played(era: int, *, held: float) -> list[tuple[FloatArray, list[FloatArray]]]:
     """Reference and sensors of each tone of an ERA; sensors settle with a tenth of its time."""
     found = []
-    times = np.arange(round(held * STEPPED_FILE_RATE)) / STEPPED_FILE_RATE
+    times = np.arange(round(held * FILE_RATE)) / FILE_RATE
     for number, frequency in enumerate(TONES):
         angle = 2 * np.pi * frequency * times
         rise = 1 - np.exp(-times / (0.1 * held))
@@ -227,16 +227,14 @@ def recording(
     pieces = []
     for era in eras:
         for reference, heard in played(era, held=held):
-            piece = np.zeros(
-                (len(reference) + round(gap * STEPPED_FILE_RATE), len(sensors) + references)
-            )
+            piece = np.zeros((len(reference) + round(gap * FILE_RATE), len(sensors) + references))
             for column, sensor in enumerate(sensors):
                 piece[: len(reference), column] = heard[sensor]
             piece[: len(reference), len(sensors) + (era if references > 1 else 0)] = reference
             pieces.append(piece)
-    samples = np.concatenate([np.zeros((STEPPED_FILE_RATE // 3, pieces[0].shape[1])), *pieces])
+    samples = np.concatenate([np.zeros((FILE_RATE // 3, pieces[0].shape[1])), *pieces])
     samples += 1e-3 * rng.standard_normal(samples.shape)
-    wavfile.write(path, STEPPED_FILE_RATE, (32767 * samples).astype(np.int16))
+    wavfile.write(path, FILE_RATE, (32767 * samples).astype(np.int16))
 
 
 def expected(rig: Rig, sensor: int) -> ComplexArray:
@@ -389,7 +387,7 @@ def test_tones_that_cannot_be_told_are_refused_with_their_time(rig: Rig, tmp_pat
 
 def sweep() -> FloatArray:
     """A glide from 60 to 100 Hz in 10 s."""
-    times = np.arange(10 * STEPPED_FILE_RATE) / STEPPED_FILE_RATE
+    times = np.arange(10 * FILE_RATE) / FILE_RATE
     return np.asarray(0.4 * np.sin(2 * np.pi * (60 + 2 * times) * times))
 
 
@@ -445,7 +443,7 @@ def test_level_beyond_any_number_is_refused(rig: Rig, tmp_path: Path) -> None:
     ("rate", "channels", "words"),
     [
         (
-            STEPPED_FILE_RATE,
+            FILE_RATE,
             1,
             "channels must be 2 of sensors and 1 or 4 references behind them, got 1",
         ),
@@ -457,7 +455,7 @@ def test_recording_of_other_inputs_or_rates_is_refused(
     rig: Rig, tmp_path: Path, rate: int, channels: int, words: str
 ) -> None:
     """Fewer channels than sensors, a second of one sample, and a rate that no converter has."""
-    path, written = tmp_path / "all.wav", STEPPED_FILE_RATE
+    path, written = tmp_path / "all.wav", FILE_RATE
     noise = np.random.default_rng(0).uniform(-0.5, 0.5, (written, channels)).astype(np.float32)
     wavfile.write(path, written, noise)
     content = path.read_bytes().replace(

@@ -93,11 +93,11 @@ def test_what_only_a_sound_card_does_is_refused(option: tuple[str, ...], tmp_pat
 RATE = 8_000.0
 DELAY = 73
 LEVEL = 0.3
-MEASURING_PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
+SENSOR_PLACES = ((0.03, 0.05), (0.20, 0.11), (0.29, 0.20))
 SENSORS = tuple(
-    WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(MEASURING_PLACES, start=1)
+    WiredSensor(f"P{n}", x, y, n, 2e-3) for n, (x, y) in enumerate(SENSOR_PLACES, start=1)
 )
-MEASURING_FREQUENCIES = np.array([61.0, 151.0, 233.0, 311.0])
+PLAYED_HZ = np.array([61.0, 151.0, 233.0, 311.0])
 
 
 def card(truth: Truth, *, noise: float = 0.0, is_shared: bool = False, **wires: object) -> DeskCard:
@@ -107,7 +107,7 @@ def card(truth: Truth, *, noise: float = 0.0, is_shared: bool = False, **wires: 
     return DeskCard(plate, rate=RATE, **wires)  # type: ignore[arg-type]
 
 
-def sines(desk: Desk, frequencies: np.ndarray = MEASURING_FREQUENCIES) -> Multisine:
+def sines(desk: Desk, frequencies: np.ndarray = PLAYED_HZ) -> Multisine:
     """Multisines of all ERAs and of the loop-back."""
     return Multisine(frequencies, len(desk.eras) + 1, RATE, LEVEL)
 
@@ -162,9 +162,9 @@ def test_measured_responses_are_those_of_the_plate(
     What is left is the ringing of the start, 1 s before.
     """
     found = undisturbed
-    model = DeskModel(truth, np.array(MEASURING_PLACES)).under()
+    model = DeskModel(truth, np.array(SENSOR_PLACES)).under()
     strokes = np.array([era.stroke for era in rig.eras])
-    exact = model.response(MEASURING_FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
+    exact = model.response(PLAYED_HZ).swapaxes(1, 2) / strokes[:, None]
     loud = np.abs(exact) > 0.05 * np.abs(exact).max(axis=(1, 2), keepdims=True)
     # The filter of inputs at 8 kHz has a ripple over this band, which the loop-back takes out too.
     np.testing.assert_allclose(found.responses.values[loud], exact[loud], rtol=0.02)
@@ -181,7 +181,7 @@ def test_a_card_without_an_output_to_spare_measures_by_a_y_cable(
     Inputs exchanged, and another ERA's output in the cable, are reported with their places.
     """
     desk = Desk(rig, SENSORS, is_shared=True)
-    sines = Multisine(MEASURING_FREQUENCIES, 4, RATE, LEVEL)
+    sines = Multisine(PLAYED_HZ, 4, RATE, LEVEL)
     sound = card(truth, is_shared=True)
     found = measure_measure(desk, sound, sines)
     difference = found.responses.values - undisturbed.responses.values
@@ -282,7 +282,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
     """One input is changed; its gains say by hand what is connected to it."""
     came = WIRED.copy()
     came[at - 1] = gains
-    each = np.broadcast_to(came, (len(MEASURING_FREQUENCIES), *came.shape)).astype(complex)
+    each = np.broadcast_to(came, (len(PLAYED_HZ), *came.shape)).astype(complex)
     found = ResponseEstimate(each, abs(each), abs(each), np.zeros(4))
     with nullcontext() if cause is None else pytest.raises(InputError, match=cause):
         check_wiring(found, Desk(rig, SENSORS))
@@ -291,7 +291,7 @@ def test_wiring_is_judged_by_the_gains_from_outputs_to_inputs(
 def test_sensors_of_a_single_source_are_no_cables(rig: Rig) -> None:
     """One ERA with the loop-back beside it: all inputs have that output alone."""
     alone = Desk(replace(rig, eras=rig.eras[:1]), SENSORS, is_shared=True)
-    each = np.full((len(MEASURING_FREQUENCIES), 4, 1), 0.4 + 0j)
+    each = np.full((len(PLAYED_HZ), 4, 1), 0.4 + 0j)
     check_wiring(ResponseEstimate(each, abs(each), abs(each), np.zeros(4)), alone)
     each[:, 3] = 1e-5
     with pytest.raises(InputError, match="connect them by a cable"):
@@ -322,8 +322,8 @@ def test_delay_follows_from_the_slope_of_phases() -> None:
     evenly = np.arange(61.0, 500.0, 60.0)
     late = np.exp(-2j * np.pi * evenly * 3.7e-3)
     assert latency(late, evenly) == pytest.approx(3.7e-3)
-    response = 0.4 * np.exp(-2j * np.pi * MEASURING_FREQUENCIES * 3.7e-3)
-    assert latency(response, MEASURING_FREQUENCIES) == pytest.approx(3.7e-3)
+    response = 0.4 * np.exp(-2j * np.pi * PLAYED_HZ * 3.7e-3)
+    assert latency(response, PLAYED_HZ) == pytest.approx(3.7e-3)
     lines = default_frequencies(40, 500)
     drawn = np.exp(2j * np.pi * np.random.default_rng(0).uniform(size=len(lines)))
     with pytest.raises(LinkError, match="loop-back"):

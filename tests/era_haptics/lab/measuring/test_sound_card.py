@@ -282,16 +282,16 @@ def test_rate_that_gives_no_whole_milliseconds_is_refused(monkeypatch: pytest.Mo
         capture.close()
 
 
-DESK_PLATE_RATE = 48_000.0
-DESK_PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
-DESK_PLATE_FREQUENCIES = np.array([61.0, 150.0, 233.0, 410.0])
+PLATE_RATE = 48_000.0
+PLATE_POINTS = np.array([[0.03, 0.05], [0.20, 0.11], [0.29, 0.20]])
+PLATE_HZ = np.array([61.0, 150.0, 233.0, 410.0])
 FINGERS = [(0.1, 0.1), (0.25, 0.06)]
 
 
 @pytest.fixture(scope="module")
 def model(truth: Truth) -> DeskModel:
     """That plate, solved."""
-    return DeskModel(truth, DESK_PLATE_POINTS)
+    return DeskModel(truth, PLATE_POINTS)
 
 
 @pytest.mark.parametrize("places", [[], FINGERS])
@@ -301,14 +301,12 @@ def test_model_agrees_with_the_direct_solution(
     """Without and with fingers; what differs is damping, viscous here and hysteretic there."""
     rig = truth.rig
     fingers = fingertip_loads(rig.fingertip, places)
-    found = model.under(fingers).response(DESK_PLATE_FREQUENCIES).swapaxes(1, 2)
+    found = model.under(fingers).response(PLATE_HZ).swapaxes(1, 2)
     direct = direct_responder(rig.plate, rig.mesh)
-    exact = direct(
-        rig.eras, DESK_PLATE_FREQUENCIES, DESK_PLATE_POINTS, loads=[*rig.masses, *fingers]
-    )
+    exact = direct(rig.eras, PLATE_HZ, PLATE_POINTS, loads=[*rig.masses, *fingers])
     # The actuator by its differential equation: gain w² / (w² - omega² + 2 i zeta w omega).
     for number, actuator in enumerate(truth.actuators):
-        w, omega = 2 * np.pi * actuator.resonance, 2 * np.pi * DESK_PLATE_FREQUENCIES
+        w, omega = 2 * np.pi * actuator.resonance, 2 * np.pi * PLATE_HZ
         moved = actuator.gain * w**2 / (w**2 - omega**2 + 2j * actuator.ratio * w * omega)
         exact[:, number] *= moved[:, None]
     wrong = np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
@@ -322,10 +320,10 @@ def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
     """
     rig, factors, frequency = truth.rig, [0.3, 3.0], 150.0
     sensors = [WiredSensor("P1", 0.03, 0.05, 1, 1e-3)]
-    desk = DeskPlate(truth, sensors, rate=DESK_PLATE_RATE, converters=Converters(), seed=1)
+    desk = DeskPlate(truth, sensors, rate=PLATE_RATE, converters=Converters(), seed=1)
     desk.set_fingers(FINGERS, factors)
     played = np.zeros((48_000, 5))
-    played[:, 1] = np.sin(2 * np.pi * frequency * np.arange(len(played)) / DESK_PLATE_RATE)
+    played[:, 1] = np.sin(2 * np.pi * frequency * np.arange(len(played)) / PLATE_RATE)
     desk.advance(played[:38_400])
     desk.begin_feeling()
     desk.advance(played[38_400:])
@@ -340,19 +338,17 @@ def test_fingers_feel_the_plate_under_them(truth: Truth) -> None:
     places, hertz = points.reshape(-1, 2), np.array([frequency])
     exact = direct(rig.eras, hertz, places, loads=[*rig.masses, *loads])[0, 1]
     exact = exact * truth.actuators[1].response(hertz)
-    times = (38_400 + 16 * np.arange(len(felt))) / DESK_PLATE_RATE
+    times = (38_400 + 16 * np.arange(len(felt))) / PLATE_RATE
     found = phasors(felt.reshape(len(felt), -1), times, frequency)
     assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact)
 
 
 def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> None:
     """The vibration goes on where it was, and settles to that of the plate under fingers."""
-    sensors = [
-        WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(DESK_PLATE_POINTS)
-    ]
+    sensors = [WiredSensor(f"P{n}", x, y, n + 1, 1e-3) for n, (x, y) in enumerate(PLATE_POINTS)]
     quiet = Converters(delay=0, noise=0.0)
-    desk = DeskPlate(truth, sensors, rate=DESK_PLATE_RATE, converters=quiet, seed=1)
-    times = np.arange(48_000) / DESK_PLATE_RATE
+    desk = DeskPlate(truth, sensors, rate=PLATE_RATE, converters=quiet, seed=1)
+    times = np.arange(48_000) / PLATE_RATE
     played = np.zeros((len(times), 5))
     played[:, 0] = np.sin(2 * np.pi * 233 * times)
     before = desk.advance(played[:9600])
@@ -363,9 +359,9 @@ def test_fingers_are_swapped_without_a_jump(truth: Truth, model: DeskModel) -> N
     # A contact mass that joins changes accelerations by a few percent, no more.
     assert steps[46:49].max() < 0.1 * np.abs(joined).max()
     loaded = model.under(fingertip_loads(truth.rig.fingertip, FINGERS))
-    (exact,) = sampled(loaded, rate=DESK_PLATE_RATE).response(np.array([233.0]))
+    (exact,) = sampled(loaded, rate=PLATE_RATE).response(np.array([233.0]))
     found = phasors(after[-9600:, :3], times[-9600:], 233.0)
-    late = quiet.response(np.array([233.0]), rate=DESK_PLATE_RATE)[0]
+    late = quiet.response(np.array([233.0]), rate=PLATE_RATE)[0]
     np.testing.assert_allclose(found / (1e-3 * late), exact[:, 0], rtol=0.01)
 
 
@@ -452,7 +448,7 @@ def test_block_that_is_lost_in_a_repeated_run_is_played_again(rig: Rig, truth: T
 MOVED_SENSOR_RATE, GRAMS = 8_000.0, 5.0
 Places = Mapping[str, tuple[float, float]]
 MOVED_SENSOR_PLACES: Places = {"P1": (0.03, 0.05), "P2": (0.20, 0.11), "P3": (0.29, 0.20)}
-MOVED_SENSOR_FREQUENCIES = np.array([61.0, 141.0, 221.0, 301.0])
+MOVED_HZ = np.array([61.0, 141.0, 221.0, 301.0])
 HEAD = "sensor,x_m,y_m,input,mv_per_m_s2,mass_g\n"
 PLAIN = "sensor,x_m,y_m,input,mv_per_m_s2\n"
 KEPT = "of 3 places are measured, in measured"
@@ -568,9 +564,9 @@ def test_each_place_is_measured_under_the_sensors_mass(rig: Rig, truth: Truth, m
     found = responses_of(read_measured(Path(bench.output)), rig)
     model = DeskModel(truth, np.array([*MOVED_SENSOR_PLACES.values()]))
     strokes = np.array([era.stroke for era in rig.eras])
-    bare = model.under().response(MOVED_SENSOR_FREQUENCIES).swapaxes(1, 2) / strokes[:, None]
+    bare = model.under().response(MOVED_HZ).swapaxes(1, 2) / strokes[:, None]
     for n, name in enumerate(MOVED_SENSOR_PLACES):
-        one = model.under(moved=(n, GRAMS / 1e3)).response(MOVED_SENSOR_FREQUENCIES)[:, 0] / strokes
+        one = model.under(moved=(n, GRAMS / 1e3)).response(MOVED_HZ)[:, 0] / strokes
         measured = found.values[:, :, found.sensors.index(name)]
         wrong = np.linalg.norm(measured - one) / np.linalg.norm(one)
         assert wrong < 0.02

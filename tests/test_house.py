@@ -170,7 +170,9 @@ def test_command_fails_where_no_test_had_time(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """And its last line says so, which nothing passed would not."""
-    monkeypatch.setattr(changed_tests, "changed_since", lambda commit: ["tests/test_house.py"])
+    monkeypatch.setattr(
+        changed_tests, "changed_since", lambda commit: ["tests/registry/test_threads.py"]
+    )
     monkeypatch.setattr(sys, "argv", ["changed_tests", "--seconds", "0"])
     assert changed_tests.main() == 3
     assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")

@@ -113,7 +113,12 @@ async def measured(
     [
         pytest.param(SHARED_WIRES["can+socketcand"], 0.01, id="bus"),
         pytest.param(WIRES["serial"], 0.06, id="two wires", marks=pytest.mark.long),
-        pytest.param(replace(WIRES["serial"], line_kind="ftdi-low-latency"), 0.6, id="FTDI"),
+        pytest.param(
+            replace(WIRES["serial"], line_kind="ftdi-low-latency"),
+            0.6,
+            id="FTDI",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_two_amplifiers_hear_each_other_where_their_clocks_are_held(
@@ -229,6 +234,7 @@ async def contrasts(rig: Rig, far: FarSide, known: Rig) -> list[float]:
     return found
 
 
+@pytest.mark.long
 def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
     rig: Rig, truth: Rig
 ) -> None:

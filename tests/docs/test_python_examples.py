@@ -22,6 +22,7 @@ def test_every_function_has_an_example() -> None:
     assert [name for name, has_example in shown.items() if not has_example] == []
 
 
+@pytest.mark.long
 def test_examples_print_what_the_page_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -543,6 +543,7 @@ def far_end_of(pid):
     return int(wait_for(lambda: children.read_text().split(), timeout=60)[0])
 
 
+@pytest.mark.long
 def test_page_and_daemon(tmp_path: Path) -> None:
     """It says where its page is, its daemon is disarmed and answers; Ctrl-C leaves nothing."""
     environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}

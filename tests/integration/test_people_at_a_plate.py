@@ -211,6 +211,7 @@ def measured(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("plain_pictures")
 def test_calibration_finds_the_true_parameters(rig: Rig, measured: Path, tmp_path: Path) -> None:
     """Every parameter within 2 %, faults of the measurement named, and a rig that can be used."""

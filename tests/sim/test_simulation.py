@@ -16,6 +16,7 @@ from daemons import SESSION, far_end_process, playing
 from drivers.playing import AmplifierTone
 from drivers.protocol.definition import QUANTITIES, STATES
 from firmware_machine import play
+from long_form import shortly
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path
 from plates import write_rig
@@ -46,7 +47,7 @@ async def wait(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-@pytest.mark.parametrize("is_interrupted", [True, False])
+@pytest.mark.parametrize("is_interrupted", shortly([True, False], [True]))
 async def test_sim_serves_until_interrupted_or_eof(is_interrupted: bool) -> None:
     """It prints a URL, serves the amplifier, and exits with status 0 and no files left."""
     with tempfile.TemporaryDirectory() as folder:
@@ -222,7 +223,7 @@ async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Pa
     assert strength[3] < 0.5 * strength[1]  # from 0.6 s on it only rings down
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", shortly([signal.SIGTERM, signal.SIGHUP], [signal.SIGTERM]))
 async def test_simulation_writes_its_recording_on_a_signal(
     tmp_path: Path, number: signal.Signals
 ) -> None:

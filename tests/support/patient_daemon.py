@@ -9,14 +9,6 @@ import sys
 
 import pytest
 
-from controller.cli.main import main
-from controller.daemon.daemon import Daemon
-from controller.play.loop import Controller
-from controller.sources import touch
-from drivers.host.amplifier import Amplifier
-from drivers.host.group import Group
-from drivers.host.line import Line
-
 PROGRAM = (sys.executable, __file__)
 RESTING = (*PROGRAM, "--resting")
 REPLY_TIMEOUT = 5.0  # s; in place of 30 ms
@@ -26,6 +18,13 @@ CONTACT_TIMEOUT = 3.0  # s; in place of 0.15 s, no longer than that of TUIO
 
 def wait_long(patch: pytest.MonkeyPatch) -> None:
     """Let amplifiers be waited for, and wait, that long in this process."""
+    # Tests that only start this program need not load the daemon.
+    from controller.daemon.daemon import Daemon
+    from controller.play.loop import Controller
+    from drivers.host.amplifier import Amplifier
+    from drivers.host.group import Group
+    from drivers.host.line import Line
+
     for method in (Line.submit, Amplifier.request):
         patch.setitem(method.__kwdefaults__, "timeout", REPLY_TIMEOUT)  # type: ignore[arg-type]
     patch.setattr("drivers.host.dialogue.COMMIT_DELAY", REPLY_TIMEOUT)
@@ -34,6 +33,9 @@ def wait_long(patch: pytest.MonkeyPatch) -> None:
 
 
 if __name__ == "__main__":
+    from controller.cli.main import main
+    from controller.sources import touch
+
     patch = pytest.MonkeyPatch()
     wait_long(patch)
     if sys.argv[1:2] == ["--resting"]:

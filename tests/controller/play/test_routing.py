@@ -294,6 +294,7 @@ async def test_promise_is_kept_beside_a_clock_that_is_not_steered() -> None:
     assert min(found.values()) > 0
 
 
+@pytest.mark.long
 @in_virtual_time
 async def test_promise_is_broken_if_clocks_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """So what plays over both amplifiers is felt by who should not."""

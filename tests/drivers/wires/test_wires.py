@@ -363,7 +363,7 @@ NOISE = [b"\x03\xfa", b"\x01\x63", b"\x17", b"\x18\x00\xf0"]
 
 
 @pytest.mark.parametrize("waits", shortly([True, False], [True]))
-@pytest.mark.parametrize(("noise", "part"), in_turn(NOISE, [250, 1 << 18]))
+@pytest.mark.parametrize(("noise", "part"), in_turn(NOISE, [250, 1 << 16]))
 def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
     noise: bytes, waits: bool, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -378,7 +378,7 @@ def test_noise_without_end_is_neither_kept_nor_searched_without_bound(
     checked = modbus_frames._checked
     monkeypatch.setattr(modbus_frames, "_checked", counted)
     reader = AduReader(is_rtu=True, of_requests=waits, waits=waits)
-    data = (noise * (1 << 18))[: 1 << 18]
+    data = (noise * (1 << 16))[: 1 << 16]
     found: list[Adu] = []
     for at in range(0, len(data), part):
         tried = 0

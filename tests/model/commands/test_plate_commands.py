@@ -117,6 +117,7 @@ def test_map_marks_a_plate_that_is_not_supported(era, answer, tmp_path):
     assert answer("map", RIG, *options[2:])["is_supported"] is True
 
 
+@pytest.mark.long
 def test_convergence_lists_errors_of_finer_and_finer_meshes(era, answer, monkeypatch, tmp_path):
     """Errors fall from mesh to mesh, and the rig's own is marked; text and JSON agree."""
     studied = []

@@ -227,6 +227,7 @@ def design(*arguments: str):
     return CliRunner().invoke(lab_app, ["design", RIG, "--workers", "1", *arguments])
 
 
+@pytest.mark.long
 def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
     """Five ERAs, one kept: channels are distinct, pictures there, and what is printed."""
     arguments = ("--eras", "5", "--keep", "NE", "--starts", "1", "-o", str(tmp_path), "--json")

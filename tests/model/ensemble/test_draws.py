@@ -1,9 +1,5 @@
-"""Drawn plates with uncertain feet, second harmonics and clock errors, by Monte Carlo and by hand.
+"""Drawn plates with uncertain feet, harmonics and clock errors, by Monte Carlo and by hand."""
 
-A test logs how many plates keep their promise for other `supports` that a rig states.
-"""
-
-import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -58,8 +54,6 @@ def test_common_gain_moves_all_channels_together():
     np.testing.assert_allclose(factors.imag, 0, atol=1e-6)
 
 
-_logger = logging.getLogger(__name__)
-
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 
 
@@ -75,26 +69,22 @@ def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_pl
     known = replace(Uncertainty.none(), gain=0.01, phase_deg=0.6, supports=0.3)
     rig = replace(rig, uncertainty=known)
     table = build_table(rig, frequencies=np.arange(100.0, 301.0, 25.0), drive_mode="phased")
-    stated = (0.0, 0.1, 0.2, 0.3)
+    stated = (0.0, 0.3)
     tables = [replace(table, uncertainty=replace(known, supports=each)) for each in stated]
-    rng, kept, promised = np.random.default_rng(3), [], []
+    rng, kept = np.random.default_rng(3), []
     for _ in range(24):
         target, quiet = random_contacts(rng, 2, (0.4, 0.3), margin=0.02).tolist()
         placed = Placement((tuple(target),), (tuple(quiet),))
         plates = draw_plates(rng, known, of=rig, count=60, contact_count=2)
-        each, said = [], []
+        each = []
         for counted in tables:
             layer, promise = only(counted, placed, drive_mode="phased")
             _, contrast = felt_on(counted, placed, layer.excitation, plates)
             assert contrast is not None
             assert promise.promised_contrast_db is not None
-            said.append(promise.promised_contrast_db)
             each.append((20 * np.log10(contrast) >= promise.promised_contrast_db).mean())
         kept.append(each)
-        promised.append(said)
-    shares, levels = np.mean(kept, axis=0), np.median(promised, axis=0)
-    for supports, share, level in zip(stated, shares, levels, strict=True):
-        _logger.info("supports %g: %.1f dB promised, kept by %.2f", supports, level, share)
+    shares = np.mean(kept, axis=0)
     assert 0.86 <= shares[-1] <= 0.95
     assert shares[0] < 0.2
 

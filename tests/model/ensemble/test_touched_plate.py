@@ -354,6 +354,7 @@ def test_places_that_are_off_change_fields_as_much_as_stiffnesses_do() -> None:
         np.testing.assert_allclose(found, expected, rtol=0.03)
 
 
+@pytest.mark.long
 def test_promises_of_exciters_whose_places_are_off_are_kept_on_nine_of_ten_plates() -> None:
     """On 60 plates each, solved with exciters where they stand, 24 answers: 86 to 96 % of all.
 

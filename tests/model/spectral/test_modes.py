@@ -131,12 +131,11 @@ def changed(plate, number, change):
 @pytest.mark.parametrize(
     ("plate", "mesh"),
     [
-        *(
-            (THIN_PLATE, SPECTRAL),
-            (THIN_PLATE, ELEMENTARY),
-            (SANDWICH, SPECTRAL),
-        ),
-        *((BOARD, SPECTRAL), (BOARD, ELEMENTARY)),
+        (THIN_PLATE, SPECTRAL),
+        pytest.param(THIN_PLATE, ELEMENTARY, marks=pytest.mark.long),
+        (SANDWICH, SPECTRAL),
+        (BOARD, SPECTRAL),
+        pytest.param(BOARD, ELEMENTARY, marks=pytest.mark.long),
     ],
 )
 def test_slopes_are_those_of_the_eigenvalues_of_other_plates(plate, mesh):

@@ -45,16 +45,16 @@ def test_warm_up_settles() -> None:
     assert clock.seconds(10.0) - 10 == pytest.approx(100e-6 / math.e, abs=1e-11)
 
 
-def test_steering_for_hours_adds_no_rounding() -> None:
-    """Rates that change every 50 ms for three hours add up to the exact sum of fractions."""
+def test_steering_for_an_hour_adds_no_rounding() -> None:
+    """Rates that change every 50 ms for an hour add up to the exact sum of fractions."""
     clock = AmplifierClock()
-    rates = [(number * 7919) % 65535 - 32767 for number in range(216_000)]
+    rates = [(number * 7919) % 65535 - 32767 for number in range(72_000)]
     exact = Fraction(0)
     for number, rate in enumerate(rates):
         since, until = Fraction(number / 20), Fraction((number + 1) / 20)
         clock.steer(rate, number / 20)
         exact += (until - since) * (1 + Fraction(rate, 10_000_000))
-    assert abs(Fraction(clock.seconds(10_800.0)) - exact) < Fraction(1, 10**11)
+    assert abs(Fraction(clock.seconds(3600.0)) - exact) < Fraction(1, 10**11)
 
 
 def test_shift_moves_the_high_word_on() -> None:

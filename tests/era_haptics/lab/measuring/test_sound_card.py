@@ -697,6 +697,7 @@ def test_options_that_do_not_fit_are_refused(make: Make, more: list[str], cause:
     assert cause in bench.said
 
 
+@pytest.mark.long
 def test_plate_is_identified_better_with_the_mass_of_the_sensor(
     rig: Rig, truth: Truth, make: Make
 ) -> None:

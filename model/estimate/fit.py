@@ -49,9 +49,10 @@ class Fit:
     searched: NDArray[np.bool_]
     """Mask (p,) of the q parameters that were searched."""
     residuals: FloatArray
-    """Real parts of all m values, imaginary parts, then the q rows of the prior (2 m + q,)."""
+    """Real parts of all m values, imaginary parts, then the q rows of the prior and the k of held
+    gains (2 m + q + k,)."""
     slopes: FloatArray
-    """Derivatives of the residuals by what is searched (2 m + q, q)."""
+    """Derivatives of the residuals by what is searched (2 m + q + k, q)."""
     predicted: ComplexArray
     """Values as the model and the gains predict them (f, s, n)."""
     gains: ComplexArray
@@ -187,8 +188,10 @@ def fit(
         plate = model.at(x)
         slopes = jacobian(plate, own)[..., own][:, :, drives]
         gains, by_gain, r, J = best_gains(plate.responses[:, :, drives], slopes, measurement)
+        held, by_held = _held(gains, by_gain, measurement.gain_std)
         if soft is not None:
             r, J = _softened(r, J, soft)
+            held, by_held = _softened(held, by_held, soft)
         last.clear()
         last[y.tobytes()] = Fit(
             model,
@@ -196,8 +199,8 @@ def fit(
             x,
             np.nan,
             own,
-            np.concatenate([r.real, r.imag, root @ (y - mean)]),
-            np.vstack([J.real, J.imag, root]),
+            np.concatenate([r.real, r.imag, root @ (y - mean), held.real]),
+            np.vstack([J.real, J.imag, root, by_held.real]),
             np.nan_to_num(gains)[:, None] * plate.responses[:, :, drives],
             gains,
             by_gain,
@@ -233,6 +236,8 @@ def best_gains(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
     """Take the best gains out of a model's responses (f, s, n) and their slopes (f, s, n, q).
 
+    Magnitudes of gains that a deviation holds are drawn towards 1.
+
     Returns gains (f, n), their slopes (f, n, q), and of the m values the residuals in standard
     deviations (m,) with their slopes (m, q).
     """
@@ -241,17 +246,32 @@ def best_gains(
     by_gain = np.zeros((*gains.shape, slopes.shape[-1]), dtype=complex)
     if measurement.free_gains:
         heard = known.any(axis=1)
-        power = ((w * np.abs(responses)) ** 2).sum(axis=1)
+        power = ((w * np.abs(responses)) ** 2).sum(axis=1) + measurement.gain_std**-2
         power = np.where(power > 0, power, 1.0)
-        gains = (w**2 * responses.conj() * d).sum(axis=1) / power
-        of_inner = np.einsum("fsnq,fsn->fnq", slopes.conj(), w**2 * d)
+        inner = (w**2 * responses.conj() * d).sum(axis=1)
+        length = np.where(inner == 0, 1.0, np.abs(inner))
+        turned = np.where(inner == 0, 1.0, inner / length)
+        size = (np.abs(inner) + measurement.gain_std**-2) / power
+        gains = size * turned
+        of_inner = np.einsum("fsnq,fsn->fnq", slopes.conj(), w**2 * d) * turned.conj()[..., None]
         of_power = 2 * np.einsum("fsnq,fsn->fnq", slopes, w**2 * responses.conj()).real
-        by_gain = (of_inner - gains[..., None] * of_power) / power[..., None]
+        by_size = (of_inner.real - size[..., None] * of_power) / power[..., None]
+        by_gain = turned[..., None] * (by_size + 1j * (size / length)[..., None] * of_inner.imag)
         slopes = by_gain[:, None] * responses[..., None] + gains[:, None, :, None] * slopes
         responses = gains[:, None] * responses
         gains = np.where(heard, gains, np.nan)
     weight = w[known]
     return gains, by_gain, weight * (responses - d)[known], weight[:, None] * slopes[known]
+
+
+def _held(
+    gains: ComplexArray, by_gain: ComplexArray, std: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Deviations of gains (f, n) from a magnitude of 1 (k,), and their derivatives (k, q)."""
+    kept = np.isfinite(gains) & np.isfinite(std)
+    size = np.abs(gains[kept])
+    by_size = (gains[kept].conj()[:, None] * by_gain[kept]).real / size[:, None]
+    return (size - 1) / std + 0j, by_size / std + 0j
 
 
 def _softened(

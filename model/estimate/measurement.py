@@ -141,6 +141,8 @@ class Measurement:
     their lines state; empty where all have one clock."""
     free_gains: bool = False
     """Whether each drive has a gain of its own at every frequency, which nothing states."""
+    gain_std: float = math.inf
+    """Relative standard deviation of the magnitudes of free gains from 1."""
     drives: tuple[int, ...] = ()
     """Number of the ERA that each of the n channels drives, empty where each drives its own."""
 

@@ -133,17 +133,12 @@ class PlateSensor:
         return np.asarray(phasors * (2j * np.pi * frequencies) ** self.derivatives)
 
 
-@dataclass(frozen=True)
-class PlateSensors:
-    """The sensors of a rig's amplifiers as those of its plate."""
-
-    used: tuple[PlateSensor, ...]
-    unused: tuple[str, ...]
-    """Why other sensors are not used, a line each."""
-
-
-async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateSensors:
+async def plate_sensors(
+    rig: Rig, amplifiers: Mapping[str, Amplifier]
+) -> tuple[list[PlateSensor], list[str]]:
     """Read what the sensors of open amplifiers, by name, measure and where.
+
+    Returns those of the plate, and a line for each other one, why it is not used.
 
     Raises CommandError for an amplifier that has none, or none of use.
     """
@@ -166,7 +161,7 @@ async def plate_sensors(rig: Rig, amplifiers: Mapping[str, Amplifier]) -> PlateS
             )
         used += own
         unused += rest
-    return PlateSensors(tuple(used), tuple(unused))
+    return used, unused
 
 
 def check_clocks(amplifiers: Mapping[str, Amplifier]) -> None:
@@ -332,27 +327,27 @@ class PlateSelfMeasurement:
         """
         try:
             can = await self._player.open()
-            sensors = await plate_sensors(self._rig, self._player.amplifiers)
+            sensors, unused = await plate_sensors(self._rig, self._player.amplifiers)
             tones = interleaved(
                 self._rig,
-                _frequency_range(can.limits.frequencies, sensors.used),
+                _frequency_range(can.limits.frequencies, sensors),
                 is_quick=self._is_quick,
             )
             await self._player.group.arm()
             await self._hold_clocks()
             started = threads.now()
-            heard, half, last = await self._all(tones, sensors.used)
+            heard, half, last = await self._all(tones, sensors)
             await self._player.silence()
             await self._wait(self._player.ramp)
             duration = threads.now() - started
         finally:
             await self._player.close()
         return MeasuredPlate(
-            self._measurement(sensors.used, heard, half, last),
+            self._measurement(sensors, heard, half, last),
             self._level,
             duration,
-            sensors=tuple(map(_described, sensors.used)),
-            notes=sensors.unused,
+            sensors=tuple(map(_described, sensors)),
+            notes=tuple(unused),
             details={"settling_s": tones.settling, "window_s": tones.window},
         )
 

@@ -355,20 +355,15 @@ class LatencySummary(ApiMessage):
     )
 
 
-LearningState: TypeAlias = Literal[
-    "off",
-    "starting",
-    "following",
-    "explaining",
-    "changed",
-    "only_alarms",
-    "restarting",
-    "failed",
-]
-"""What happens to what settled patterns show of the plate."""
+LearningState: TypeAlias = Literal["following", "changed", "off"]
+"""Whether answers follow the plate, the plate has changed unexplained, or neither."""
 
-BAD: tuple[LearningState, ...] = ("changed", "restarting", "failed")
-"""States in which plate or estimator need attention."""
+LEARNING_WORDS: dict[LearningState, str] = {
+    "following": "following",
+    "changed": "changed, promises lowered until you run era rig check",
+    "off": "off",
+}
+"""What people read of it."""
 
 
 class PlateEvent(CauseAndRemedy):
@@ -382,8 +377,8 @@ class PlateEvent(CauseAndRemedy):
     alarms: Count = Field(description="patterns so far that show another plate than the known one")
 
 
-class LearningStatus(PlateEvent):
-    """The same with counts since the start."""
+class LearningSummary(PlateEvent):
+    """What is learned of the plate while it plays, and how often."""
 
     readings: Count = Field(description="settled patterns that were measured")
     estimates: Count = Field(description="of these, by the estimator")
@@ -395,11 +390,6 @@ class LearningStatus(PlateEvent):
     )
     corrections: Count = Field(description="of the answers to touches")
     restarts: Count = Field(description="of the estimator")
-
-
-class LearningSummary(LearningStatus):
-    """What is learned of the plate while it plays, and how often."""
-
     last_estimate_s: float | None = Field(description="time since the last estimate")
     latency_ms: LatencySummary = Field(
         description="from the end of a measurement to the answers that follow it"

@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING
 
 from controller.api.link import Notification
 from controller.api.methods import StatusResult
-from controller.api.schema import AmplifierStatus, ContactStatus, LearningSummary, headline
+from controller.api.schema import (
+    LEARNING_WORDS,
+    AmplifierStatus,
+    ContactStatus,
+    LearningSummary,
+    headline,
+)
 from drivers.by_hand.cli import in_words
 from drivers.protocol.definition import READINGS
 from model.quantities import counted
@@ -115,7 +121,7 @@ def _contact(contact: ContactStatus) -> str:
 
 def _learning(learning: LearningSummary) -> list[str]:
     """Format what is learned of the plate."""
-    state = learning.state.replace("_", " ")
+    state, words = learning.state, LEARNING_WORDS[learning.state]
     last, took = learning.last_estimate_s, learning.latency_ms.median
     within = "".join(_given((", median {:.0f} ms after a measurement", took)))
     ago = "".join(_given((", last estimated {:.0f} s ago", last)))
@@ -124,7 +130,8 @@ def _learning(learning: LearningSummary) -> list[str]:
         f"{counted(learning.corrections, 'correction')} of answers{within}"
     )
     return [
-        f"  plate {state.upper() if learning.cautious else state}: {learning.cause}",
+        f"  plate {words.replace(state, state.upper()) if learning.cautious else words}: "
+        f"{learning.cause}",
         *_given(("    answers promise what a plate that is not known gives", learning.cautious)),
         *_given(("    remedy: {}", learning.remedy)),
         *_given(("    {}", measured if learning.readings else None)),

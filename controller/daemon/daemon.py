@@ -146,7 +146,7 @@ class Daemon:
                 changed=self._publisher.plate_changed,
                 estimated=self._publisher.learning_latencies.add,
             )
-            self.learning.observe(cycle.observers)
+            self.learning.readings.observe(cycle.observers)
         observe(cycle.observers)
         self._inputs = TouchInputs(
             cycle.deliver,
@@ -302,7 +302,7 @@ class Daemon:
         if new.state is DaemonState.READY_TO_SWITCH_ON:
             self.learning.open()
         if new.state is not DaemonState.OPERATION_ENABLED:
-            self.learning.ended()
+            self.learning.readings.ended()
 
     def _status_line(self) -> str:
         operation = self._supervisor.operation

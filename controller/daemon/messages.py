@@ -42,7 +42,6 @@ from controller.api.schema import (
     EffectDescription,
     EraPosition,
     LatencySummary,
-    LearningStatus,
     LearningSummary,
     LinkCounters,
     PlateEvent,
@@ -388,11 +387,6 @@ def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
     return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
 
 
-def plate_event(status: LearningStatus) -> PlateEvent:
-    """The event of topic `plate`."""
-    return PlateEvent(**_same(status, PlateEvent))
-
-
 def _same(status: object, message: type[ApiMessage]) -> dict[str, Any]:
     """The attributes of a status that are fields of a message."""
     return {key: getattr(status, key) for key in message.model_fields if hasattr(status, key)}
@@ -449,7 +443,7 @@ class EventPublisher:
                 "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
                 "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
                 "layout": layouts.event,
-                "plate": self._plate_event,
+                "plate": lambda: None if (found := learning()) is None else found.event,
                 "inputs": inputs,
                 "strength": self.strengths,
             },
@@ -487,9 +481,9 @@ class EventPublisher:
             return f"{operation.cause}; {operation.remedy}"
         return self._player.why_not(key)
 
-    def plate_changed(self, status: LearningStatus) -> None:
+    def plate_changed(self, event: PlateEvent) -> None:
         """Publish what has happened to the plate, or to learning it."""
-        self.hub.publish("plate", lambda: plate_event(status))
+        self.hub.publish("plate", lambda: event)
 
     def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
         """Publish that the link to amplifiers was degraded, lost, retried or opened again."""
@@ -533,18 +527,7 @@ class EventPublisher:
     def learning_summary(self) -> LearningSummary | None:
         """What is learned of the plate; None where nothing is to be."""
         learning = self._learning()
-        if learning is None:
-            return None
-        at = learning.estimated_at
-        return LearningSummary(
-            **learning.status.model_dump(),
-            last_estimate_s=None if at is None else max(0.0, threads.now() - at),
-            latency_ms=self.learning_latencies.summary(),
-        )
-
-    def _plate_event(self) -> PlateEvent | None:
-        learning = self._learning()
-        return None if learning is None else plate_event(learning.status)
+        return None if learning is None else learning.summary(self.learning_latencies.summary())
 
     def _refused(self, reason: str) -> None:
         self._noted({"time_s": threads.now(), "refused": reason})

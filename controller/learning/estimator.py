@@ -1,35 +1,30 @@
 """The estimator: settled patterns in, answers of the plate as it is known now out.
 
-    python -m controller.learning.estimator
-
-A process of its own, at a lower priority, so that the control loop does not wait for it. It reads
-requests from standard input, answers each on standard output, and ends with its input.
+It works in a process of its own, at a lower priority, so that the control loop does not wait for
+it. `Worker` is that process as the daemon sees it: a pool of one, whose calls have a time limit.
+One that hangs can be killed at any moment, and the kernel ends it with the daemon.
 """
 
+import asyncio
 import contextlib
 import os
-import sys
+import resource
+import signal
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from multiprocessing import active_children, get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
-from controller.learning.estimator_process import (
-    HEAD,
-    Answers,
-    Estimate,
-    Note,
-    Ready,
-    RefreshedAnswers,
-    Reply,
-    Request,
-    Start,
-    packed,
-    unpacked,
-)
+from controller.api.schema import LearningState
 from controller.plate_measurement import settling
+from controller.process.child import end_with_parent
 from model.answer.plan import prepare_answers
 from model.errors import InputError
+from model.estimate.forward import Sensor
 from model.estimate.learned_plate import LearnedTable, PlateEstimate
 from model.estimate.settled_patterns import SettledPattern
 from model.files.array_file import remove_partial
@@ -37,108 +32,131 @@ from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following
 
+MAX_MEMORY = 1 << 30
+"""Bytes that an estimator may take; one that needs more ends, and another starts."""
+
 _NICE = 10  # above that of the daemon, whose loop comes first
-_SAVE_INTERVAL, _REFRESH_INTERVAL = 10.0, 60.0  # s
 _IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured
+_CHANGED_REMEDY = (
+    "run era rig check, and look for a loose mount, a crack or something on the plate; then "
+    "identify it (era rig identify), or discard what was learned (era forget)"
+)
+_IDENTIFY = "identify the plate (era rig identify)"
+_HELD = "the plate is not as known; the next patterns tell what has changed"
+_OF_DAEMON = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1}
+"""Signals that the daemon handles; a group or a service gets them as a whole."""
+
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, eq=False)
+class PlateReport:
+    """The plate as the estimator knows it, after its start or a pattern."""
+
+    state: LearningState
+    cause: str
+    remedy: str | None
+    is_alarm: bool = False
+    """Whether the pattern is not of the plate as known."""
+    table: LocalizationTable | None = None
+    """Corrected table, prepared for its first touch; None: answers stay as they are."""
+    note: str = ""
+    """A line for the log; else ""."""
 
 
 class Estimator:
-    """A table in service, and when it is kept and prepared whole; raises InputError.
+    """A table in service, which settled patterns correct; raises InputError.
 
-    now: the clock of both [s].
+    table: of the rig as built, never changed; sensors: those that readings come from; drive_mode:
+    of the questions that answers are prepared for; file: keeps what is learned. One that is damaged
+    or of another plate is renamed.
     """
 
-    def __init__(self, start: Start, *, now: Callable[[], float] = time.monotonic) -> None:
-        self._start, self._now = start, now
-        self._base = start.table.fingerprint
-        self.only_alarms = why_only_alarms(start.rig)
-        known = PlateEstimate.of_rig(start.rig, start.sensors)
-        if self.only_alarms:
-            known = replace(known, is_explained=False)
-        self.note = ""
-        remove_partial(start.file)
+    def __init__(
+        self,
+        rig: Rig,
+        table: LocalizationTable,
+        sensors: Sequence[Sensor],
+        drive_mode: str,
+        file: Path,
+    ) -> None:
+        self._rig, self._table, self._drive_mode, self._file = rig, table, drive_mode, file
+        known = PlateEstimate.of_rig(rig, sensors)
+        self._why_off = why_only_alarms(rig)
+        known = replace(known, is_explained=not self._why_off)
+        remove_partial(file)
+        self._note, self._is_kept = "", True
+        self._cause, self._alarms = "the plate is followed from the rig as built on", 0
         try:
-            self._learned = LearnedTable.resumed(start.table, known, file=start.file)
-            if self._learned.current is not start.table:
-                age = max(time.time() - start.file.stat().st_mtime, 0.0)
-                live = self._learned.live
-                live.known = replace(live.known, time=now() - age)
+            self._learned = LearnedTable.resumed(table, known, file=file, now=time.monotonic())
         except InputError as error:
-            self.note = f"{error}; {_set_aside(start.file)}"
-            self._learned = LearnedTable(start.table, known, file=start.file)
-        self._saved_at = self._refreshed_at = now()
-        self._is_saved = self._is_refreshed = True
-        self._save_error = ""
+            self._note = f"learning anew: {error}; {_set_aside(file)}"
+            self._learned = LearnedTable(table, known, file=file)
 
-    def ready(self) -> Ready:
-        """What it starts with."""
-        learned, table = self._learned, self._start.table
-        low, high = float(table.frequencies[0]), float(table.frequencies[-1])
-        is_resumed = learned.current is not table
-        return Ready(
-            settling(self._start.rig, (low, high)),
-            self.note,
-            self.only_alarms,
-            self._prepared(learned.current, whole=True) if is_resumed else None,
-            self._cautious(),
-            learned.change,
-        )
+    def start(self) -> tuple[float, PlateReport, LocalizationTable]:
+        """The time [s] until the plate has settled, what was learned before, the cautious table."""
+        found, frequencies = self._learned.current, self._table.frequencies
+        if found is not self._table:
+            self._cause = "the plate is followed from what was learned before on"
+        report = self._report(None if found is self._table else found, note=self._note)
+        rest = settling(self._rig, (float(frequencies[0]), float(frequencies[-1])))
+        return rest, report, self._cautious()
 
-    def take(self, pattern: SettledPattern) -> list[Reply]:
+    def take(self, pattern: SettledPattern) -> PlateReport:
         """Take a pattern; of one of no plate nothing is learned, and a note says so."""
-        learned = self._learned
+        was_known = not self._learned.change and self._cause != _HELD
         try:
-            found = learned.take(pattern)
+            found, table = self._learned.take(pattern)
         except ValueError as error:  # InputError and LinAlgError are such
-            note = Note(f"a pattern is not used: {error}")
-            return [note, Estimate(pattern.time, False, False, "", learned.change, None)]
-        report, table = found.report, found.table
-        if table is not None:
-            self._is_saved = self._is_refreshed = False
-        estimate = Estimate(
-            pattern.time,
-            report.alarm,
-            report.is_held,
-            "" if report.explanation is None else str(report.explanation),
-            learned.change,
-            None if table is None else self._prepared(table, whole=False),
-        )
-        return [estimate]
+            return self._report(None, note=f"a pattern is not used: {error}")
+        self._is_kept = self._is_kept and table is None
+        self._alarms += found.alarm
+        if found.explanation is not None:
+            self._cause = f"the plate has changed: {found.explanation}"
+        elif found.is_held:
+            self._cause = _HELD
+        elif found.alarm:
+            self._cause = f"the plate is not as the rig says (alarm {self._alarms})"
+        elif not was_known:
+            self._cause = "the plate is again as it was"
+        return self._report(table, is_alarm=found.alarm)
 
-    def chores(self) -> list[Reply]:
-        """Save what was learned, and prepare answers whole, where that is due."""
-        now = self._now()
-        note = self.save() if now >= self._saved_at + _SAVE_INTERVAL else None
-        done: list[Reply] = [] if note is None else [note]
-        if not self._is_refreshed and now >= self._refreshed_at + _REFRESH_INTERVAL:
-            self._refreshed_at, self._is_refreshed = now, True
-            whole = self._prepared(self._learned.current, whole=True)
-            done.append(RefreshedAnswers(whole, self._cautious()))
-        return done
+    def keep(self) -> tuple[str, LocalizationTable | None]:
+        """Write what was learned since; return why it could not be, and the cautious table of it.
 
-    def save(self) -> Note | None:
-        """Write what was learned; where that fails, say so once, and try again later."""
-        self._saved_at = self._now()
+        The next call tries again, with the same reason once only. None: the table is as before.
+        """
+        if self._is_kept:
+            return "", None
+        before, self._note = self._note, ""
         try:
-            if not self._is_saved:
-                self._learned.save()
+            self._learned.save()
         except OSError as error:
-            before, self._save_error = self._save_error, str(error)
-            is_new = self._save_error != before
-            return Note(f"{self._start.file}: not written: {error}") if is_new else None
-        self._is_saved, self._save_error = True, ""
-        return None
+            self._note = f"{self._file}: not written: {error}"
+        self._is_kept = not self._note
+        return "" if self._note == before else self._note, self._cautious()
 
-    def _prepared(self, table: LocalizationTable, *, whole: bool) -> Answers:
-        # Of its own, not the one that the next correction starts from.
-        table = replace(table)
-        prepare_answers(table, self._start.drive_mode)
+    def _report(
+        self, table: LocalizationTable | None, *, is_alarm: bool = False, note: str = ""
+    ) -> PlateReport:
+        if self._learned.change:
+            said = PlateReport("changed", self._learned.change, _CHANGED_REMEDY)
+        elif self._why_off:
+            as_built = f"answers stay as built: {self._why_off}"
+            said = PlateReport("off", self._cause if self._alarms else as_built, _IDENTIFY)
+        else:
+            said = PlateReport("following", self._cause, None)
+        table = None if table is None else self._prepared(table)
+        return replace(said, is_alarm=is_alarm, table=table, note=note)
+
+    def _cautious(self) -> LocalizationTable:
+        return self._prepared(table_following(self._table, self._learned.cautious_rig))
+
+    def _prepared(self, table: LocalizationTable) -> LocalizationTable:
+        table = replace(table)  # not the one that the next correction starts from
+        prepare_answers(table, self._drive_mode)
         _ = table.in_time
-        return Answers(self._base, table, whole)
-
-    def _cautious(self) -> Answers:
-        wide = table_following(self._start.table, self._learned.cautious_rig)
-        return self._prepared(wide, whole=False)
+        return table
 
 
 def why_only_alarms(rig: Rig) -> str:
@@ -167,40 +185,70 @@ def _set_aside(file: Path) -> str:
     return f"it is {old} now"
 
 
-def _main() -> None:
+class Worker:
+    """A process that makes an object, and calls its methods one at a time.
+
+    Nothing of it waits in this process but the caller of `call`. To be made in the main thread,
+    whose end is that of the process to the kernel.
+    """
+
+    def __init__(self) -> None:
+        before = {*active_children()}
+        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (os.getpid(),))
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_DAEMON)  # the process inherits it
+        try:
+            self._pool.submit(os.getpid)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        (self._process,) = {*active_children()} - before
+        self.pid = self._process.pid
+        """Process number."""
+
+    async def make(self, limit: float, factory: Callable[..., object], *arguments: object) -> None:
+        """Make the object, within a time limit [s]; raises as `call` does."""
+        await self._result(limit, _make, factory, *arguments)
+
+    async def call(
+        self, limit: float, method: Callable[..., _Result], *arguments: object
+    ) -> _Result:
+        """Return what a method of the object returns within a time limit [s].
+
+        Raises what the method does, TimeoutError, and ChildProcessError where the process has died.
+        """
+        found: _Result = await self._result(limit, _call, method, *arguments)
+        return found
+
+    async def _result(self, limit: float, function: Callable[..., Any], *arguments: object) -> Any:
+        try:
+            async with asyncio.timeout(limit):
+                return await asyncio.wrap_future(self._pool.submit(function, *arguments))
+        except BrokenProcessPool:
+            raise ChildProcessError("its process has died") from None
+        except TimeoutError:
+            raise TimeoutError(f"no reply within {limit:g} s") from None
+
+    def end(self) -> None:
+        """Kill the process, whatever it does."""
+        self._process.kill()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _begin(parent: int) -> None:
+    """Begin the process of a worker."""
+    end_with_parent(parent, signal.SIGKILL)
     with contextlib.suppress(OSError):
         os.nice(_NICE)
-    output = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # for what a plugin prints
-    estimator: Estimator | None = None
-    try:
-        for request in _requests():
-            replies: list[Reply]
-            if isinstance(request, Start):
-                try:
-                    estimator = Estimator(request)
-                    replies = [estimator.ready()]
-                except InputError as error:
-                    replies = [Note(str(error), is_final=True)]
-            else:
-                assert estimator is not None  # noqa: S101  started first
-                replies = estimator.chores() if request is None else estimator.take(request)
-            output.write(packed(replies))
-            output.flush()
-    except BrokenPipeError:
-        return
-    finally:
-        if estimator is not None:
-            estimator.save()
+    with contextlib.suppress(ValueError):  # less is allowed already
+        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY, MAX_MEMORY))
 
 
-def _requests() -> Iterator[Request]:
-    """Requests until the end of the input."""
-    while len(head := sys.stdin.buffer.read(HEAD)) == HEAD:
-        length = int.from_bytes(head, "big")
-        if len(content := sys.stdin.buffer.read(length)) == length:
-            yield unpacked(content)
+_made: Any  # by the worker's factory
 
 
-if __name__ == "__main__":
-    _main()
+def _make(factory: Callable[..., object], *arguments: object) -> None:
+    global _made
+    _made = factory(*arguments)
+
+
+def _call(method: Callable[..., _Result], *arguments: object) -> _Result:
+    return method(_made, *arguments)

@@ -1,61 +1,83 @@
 """Learning of the plate while the daemon drives it: settled patterns correct the next answers.
 
-    control loop -> pattern -> SettledReadings -> EstimatorProcess -> table -> control loop
+    control loop -> SettledReadings -> estimator, in a process of its own -> table -> control loop
 
-The control loop never waits for any of this, and stops do not pass through it. Answers are replaced
-in one step, whole and prepared. Without an estimator they stay as they were for `CAUTIOUS_AFTER`
-seconds, then they are those of a plate that is not known.
+The control loop never waits for any of this, and stops do not pass through it. Whatever happens to
+the estimator, the daemon goes on: one that dies, or does not answer in time, is replaced after a
+growing pause, until several in a row have failed without an estimate.
 
-`SettledReadings` reads the sensors once in every pattern that has settled: some time after its last
-fade and after the last change of the contacts. What plays is never delayed for a reading: its
-requests go last on the line, and none is sent while contacts change. A renewal disturbs a reading,
-which is then repeated.
+Answers are replaced in one step. They were prepared before: by the estimator, and for onsets and
+endings here, one frequency at a time; until then these keep the shapes of the previous answers.
+Without an estimator they stay as they were for `CAUTIOUS_AFTER` seconds, then they are those of a
+plate that is not known.
+
+A pattern has settled some time after its last fade and after the last change of the contacts. What
+plays is never delayed for a reading: its requests go last on the line, and none is sent while
+contacts change. A renewal disturbs a reading, which is then repeated.
 """
 
 import asyncio
 import cmath
+import contextlib
 import logging
 import math
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from controller.api.schema import BAD, LearningState, LearningStatus
-from controller.learning.estimator_process import (
-    DEFAULT_TIMEOUTS,
-    Answers,
-    AnswersInUse,
-    Estimate,
-    EstimatorProcess,
-    EstimatorTimeouts,
-    Note,
-    Ready,
-    RefreshedAnswers,
-    Start,
+from controller.api.schema import (
+    LEARNING_WORDS,
+    LatencySummary,
+    LearningState,
+    LearningSummary,
+    PlateEvent,
 )
+from controller.learning.estimator import Estimator, PlateReport, Worker
 from controller.plate_measurement import PlateSensor, check_clocks, plate_sensors
 from controller.play.loop import Controller
 from controller.play.planner import Observers, PlayReport
-from controller.sources.touch import Change, Contact
+from controller.sources.touch import Contact
 from drivers.errors import CommandError, DriverError, Preempted
-from drivers.host.amplifier import Amplifier, Reading, finish_reading, start_reading
+from drivers.host.amplifier import Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
+from model.errors import InputError
 from model.estimate.forward import RestingFinger
 from model.estimate.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads
 from registry.plugins import failure_text
+from registry.threads import Backoff
+
+START_LIMIT = 60.0
+"""Time [s] in which an estimator must take patterns."""
+
+ESTIMATE_LIMIT = 30.0
+"""Time [s] for one pattern; the search for an explanation takes longest."""
+
+MAX_FAILURES = 8
+"""Failures in a row after which an estimator is not replaced any more."""
+
+MAX_WAITING = 16
+"""Patterns that wait for the estimator; newer ones are dropped."""
+
+CAUTIOUS_AFTER = 60.0
+"""Time [s] without an estimator after which answers no longer trust what was learned."""
 
 WINDOW = 0.2  # s; of a reading, as in an identification
 READINGS = 4  # of one pattern, at most, where others are disturbed
 _MOVED = 0.003  # m; a finger that has moved by less loads the plate as before
 _MARGIN = 0.002  # s; of the amplifiers' clocks
 _PERIODS = 1.01  # of a tone within a window, for frequencies as amplifiers round them
-_PAUSE_AFTER_FAILURE = 10.0  # s
+_KEEP_INTERVAL, _SHAPE_INTERVAL = 10.0, 60.0  # s
+_CLOSE_LIMIT = 0.3  # s
+_PAUSE = 10.0  # s; before the sensors are asked, or read, again after a failure
+_BETWEEN = 0.02  # s; between frequencies, which take a millisecond or two each
+
+_FAILED_REMEDY = "see the log above; era forget starts anew"
+_COUNTED = ("readings", "estimates", "discarded", "disturbed", "corrections", "restarts")
 
 _logger = logging.getLogger(__name__)
 
@@ -63,9 +85,8 @@ _logger = logging.getLogger(__name__)
 class SettledReadings:
     """Follows what the control loop reports, and reads each pattern once it has settled.
 
-    amplifiers: by name; their clocks must agree.
-    sensors: of these amplifiers.
-    settling: time [s] until the plate has settled.
+    The clocks of the controller's amplifiers must agree.
+
     take: receives each pattern with its reading, at the time [s] when the window ended.
     disturbed: called for each reading that a change, an overload or the link has spoilt.
     """
@@ -73,66 +94,73 @@ class SettledReadings:
     def __init__(
         self,
         rig: Rig,
-        amplifiers: Mapping[str, Amplifier],
-        sensors: Sequence[PlateSensor],
+        controller: Controller,
         *,
-        settling: float,
         take: Callable[[SettledPattern], None],
         disturbed: Callable[[], None],
     ) -> None:
-        self._rig, self._amplifiers, self._sensors = rig, amplifiers, sensors
-        self._settling, self._take, self._disturbed = settling, take, disturbed
-        self._highest = min(sensor.frequency_max for sensor in sensors)
+        self.sensors: Sequence[PlateSensor] = ()
+        """Sensors of the amplifiers, to be set before `run`."""
+        self.settling = 0.0
+        """Time [s] until the plate has settled, to be set before `run`."""
+        self._rig, self._controller = rig, controller
+        self._take, self._disturbed = take, disturbed
         self._contacts: tuple[Contact, ...] = ()
         self._settled_contacts: tuple[Contact, ...] = ()
         self._playing: PlayReport | None = None
-        self._due = math.inf
+        self._due = math.inf  # s; when it has settled
         self._change = asyncio.Event()
 
-    def pattern_applied(self, applied: PlayReport) -> None:
-        """Follow a pattern that the amplifiers have confirmed, if it can be read."""
-        frequencies = {command.frequency for command in applied.drive.values()}
-        is_one = len(applied.contents) == len(frequencies) == 1
-        is_read = applied.lasts and is_one and max(frequencies) <= self._highest
-        self._playing = applied if is_read else None
-        self._contacts = applied.contacts
-        self._wait_for(applied.time + applied.settled_after)
-
-    def contacts_changed(self, contacts: tuple[Contact, ...]) -> None:
-        """Follow the contacts; where they load the plate otherwise it settles anew."""
-        self._contacts = contacts
-        if not _are_same(contacts, self._settled_contacts):
-            self._wait_for(threads.now())
+    def observe(self, loop: Observers) -> None:
+        """Observe what the control loop reports."""
+        loop.contacts_changed.append(lambda contacts, change: self._contacts_changed(contacts))
+        loop.pattern_applied.append(self._pattern_applied)
+        loop.silenced.append(lambda silenced: self.ended())
 
     def ended(self) -> None:
         """Read no more of what played."""
         self._playing, self._due = None, math.inf
         self._change.set()
 
-    async def run(self) -> None:
-        """Read every pattern that settles, until cancelled."""
-        while True:
-            self._change.clear()
-            if await self._changes_by(self._due):
-                continue
-            applied, contacts = self._playing, self._contacts
-            self._due = math.inf
-            if applied is None:
-                continue
-            try:
-                await self._read(applied, contacts)
-            except Preempted:
-                self._disturbed()  # what preempted it is read once it has settled
-            except DriverError as error:
-                self._disturbed()
-                _logger.info("reading given up: %s", error)
-                await asyncio.sleep(_PAUSE_AFTER_FAILURE)
+    def _pattern_applied(self, applied: PlayReport) -> None:
+        """Follow a pattern that the amplifiers have confirmed, if it can be read."""
+        highest = min((each.frequency_max for each in self.sensors), default=0.0)
+        frequencies = {command.frequency for command in applied.drive.values()}
+        is_one = applied.lasts and len(applied.contents) == len(frequencies) == 1
+        self._playing = applied if is_one and max(frequencies) <= highest else None
+        self._contacts = applied.contacts
+        self._wait_for(applied.time + applied.settled_after)
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...]) -> None:
+        """Follow the contacts; where they load the plate otherwise it settles anew."""
+        self._contacts = contacts
+        if not _are_same(contacts, self._settled_contacts):
+            self._wait_for(threads.now())
 
     def _wait_for(self, since: float) -> None:
         """Read a settling time after a moment [s] with the contacts of now."""
         self._settled_contacts = self._contacts
-        self._due = math.inf if self._playing is None else since + self._settling
+        self._due = math.inf if self._playing is None else since + self.settling
         self._change.set()
+
+    async def run(self) -> None:
+        """Read every pattern that settles, until cancelled."""
+        while True:
+            self._change.clear()
+            if await self._changes_by(self._due) or self._playing is None:
+                continue
+            self._due, pattern = math.inf, None
+            try:
+                pattern = await self._read(self._playing, self._contacts)
+            except Preempted:
+                pass  # what preempted it is read once it has settled
+            except DriverError as error:
+                _logger.info("reading given up: %s", error)
+                await asyncio.sleep(_PAUSE)
+            if pattern is None:
+                self._disturbed()
+            else:
+                self._take(pattern)
 
     async def _changes_by(self, moment: float) -> bool:
         """Wait for a change until a moment [s]; whether there was one."""
@@ -144,57 +172,53 @@ class SettledReadings:
             return False
         return True
 
-    async def _read(self, applied: PlayReport, contacts: tuple[Contact, ...]) -> None:
-        """Read a pattern until a reading was not disturbed; raises DriverError."""
+    async def _read(
+        self, applied: PlayReport, contacts: tuple[Contact, ...]
+    ) -> SettledPattern | None:
+        """Read a pattern until a reading was not disturbed, None if all were; raises DriverError.
+
+        Without the phase of its drives: outputs follow their clocks by a delay that is not known.
+        """
         (frequency,) = {command.frequency for command in applied.drive.values()}
         for _ in range(READINGS):
             readings, ended_at = await self._measure(frequency)
             if self._change.is_set():
-                self._disturbed()
-                return
+                return None
             if all(each.state == "COMPLETE" for each in readings.values()):
                 break
         else:
-            self._disturbed()
-            return
+            return None
         values = []
-        for sensor in self._sensors:
-            several = readings[sensor.amplifier].sensors
-            if sensor.number >= len(several) or several[sensor.number].is_overloaded:
-                self._disturbed()
-                return
+        for sensor in self.sensors:
             reading = readings[sensor.amplifier]
+            if reading.sensors[sensor.number].is_overloaded:
+                return None
             values.append(sensor.accelerations(reading, np.array([frequency]))[0])
         if not np.isfinite(values).all() or not np.any(values):  # no phase to turn others to
-            self._disturbed()
             _logger.info("reading given up: all sensors read nothing")
-            return
+            return None
+        bases = np.zeros(len(self._rig.eras), dtype=complex)
+        for number, era in enumerate(self._rig.eras):
+            if (tone := applied.drive.get(era.name)) is not None:
+                phase = math.radians(tone.phase)
+                bases[number] = cmath.rect(tone.level * era.full_level, phase)
         tip = self._rig.fingertip
-        fingers = [RestingFinger(c.x, c.y, tip.scaled(c.load)) for c in contacts if tip is not None]
-        pattern = SettledPattern(
-            ended_at,
-            frequency,
-            np.array(
-                [
-                    cmath.rect(tone.level * era.full_level, math.radians(tone.phase))
-                    if (tone := applied.drive.get(era.name)) is not None
-                    else 0j
-                    for era in self._rig.eras
-                ]
-            ),
-            np.array(values),
-            tuple(fingers),
-            has_phase=False,  # outputs follow their clocks by a delay that is not known
+        fingers = (
+            ()
+            if tip is None
+            else (RestingFinger(each.x, each.y, tip.scaled(each.load)) for each in contacts)
         )
-        self._take(pattern)
+        return SettledPattern(
+            ended_at, frequency, bases, np.array(values), tuple(fingers), has_phase=False
+        )
 
     async def _measure(self, frequency: float) -> tuple[Mapping[str, Reading], float]:
         """Read a tone [Hz] at all amplifiers; the readings, and when [s] their window ended.
 
         Nothing is requested after a change meanwhile.
         """
-        names = {sensor.amplifier for sensor in self._sensors}
-        amplifiers = {name: self._amplifiers[name] for name in sorted(names)}
+        names = sorted({sensor.amplifier for sensor in self.sensors})
+        amplifiers = {name: self._controller.amplifiers[name] for name in names}
         window = max(WINDOW, _PERIODS / frequency)
         started = {
             name: await start_reading(each, [frequency], window)
@@ -221,19 +245,6 @@ def _are_same(contacts: tuple[Contact, ...], before: tuple[Contact, ...]) -> boo
     )
 
 
-CAUTIOUS_AFTER = 60.0
-"""Time [s] without an estimator after which answers no longer trust what was learned."""
-
-_PAUSE = 10.0  # s; before the sensors are asked, or read, again after a failure
-
-_CHANGED_REMEDY = (
-    "look for a loose mount, a crack or something on the plate; then identify it (era rig identify)"
-    ", or discard what was learned (era forget)"
-)
-_UNUSUAL = ("changed", "explaining", "failed")
-_FAILED_REMEDY = "see the log above; era forget starts anew"
-
-
 class Learning:
     """Learning of one plate, from `open` on, when all amplifiers are open, until `close`.
 
@@ -251,64 +262,50 @@ class Learning:
         file: Path,
         *,
         controller: Controller,
-        changed: Callable[[LearningStatus], None] = lambda status: None,
-        estimated: Callable[[float], None] = lambda latency: None,
-        timeouts: EstimatorTimeouts = DEFAULT_TIMEOUTS,
+        changed: Callable[[PlateEvent], None],
+        estimated: Callable[[float], None],
     ) -> None:
-        self.status = LearningStatus(
+        self.event = PlateEvent(
             state="off",
             cause="amplifiers not asked for their sensors yet",
             remedy=None,
             cautious=False,
             alarms=0,
-            readings=0,
-            estimates=0,
-            discarded=0,
-            disturbed=0,
-            corrections=0,
-            restarts=0,
         )
-        self.estimated_at: float | None = None  # s; the last estimate
-        self._rig, self._base, self._file = rig, table, file
+        """Present state of the plate, and why."""
+        self.readings = SettledReadings(
+            rig, controller, take=self._hand, disturbed=lambda: self._count("disturbed")
+        )
+        """Readings of the plate, which are to observe the control loop."""
+        self.worker: Worker | None = None
+        """Process of the estimator, if one runs."""
+        self._rig, self._base, self._file = rig, (table, timing), file
         self._controller = controller
-        self._changed, self._estimated, self._timeouts = changed, estimated, timeouts
-        self._answers = AnswersInUse(controller, table, timing)
-        self._cautious: Answers | None = None
-        self._only_alarms, self._is_held = "", False
-        self._sensors: Sequence[PlateSensor] | None = None  # until they were read
-        self._readings: SettledReadings | None = None
-        self._estimator: EstimatorProcess | None = None
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._changed, self._estimated = changed, estimated
+        self._table, self._timing = self._base
+        self._cautious: LocalizationTable | None = None
+        self._counts = dict.fromkeys(_COUNTED, 0)
+        self._estimated_at: float | None = None  # s
+        self._is_shaped = True
+        self._waiting: asyncio.Queue[SettledPattern] = asyncio.Queue(MAX_WAITING)
+        self._task: asyncio.Task[None] | None = None
         self._outage: asyncio.TimerHandle | None = None
 
-    @property
-    def estimator_pid(self) -> int | None:
-        """Process number of the estimator, if one runs."""
-        return None if self._estimator is None else self._estimator.pid
-
-    def observe(self, loop: Observers) -> None:
-        """Observe what the control loop reports."""
-        loop.contacts_changed.append(self._contacts_changed)
-        loop.pattern_applied.append(self._pattern_applied)
-        loop.silenced.append(lambda silenced: self.ended())
-
-    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
-        if self._readings is not None:
-            self._readings.contacts_changed(contacts)
-
-    def _pattern_applied(self, applied: PlayReport) -> None:
-        if self._readings is not None:
-            self._readings.pattern_applied(applied)
-
-    def ended(self) -> None:
-        """Note that nothing plays any more."""
-        if self._readings is not None:
-            self._readings.ended()
+    def summary(self, latency_ms: LatencySummary) -> LearningSummary:
+        """What is learned; latency_ms: of what `estimated` was called with."""
+        at = self._estimated_at
+        found = {
+            **self.event.model_dump(),
+            **self._counts,
+            "last_estimate_s": None if at is None else max(0.0, threads.now() - at),
+            "latency_ms": latency_ms,
+        }
+        return LearningSummary.model_validate(found)
 
     def open(self) -> None:
         """Start once the amplifiers are open; they are asked again after a failure."""
-        if self._estimator is None and "opening" not in self._tasks:
-            self._spawn("opening", self._open())
+        if self._task is None or (self._task.done() and not self.readings.sensors):
+            self._task = asyncio.create_task(self._run(), name="plate")
 
     async def forget(self) -> None:
         """Discard what was learned; answers are those of the table as built at once.
@@ -316,12 +313,11 @@ class Learning:
         Raises CommandError where nothing is learned, and where the file cannot be removed: then
         what was learned is still followed.
         """
-        if self.status.state == "off":
-            raise CommandError(f"nothing is learned of the plate: {self.status.cause}")
-        await self._end("opening", "estimator", "readings", "shaping")
-        self._estimator, self._readings, self._cautious = None, None, None
-        self._note_lost(waiting=0)
-        self._reset()
+        if not self.readings.sensors and self.event.remedy != _FAILED_REMEDY:
+            raise CommandError(f"nothing is learned of the plate: {self.event.cause}")
+        await self.close()
+        self._cautious = None
+        self._answer_by(*self._base, is_cautious=False)
         try:
             self._file.unlink(missing_ok=True)
         except OSError as error:
@@ -330,152 +326,177 @@ class Learning:
                 "writable for the daemon, then repeat era forget"
             ) from error
         finally:
-            if self._sensors is None:
-                self.open()
-            else:
-                self._start(self._sensors)
+            self.open()
 
     async def close(self) -> None:
         """End the estimator, which keeps what it has learned."""
-        if self._outage is not None:
-            self._outage.cancel()
-        await self._end(*self._tasks)
+        self._end_outage()
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+            self._task = None
 
-    async def _open(self) -> None:
-        """Ask the amplifiers for their sensors until they tell; start an estimator if they have."""
-        while True:
+    async def _run(self) -> None:
+        """Follow the plate until cancelled, or until that fails for good."""
+        try:
+            if not await self._has_sensors():
+                return
+            async with asyncio.TaskGroup() as beside:
+                reading = beside.create_task(self._read())
+                await self._keep_estimator()
+                reading.cancel()
+        except Exception as error:
+            _logger.exception("plate: learning failed")
+            self._say_failed(failure_text(error))
+        finally:
+            self._waiting = asyncio.Queue(MAX_WAITING)
+            self._discard()
+
+    async def _has_sensors(self) -> bool:
+        """Ask the amplifiers for their sensors until they tell; whether they have some of use."""
+        while not self.readings.sensors:
             try:
                 check_clocks(self._controller.amplifiers)
-                found = await plate_sensors(self._rig, self._controller.amplifiers)
+                self.readings.sensors, _ = await plate_sensors(
+                    self._rig, self._controller.amplifiers
+                )
             except CommandError as error:
                 self._say("off", str(error))
-                return
+                return False
             except DriverError as error:
-                self._say(
-                    "off",
-                    f"sensors not read: {error}; asking again every {_PAUSE:g} s",
-                    "check the link and the supply of the amplifiers",
-                )
+                cause = f"sensors not read: {error}; asking again every {_PAUSE:g} s"
+                self._say("off", cause, "check the link and the supply of the amplifiers")
                 await asyncio.sleep(_PAUSE)
-            else:
-                self._sensors = found.used
-                self._start(found.used)
+        return True
+
+    async def _keep_estimator(self) -> None:
+        """Replace the estimator whenever it fails, until that is final."""
+        self._say("off", "the estimator is starting")
+        backoff, failures = Backoff(first=1.0, maximum=60.0), 0
+        while True:
+            started_at, estimates = threads.now(), self._counts["estimates"]
+            try:
+                await self._estimate()
+            except InputError as error:
+                reason, failures = str(error), MAX_FAILURES
+            except OSError as error:
+                reason = str(error)
+            except Exception as error:
+                _logger.exception("plate: the estimator failed")
+                reason = failure_text(error)
+            finally:
+                self.worker = None
+                self._discard()
+            failures = 1 if self._counts["estimates"] > estimates else failures + 1
+            self._begin_outage()
+            if failures >= MAX_FAILURES:
+                self._say_failed(f"estimator: {reason}")
                 return
+            self._count("restarts")
+            self._say_failed(f"estimator: {reason}; retrying")
+            await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
-    def _start(self, sensors: Sequence[PlateSensor]) -> None:
-        self._say("starting", "the estimator is starting")
-        start = Start(
-            self._rig,
-            replace(self._base),  # without what is prepared in it
-            tuple(sensor.place for sensor in sensors),
-            self._controller.drive_mode,
-            self._file.absolute(),
-        )
-        self._estimator = EstimatorProcess(
-            start, received=self._received, failed=self._failed, timeouts=self._timeouts
-        )
-        self._spawn("estimator", self._estimator.run())
+    async def _estimate(self) -> None:
+        """Run one estimator; raises InputError for a rig of which nothing can be learned.
 
-    def _received(self, reply: Ready | Estimate | RefreshedAnswers | Note) -> None:
-        match reply:
-            case Ready():
-                self._ready(reply)
-            case Estimate():
-                self._take(reply)
-            case RefreshedAnswers():
-                self._cautious = reply.cautious
-                if not self.status.cautious and not self._is_held:
-                    self._correct(reply.answers)
-            case Note():
-                _logger.warning("plate: %s", reply.text)
-
-    def _ready(self, ready: Ready) -> None:
-        self._end_outage()
-        if ready.note:
-            _logger.warning("plate: learning anew: %s", ready.note)
-        self._cautious, self._is_held = ready.cautious, False
-        self._only_alarms = ready.only_alarms
-        if ready.answers is not None:
-            self._correct(ready.answers, is_cautious=bool(ready.change))
-        elif self.status.cautious:
-            self._reset()
-        if "readings" not in self._tasks:
-            self._spawn("readings", self._read(ready.settling))
-        if ready.change:
-            self._say("changed", ready.change, _CHANGED_REMEDY)
-        else:
-            known = "what was learned before" if ready.answers else "the rig as built"
-            self._say_followed(f"the plate is followed from {known} on")
-
-    def _say_followed(self, cause: str) -> None:
-        """Report that the plate is followed, or only watched."""
-        if self._only_alarms:
-            self._say(
-                "only_alarms",
-                f"answers stay as built: {self._only_alarms}",
-                "identify the plate (era rig identify)",
+        Raises OSError where it does not start, reply or live.
+        """
+        worker = self.worker = Worker()
+        try:
+            await worker.make(
+                START_LIMIT,
+                Estimator,
+                self._rig,
+                replace(self._base[0]),  # without what is prepared in it
+                [sensor.place for sensor in self.readings.sensors],
+                self._controller.drive_mode,
+                self._file.absolute(),
             )
-        else:
-            self._say("following", cause)
+            self.readings.settling, report, self._cautious = await worker.call(
+                START_LIMIT, Estimator.start
+            )
+            if self.event.cautious:
+                self._answer_by(*self._base, is_cautious=False)
+            self._follow(report)
+            keep_at = shape_at = threads.now()
+            while True:
+                if threads.now() >= shape_at and not self._is_shaped:
+                    await self._shape()
+                    shape_at = threads.now() + _SHAPE_INTERVAL
+                if (pattern := await self._pattern_until(keep_at)) is not None:
+                    report = await worker.call(ESTIMATE_LIMIT, Estimator.take, pattern)
+                    self._follow(report, pattern)
+                else:
+                    keep_at = threads.now() + _KEEP_INTERVAL
+                    note, cautious = await worker.call(ESTIMATE_LIMIT, Estimator.keep)
+                    self._note(note)
+                    self._cautious = cautious or self._cautious
+        finally:
+            with contextlib.suppress(Exception):
+                await worker.call(_CLOSE_LIMIT, Estimator.keep)
+            worker.end()
+
+    async def _pattern_until(self, moment: float) -> SettledPattern | None:
+        """The next pattern, None at a moment [s]."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(max(0.0, moment - threads.now())):
+                return await self._waiting.get()
+        return None
 
     def _hand(self, pattern: SettledPattern) -> None:
-        is_taken = self._estimator is not None and self._estimator.hand(pattern)
-        self._count(readings=1, discarded=0 if is_taken else 1)
+        self._count("readings")
+        try:
+            self._waiting.put_nowait(pattern)
+        except asyncio.QueueFull:
+            self._count("discarded")
 
-    def _take(self, estimate: Estimate) -> None:
-        self.estimated_at = threads.now()
-        self._is_held = estimate.is_held
-        if self._readings is not None:
-            self._end_outage()
-        self._count(estimates=1)
-        if estimate.alarm:
-            self._count(alarms=1)
-        if estimate.answers is not None:
-            self._correct(estimate.answers, is_cautious=bool(estimate.change))
-            self._estimated(threads.now() - estimate.time)
-        if estimate.change:
-            if estimate.explanation or self.status.state != "changed":
-                self._say("changed", estimate.change, _CHANGED_REMEDY)
-        elif estimate.explanation:
-            self._say("following", f"the plate has changed: {estimate.explanation}")
-        elif estimate.is_held:
-            if self.status.state != "explaining":
-                cause = "the plate is not as known; the next patterns tell what has changed"
-                self._say("explaining", cause)
-        elif estimate.alarm:
-            cause = f"the plate is not as the rig says (alarm {self.status.alarms})"
-            self._say(self.status.state, cause, self.status.remedy, is_alarm=True)
-        elif self.status.state in _UNUSUAL:
-            self._say_followed("the plate is again as it was")
+    def _follow(self, report: PlateReport, pattern: SettledPattern | None = None) -> None:
+        """Follow what the estimator has found at its start, or in a pattern."""
+        self._end_outage()
+        self._note(report.note)
+        if report.table is not None:
+            timing = self._timing.following(report.table)
+            self._answer_by(report.table, timing, is_cautious=report.state == "changed")
+            self._is_shaped = False
+            self._count("corrections")
+        if pattern is not None:
+            self._estimated_at = threads.now()
+            self._count("estimates")
+            if report.table is not None:
+                self._estimated(threads.now() - pattern.time)
+        self.event = self.event.model_copy(update={"alarms": self.event.alarms + report.is_alarm})
+        if report.is_alarm or (report.state, report.cause) != (self.event.state, self.event.cause):
+            is_bad = report.is_alarm or report.state == "changed"
+            self._say(report.state, report.cause, report.remedy, is_bad=is_bad)
 
-    def _reset(self) -> None:
-        self._answers.reset()
-        self.status = self.status.model_copy(update={"cautious": False})
+    def _note(self, note: str) -> None:
+        if note:
+            _logger.warning("plate: %s", note)
 
-    def _correct(self, answers: Answers, *, is_cautious: bool = False) -> None:
-        self._answers.replace(answers)
-        self.status = self.status.model_copy(update={"cautious": is_cautious})
-        self._count(corrections=1)
-        if answers.is_complete:
-            self._spawn("shaping", self._answers.shape_anew())
+    async def _shape(self) -> None:
+        """Shape onsets and endings for the present table, while nothing is on its way."""
+        table = self._table
+        timing, frequencies = Timing(table), table.frequencies.tolist()
+        while frequencies:
+            if not self._controller.cycle.is_preparing:
+                timing.prepare([frequencies.pop()])
+            await asyncio.sleep(_BETWEEN)
+        if self._table is table:
+            self._answer_by(table, timing, is_cautious=self.event.cautious)
+            self._is_shaped = True
 
-    def _note_lost(self, *, waiting: int) -> None:
-        """Count readings that will not be estimated, but for those that wait."""
-        status = self.status
-        lost = status.readings - status.estimates - status.discarded - waiting
-        self._count(discarded=max(lost, 0))
+    def _answer_by(self, table: LocalizationTable, timing: Timing, *, is_cautious: bool) -> None:
+        self._table, self._timing = table, timing
+        self._controller.replace_answers(table, timing)
+        self.event = self.event.model_copy(update={"cautious": is_cautious})
 
-    def _failed(self, reason: str, is_final: bool) -> None:
-        """Note that an estimator has ended."""
-        self._note_lost(waiting=0 if self._estimator is None else self._estimator.waiting)
-        self._await_outage()
-        if is_final:
-            self._say("failed", f"estimator: {reason}", _FAILED_REMEDY)
-        else:
-            self._count(restarts=1)
-            self._say("restarting", f"estimator: {reason}; retrying")
+    def _discard(self) -> None:
+        """Count readings that will not be estimated."""
+        counts = self._counts
+        others = counts["estimates"] + counts["discarded"] + self._waiting.qsize()
+        self._count("discarded", counts["readings"] - others)
 
-    def _await_outage(self) -> None:
+    def _begin_outage(self) -> None:
         """Answer cautiously after a while, unless the plate is watched again by then."""
         if self._outage is None:
             loop = asyncio.get_running_loop()
@@ -488,77 +509,41 @@ class Learning:
 
     def _answer_cautiously(self) -> None:
         """Stop trusting what was learned, since no estimator watches the plate."""
-        if self._cautious is None or self.status.cautious:
-            return
-        self._correct(self._cautious, is_cautious=True)
-        _logger.warning(
-            "plate: not watched for %g s, answers are those of a plate that is not known",
-            CAUTIOUS_AFTER,
-        )
-        self._changed(self.status)
+        if self._cautious is not None and not self.event.cautious:
+            timing = self._timing.following(self._cautious)
+            self._answer_by(self._cautious, timing, is_cautious=True)
+            self._count("corrections")
+            self._note(
+                f"not watched for {CAUTIOUS_AFTER:g} s, answers are those of a plate that is not "
+                "known"
+            )
+            self._changed(self.event)
 
     def _say(
-        self,
-        state: LearningState,
-        cause: str,
-        remedy: str | None = None,
-        *,
-        is_alarm: bool = False,
+        self, state: LearningState, cause: str, remedy: str | None = None, *, is_bad: bool = False
     ) -> None:
         """Set state, cause and remedy, log them and report the change."""
         said = {"state": state, "cause": cause, "remedy": remedy}
-        self.status = self.status.model_copy(update=said)
-        level = logging.WARNING if state in BAD or is_alarm else logging.INFO
-        _logger.log(level, "plate: %s: %s", state, cause, extra={"topic": "plate"})
-        self._changed(self.status)
+        self.event = self.event.model_copy(update=said)
+        level = logging.WARNING if is_bad else logging.INFO
+        words = LEARNING_WORDS[state]
+        _logger.log(level, "plate: %s: %s", words, cause, extra={"topic": "plate"})
+        self._changed(self.event)
 
-    def _count(self, **counts: int) -> None:
-        now = {key: getattr(self.status, key) + more for key, more in counts.items()}
-        self.status = self.status.model_copy(update=now)
+    def _say_failed(self, cause: str) -> None:
+        self._say("off", cause, _FAILED_REMEDY, is_bad=True)
 
-    def _spawn(self, name: str, work: Coroutine[Any, Any, None]) -> None:
-        """Run work in the only task of a name; the daemon goes on if it fails."""
-        if name in self._tasks:
-            self._tasks[name].cancel()
-        task = asyncio.create_task(self._guarded(name, work), name=f"plate {name}")
-        self._tasks[name] = task
-        task.add_done_callback(
-            lambda done: self._tasks.pop(name) if self._tasks.get(name) is done else None
-        )
+    def _count(self, name: str, more: int = 1) -> None:
+        self._counts[name] += more
 
-    async def _guarded(self, name: str, work: Coroutine[Any, Any, None]) -> None:
-        try:
-            await work
-        except Exception as error:
-            _logger.exception("plate: %s failed", name)
-            self._say("failed", failure_text(error), _FAILED_REMEDY)
-
-    async def _read(self, settling: float) -> None:
+    async def _read(self) -> None:
         """Read settled patterns; report failures and start again after them."""
         while True:
-            self._readings = SettledReadings(
-                self._rig,
-                self._controller.amplifiers,
-                self._sensors or (),
-                settling=settling,
-                take=self._hand,
-                disturbed=lambda: self._count(disturbed=1),
-            )
             try:
-                await self._readings.run()
+                await self.readings.run()
             except Exception as error:
                 _logger.exception("plate: readings failed")
-                self._readings = None
-                self._say(
-                    "failed",
-                    f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s",
-                    _FAILED_REMEDY,
-                )
-                self._await_outage()
+                cause = f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s"
+                self._say_failed(cause)
+                self._begin_outage()
             await asyncio.sleep(_PAUSE)
-
-    async def _end(self, *names: str) -> None:
-        ending = [self._tasks[name] for name in names if name in self._tasks]
-        for task in ending:
-            task.cancel()
-        await asyncio.gather(*ending, return_exceptions=True)

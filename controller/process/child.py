@@ -33,12 +33,20 @@ async def ended(process: asyncio.subprocess.Process, timeout: float) -> None:
     await process.wait()
 
 
+def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
+    """Let the kernel signal this process when its parent exits, on Linux; end where it has.
+
+    parent: its process number; number: of the signal.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent:
+        os._exit(0)  # the parent exited before prctl
+
+
 def _main() -> None:
     parent, module = int(sys.argv[1]), sys.argv[2]
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent:
-        return  # the parent exited before prctl
+    end_with_parent(parent)
     for number in (signal.SIGHUP, signal.SIGUSR1):
         signal.signal(number, signal.SIG_IGN)
     sys.argv[:] = [module, *sys.argv[3:]]

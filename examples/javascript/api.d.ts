@@ -372,7 +372,7 @@ export interface PlateEvent {
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
-  state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
+  state: "following" | "changed" | "off";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
   cautious: boolean;
   /** patterns so far that show another plate than the known one */
@@ -511,7 +511,7 @@ export interface LearningSummary {
   cause: string;
   /** what to do about it; null if nothing */
   remedy: string | null;
-  state: "off" | "starting" | "following" | "explaining" | "changed" | "only_alarms" | "restarting" | "failed";
+  state: "following" | "changed" | "off";
   /** whether answers are those of a plate that is not known: it has changed in an unknown way, or there was no estimator for a minute */
   cautious: boolean;
   /** patterns so far that show another plate than the known one */

@@ -15,6 +15,7 @@ The file of a learned plate holds parameters and covariance, beside the table th
 
 import hashlib
 import json
+import time
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -312,16 +313,6 @@ def _digest(text: str, x: np.ndarray, covariance: np.ndarray) -> bytes:
     return hashlib.sha256(text.encode() + x.tobytes() + covariance.tobytes()).digest()
 
 
-@dataclass(frozen=True, eq=False)
-class LearningStep:
-    """Result of a pattern for a table in service."""
-
-    report: PatternReport
-    """Report of the pattern."""
-    table: LocalizationTable | None
-    """The table from now on, None if it stays the same."""
-
-
 class LearnedTable:
     """A table in service, corrected by the settled patterns of its plate.
 
@@ -338,9 +329,12 @@ class LearnedTable:
         """The table as corrected so far."""
 
     @classmethod
-    def resumed(cls, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> Self:
+    def resumed(
+        cls, table: LocalizationTable, known: PlateEstimate, *, file: Path, now: float = 0.0
+    ) -> Self:
         """Resume with what the file holds, if it exists.
 
+        now: time [s] on the clock of the patterns; the plate has drifted since the file is written.
         Raises InputError for another kind of file, OtherPlate for one of another table or of other
         parameters.
         """
@@ -353,7 +347,8 @@ class LearnedTable:
                 f"{file}: parameters must be those of this rig and its sensors; remove the file to "
                 "learn anew"
             )
-        known = replace(known, state=learned.state, time=None, change=learned.change)
+        written_at = now - max(time.time() - file.stat().st_mtime, 0.0)
+        known = replace(known, state=learned.state, time=written_at, change=learned.change)
         resumed = cls(table, known, file=file)
         resumed.current = resumed._followed()
         return resumed
@@ -363,8 +358,8 @@ class LearnedTable:
         """How the plate has changed in a way that its parameters do not follow, or ""."""
         return self.live.known.change
 
-    def take(self, pattern: SettledPattern) -> LearningStep:
-        """Take a settled pattern, and correct the table by it.
+    def take(self, pattern: SettledPattern) -> tuple[PatternReport, LocalizationTable | None]:
+        """Take a settled pattern, and correct the table by it; None where that stays the same.
 
         Raises InputError or another ValueError for a pattern that leads to a plate that no table
         can follow; the state before it is restored, suspect patterns are discarded.
@@ -378,12 +373,12 @@ class LearnedTable:
             if not np.isfinite(state.x).all() or not np.isfinite(state.covariance).all():
                 raise InputError("parameters must be finite after a pattern, got others")
             if state is before.state and bool(change) == bool(before.change):
-                return LearningStep(report, None)
+                return report, None
             self.current = self._followed()
         except Exception:
             self.live = LivePlate(before)
             raise
-        return LearningStep(report, self.current)
+        return report, self.current
 
     def _followed(self) -> LocalizationTable:
         """The table for the plate as it is known now."""

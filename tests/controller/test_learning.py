@@ -1,7 +1,9 @@
-"""What the daemon says and answers by as its estimator replies, without a process."""
+"""Learning of the plate: what the daemon says and answers by, the estimator, and its process."""
 
 import asyncio
-import pickle
+import os
+import signal
+import sys
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
@@ -13,25 +15,13 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import pytest
 
-from controller.api.schema import LearningState
+from controller.api.schema import LatencySummary, LearningState, PlateEvent
+from controller.learning import estimator as estimator_module
 from controller.learning import learning as module
-from controller.learning.estimator import Estimator
-from controller.learning.estimator_process import (
-    Answers,
-    AnswersInUse,
-    Estimate,
-    EstimatorTimeouts,
-    Note,
-    Ready,
-    RefreshedAnswers,
-    Reply,
-    Start,
-    unpacked,
-)
+from controller.learning.estimator import Estimator, PlateReport, Worker
 from controller.learning.learning import Learning
 from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
-from drivers.playing import AmplifierLayer, AmplifierTone
 from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.estimate.forward import Sensor
@@ -47,6 +37,7 @@ class Taking:
 
     drive_mode = "switched"
     amplifiers: ClassVar[dict[str, object]] = {}
+    cycle = SimpleNamespace(is_preparing=False)
 
     def __init__(self) -> None:
         self.taken: list[LocalizationTable] = []
@@ -56,216 +47,281 @@ class Taking:
         self.taken.append(table)
 
 
-class Estimators:
-    """In place of processes: counts them, and replies what a test wants."""
-
-    def __init__(self) -> None:
-        self.count, self.pid, self.waiting = 0, None, 0
-        self.reply: Callable[[Reply], None] = lambda reply: None
-
-    def __call__(
-        self,
-        start: Start,
-        *,
-        received: Callable[[Reply], None],
-        failed: Callable[[str, bool], None],
-        timeouts: EstimatorTimeouts,
-    ) -> "Estimators":
-        """One more."""
-        self.count += 1
-        self.reply = received
-        return self
-
-    async def run(self) -> None:
-        """Until cancelled."""
-        await asyncio.Event().wait()
-
-
 class Readings:
-    """Of no sensors; `ending` ends them."""
+    """In place of those of sensors: `take` hands a pattern over, `ending` ends them."""
 
-    ending: asyncio.Event
-    count = 0
-
-    def __init__(self, *args: object, **kwargs: object) -> None:
-        Readings.count += 1
-        Readings.ending = asyncio.Event()
+    def __init__(self, *args: object, take: Callable[[SettledPattern], None], **more: object):
+        self.take, self.sensors, self.settling = take, (), 0.0
+        self.ending, self.count = asyncio.Event(), 0
 
     async def run(self) -> None:
         """Until they fail."""
-        await Readings.ending.wait()
+        self.count += 1
+        self.ending.clear()
+        await self.ending.wait()
         raise RuntimeError("a sensor of no kind")
 
 
+class Workers:
+    """In place of processes: counts them, and replies what a test wants.
+
+    started: what the next estimator reports at its start; reports: of the next patterns, an error
+    to raise, or None never to reply.
+    """
+
+    def __init__(self) -> None:
+        self.count, self.ended, self.pid = 0, 0, 1
+        self.started: PlateReport | Exception = FOLLOWED
+        self.reports = asyncio.Queue[PlateReport | Exception | None]()
+
+    def __call__(self) -> "Workers":
+        """One more."""
+        self.count += 1
+        return self
+
+    async def make(self, limit: float, *arguments: object) -> None:
+        """Begin."""
+        if isinstance(self.started, Exception):
+            raise self.started
+
+    async def call(self, limit: float, method: Callable[..., object], *arguments: object) -> Any:
+        """Reply, or raise TimeoutError."""
+        if method is Estimator.start:
+            return 0.2, self.started, CAUTIOUS
+        if method is Estimator.keep:
+            return "", None
+        async with asyncio.timeout(limit):
+            found = await self.reports.get()
+            if found is None:
+                await asyncio.Event().wait()
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def end(self) -> None:
+        """One less."""
+        self.ended += 1
+
+
 @pytest.fixture
-def estimators(monkeypatch: pytest.MonkeyPatch) -> Estimators:
-    """Of a learning whose amplifiers have sensors."""
-    found = Estimators()
+def workers(monkeypatch: pytest.MonkeyPatch) -> Workers:
+    """Of a learning whose amplifiers have a sensor."""
+    found = Workers()
 
     async def sensors(*args: object) -> Any:
-        return type("Sensors", (), {"used": ()})
+        return (SimpleNamespace(place=None),), ()
 
-    monkeypatch.setattr(module, "EstimatorProcess", found)
+    monkeypatch.setattr(module, "Worker", found)
     monkeypatch.setattr(module, "SettledReadings", Readings)
     monkeypatch.setattr(module, "plate_sensors", sensors)
     monkeypatch.setattr(module, "check_clocks", lambda amplifiers: None)
     return found
 
 
-def answers() -> Answers:
-    """Of the small table as it is."""
-    table = small_table()
-    return Answers(table.fingerprint, replace(table), is_complete=False)
-
-
-QUIET = Estimate(0.0, alarm=False, is_held=False, explanation="", change="", answers=None)
-
-
-def ready() -> Ready:
-    """Of an estimator that knows the plate."""
-    return Ready(0.2, "", "", None, answers(), change="")
+CAUTIOUS = replace(small_table())
+CORRECTED = replace(small_table())
+FOLLOWED = PlateReport("following", "the plate is followed", None)
+CHANGED = PlateReport("changed", "a crack", "look for it")
+WATCHED = PlateReport("off", "never measured", "measure it")
+PATTERN = SettledPattern(0.0, 110.0, np.zeros(4, dtype=complex), np.ones(4, dtype=complex))
 
 
 @asynccontextmanager
-async def opened(folder: Path) -> AsyncIterator[tuple[Learning, Taking]]:
-    """A learning whose estimator is started, closed at the end."""
-    taking = Taking()
+async def opened(folder: Path) -> AsyncIterator[tuple[Learning, Taking, list[PlateEvent]]]:
+    """A learning whose estimator is started, its controller and events, closed at the end."""
+    taking, events = Taking(), list[PlateEvent]()
     learning = Learning(
         make_paper_rig(12, 9),
         small_table(),
         Timing(small_table()),
         folder / "learned.npz",
         controller=cast(Controller, taking),
+        changed=events.append,
+        estimated=lambda latency: None,
     )
     learning.open()
     await asyncio.sleep(0.1)
-    yield learning, taking
-    await asyncio.sleep(0.1)
+    yield learning, taking, events
     await learning.close()
 
 
+async def hand(learning: Learning, *, count: int = 1) -> None:
+    """Hand patterns over, and wait until they are estimated."""
+    for _ in range(count):
+        cast(Any, learning.readings).take(PATTERN)
+    await asyncio.sleep(0.1)
+
+
+def counted(learning: Learning, *names: str) -> tuple[int, ...]:
+    """Counts of the status by their names."""
+    empty = LatencySummary(count=0, median=None, p99=None, p999=None, histogram=[])
+    status = learning.summary(empty)
+    return tuple(getattr(status, name) for name in names)
+
+
 @dataclass(frozen=True)
-class Told:
-    """What the estimator tells, and what is so thereafter, by the names of the status.
+class Course:
+    """What the estimator reports of a pattern, and what is so thereafter.
 
     taken: how many tables the controller has taken in all; levels: of what was logged for it.
     """
 
-    reply: Reply
+    report: PlateReport
     state: LearningState
     is_cautious: bool | None = None
     taken: int | None = None
     levels: Sequence[str] | None = None
 
 
-def watching() -> Ready:
-    """Of an estimator that can only give alarms."""
-    return replace(ready(), only_alarms="never measured")
-
-
-REFRESHED = RefreshedAnswers(answers(), answers())
-CHANGED, FOLLOWING = "changed", "following"
-EXPLAINING, ONLY_ALARMS = "explaining", "only_alarms"
+AGAIN = replace(FOLLOWED, cause="the plate is again as it was")
+HELD = replace(FOLLOWED, cause="the plate is not as known", is_alarm=True)
 COURSES = {
     # Changed and cautious, until an estimate says that it is as it was.
-    "a plate that had changed stays so over a restart": [
-        Told(replace(ready(), answers=answers(), change="a crack"), CHANGED, is_cautious=True),
-        Told(replace(QUIET, change="a crack"), CHANGED),
-        Told(replace(QUIET, answers=answers()), FOLLOWING, is_cautious=False),
-    ],
-    # Not while patterns are held or answers are cautious, and as soon as neither is so.
-    "refreshed answers are taken again after a change": [
-        Told(ready(), FOLLOWING),
-        Told(replace(QUIET, alarm=True, is_held=True), EXPLAINING),
-        Told(REFRESHED, EXPLAINING, taken=0),
-        Told(replace(QUIET, explanation="a crack", change="a crack", answers=answers()), CHANGED),
-        Told(REFRESHED, CHANGED, taken=1),
-        Told(replace(QUIET, answers=answers()), FOLLOWING),
-        Told(REFRESHED, FOLLOWING, taken=3),
-    ],
-    # Held, then quiet: the state is again that of a plate that was not measured.
-    "a watched plate is only watched after a failure": [
-        Told(watching(), ONLY_ALARMS),
-        Told(replace(QUIET, is_held=True), EXPLAINING),
-        Told(QUIET, ONLY_ALARMS),
-    ],
+    "a plate that had changed stays so over a restart": (
+        replace(CHANGED, table=CORRECTED),
+        [
+            Course(CHANGED, "changed", is_cautious=True, levels=[]),
+            Course(replace(AGAIN, table=CORRECTED), "following", is_cautious=False),
+        ],
+    ),
+    # Each change is a warning once; answers of a plate that is followed stay while it is not known.
+    "answers follow the plate again after a change": (
+        FOLLOWED,
+        [
+            Course(replace(FOLLOWED, table=CORRECTED), "following", taken=2, levels=[]),
+            Course(HELD, "following", is_cautious=False, taken=2, levels=["WARNING"]),
+            Course(
+                replace(CHANGED, table=CORRECTED),
+                "changed",
+                is_cautious=True,
+                taken=3,
+                levels=["WARNING"],
+            ),
+            Course(replace(AGAIN, table=CORRECTED), "following", is_cautious=False, taken=4),
+        ],
+    ),
     # It is all that such a plate can tell.
-    "an alarm of a watched plate is a warning": [
-        Told(watching(), ONLY_ALARMS),
-        Told(replace(QUIET, alarm=True), ONLY_ALARMS, levels=["WARNING"]),
-    ],
+    "an alarm of a watched plate is a warning": (
+        WATCHED,
+        [
+            Course(WATCHED, "off", levels=[]),
+            Course(replace(WATCHED, is_alarm=True), "off", taken=0, levels=["WARNING"]),
+        ],
+    ),
+    "a note is logged": (
+        FOLLOWED,
+        [Course(replace(FOLLOWED, note="not used"), "following", levels=["WARNING"])],
+    ),
 }
 
 
 @pytest.mark.parametrize("name", COURSES)
 @in_virtual_time
 async def test_status_follows_the_estimator(
-    estimators: Estimators, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
+    workers: Workers, tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """After each reply of a course."""
-    async with opened(tmp_path) as (learning, taking):
-        for told in COURSES[name]:
+    """State, answers and log are those of each report of a course, and each is an event."""
+    caplog.set_level("INFO")
+    workers.started, course = COURSES[name]
+    async with opened(tmp_path) as (learning, taking, events):
+        assert learning.event.state == workers.started.state
+        for each in course:
             caplog.clear()
-            estimators.reply(told.reply)
-            status = learning.status
-            assert status.state is told.state, told
-            assert told.is_cautious in (None, status.cautious), told
-            assert told.taken in (None, len(taking.taken)), told
-            assert told.levels in (None, [each.levelname for each in caplog.records]), told
+            workers.reports.put_nowait(each.report)
+            await hand(learning)
+            logged = [found.levelname for found in caplog.records]
+            assert learning.event.state == each.state, each
+            assert each.is_cautious in (None, learning.event.cautious), each
+            assert each.taken in (None, len(taking.taken)), each
+            assert each.levels in (None, logged), each
+            assert events[-1] == learning.event or not logged
+        alarms = sum(each.report.is_alarm for each in course)
+        assert learning.event.alarms == alarms
+        assert counted(learning, "readings", "estimates") == (len(course),) * 2
+
+
+@in_virtual_time
+async def test_onsets_are_shaped_anew_a_minute_after_a_correction(
+    workers: Workers, tmp_path: Path
+) -> None:
+    """Of several corrections in a minute, the first and the last are shaped, in one step each."""
+    async with opened(tmp_path) as (learning, taking, _):
+        for _ in range(2):
+            workers.reports.put_nowait(replace(FOLLOWED, table=CORRECTED))
+            await hand(learning)
+            await asyncio.sleep(15.0)
+        assert len(taking.taken) == 3
+        await asyncio.sleep(60.0)
+        assert len(taking.taken) == 4
+        assert counted(learning, "corrections") == (2,)
 
 
 @in_virtual_time
 async def test_file_that_cannot_be_removed_is_still_followed(
-    estimators: Estimators, tmp_path: Path
+    workers: Workers, tmp_path: Path
 ) -> None:
-    """`forget` names the file, and another estimator starts from it."""
-    async with opened(tmp_path) as (learning, _):
-        estimators.reply(ready())
-        await asyncio.sleep(0.1)
+    """`forget` names the file, and another estimator starts from it; then answers are as built."""
+    workers.started = replace(FOLLOWED, table=CORRECTED)
+    async with opened(tmp_path) as (learning, taking, _):
         (tmp_path / "learned.npz").mkdir()
         with pytest.raises(CommandError, match=r"learned\.npz"):
             await learning.forget()
-        assert estimators.count == 2
-        assert learning.status.state == "starting"
-        estimators.reply(replace(ready(), answers=answers()))
-        assert learning.status.state == "following"
+        assert taking.taken[-1] is not CORRECTED
+        await asyncio.sleep(0.1)
+        assert (workers.count, workers.ended) == (2, 1)
+        assert learning.event.state == "following"
+        assert taking.taken[-1] is CORRECTED
 
 
 @in_virtual_time
-async def test_readings_that_fail_are_started_anew(estimators: Estimators, tmp_path: Path) -> None:
-    """Failed with the cause at once; read again after a pause, and followed after an estimate."""
-    async with opened(tmp_path) as (learning, _):
-        estimators.reply(ready())
+async def test_what_waits_is_forgotten_with_the_plate(workers: Workers, tmp_path: Path) -> None:
+    """The next estimator gets no pattern from before, and those are counted."""
+    async with opened(tmp_path) as (learning, _, _):
+        await hand(learning, count=3)
+        await learning.forget()
         await asyncio.sleep(0.1)
-        before = Readings.count
-        Readings.ending.set()
+        workers.reports.put_nowait(FOLLOWED)
         await asyncio.sleep(0.1)
-        assert learning.status.state == "failed"
-        assert "a sensor of no kind" in learning.status.cause
+        assert counted(learning, "readings", "estimates", "discarded") == (3, 0, 3)
+
+
+@in_virtual_time
+async def test_readings_that_fail_are_started_anew(workers: Workers, tmp_path: Path) -> None:
+    """Off with the cause at once; read again after a pause, and followed after an estimate."""
+    async with opened(tmp_path) as (learning, _, _):
+        readings = cast(Readings, learning.readings)
+        readings.ending.set()
+        await asyncio.sleep(0.1)
+        assert learning.event.state == "off"
+        assert "a sensor of no kind" in learning.event.cause
+        assert learning.event.remedy is not None
         await asyncio.sleep(11.0)
-        assert Readings.count == before + 1
-        estimators.reply(QUIET)
-        assert learning.status.state == "following"
+        assert readings.count == 2
+        workers.reports.put_nowait(FOLLOWED)
+        await hand(learning)
+        assert learning.event.state == "following"
         await asyncio.sleep(61.0)
-        assert not learning.status.cautious
+        assert not learning.event.cautious
 
 
 @in_virtual_time
-async def test_readings_that_stay_away_make_answers_cautious(
-    estimators: Estimators, tmp_path: Path
+async def test_plate_that_is_not_watched_makes_answers_cautious(
+    workers: Workers, tmp_path: Path
 ) -> None:
-    """Nobody watches the plate: after a minute what was learned is not trusted."""
-    async with opened(tmp_path) as (learning, _):
-        estimators.reply(ready())
-        await asyncio.sleep(0.1)
-        Readings.ending.set()
-        await asyncio.sleep(61.0)
-        assert learning.status.cautious
+    """After a minute without readings what was learned is not trusted, and not before."""
+    async with opened(tmp_path) as (learning, taking, events):
+        cast(Readings, learning.readings).ending.set()
+        await asyncio.sleep(59.0)
+        assert not learning.event.cautious
+        await asyncio.sleep(2.0)
+        assert learning.event.cautious
+        assert events[-1].cautious
+        assert taking.taken == [CAUTIOUS]
 
 
 @in_virtual_time
 async def test_sensors_that_were_not_read_are_asked_for_again(
-    estimators: Estimators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Off with the link's error and a remedy; the estimator starts once they reply."""
     replying = module.plate_sensors
@@ -274,83 +330,169 @@ async def test_sensors_that_were_not_read_are_asked_for_again(
         raise LinkError("no reply of A")
 
     monkeypatch.setattr(module, "plate_sensors", silent)
-    async with opened(tmp_path) as (learning, _):
-        assert learning.status.state == "off"
-        assert "no reply of A" in learning.status.cause
-        assert learning.status.remedy is not None
+    async with opened(tmp_path) as (learning, _, _):
+        assert learning.event.state == "off"
+        assert "no reply of A" in learning.event.cause
+        assert learning.event.remedy is not None
+        with pytest.raises(CommandError, match="no reply of A"):
+            await learning.forget()
         monkeypatch.setattr(module, "plate_sensors", replying)
         await asyncio.sleep(11.0)
-        assert learning.status.state == "starting"
+        assert learning.event.state == "following"
 
 
 @in_virtual_time
-async def test_forget_asks_for_sensors_that_were_never_read(
-    estimators: Estimators, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+async def test_failure_to_read_sensors_is_said_again(
+    workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without them no estimator is started; a failure to read them is said again."""
+    """Without them no estimator is started; `forget` tries again, as an opened amplifier does."""
+    asked = 0
 
     async def failing(*args: object) -> None:
+        nonlocal asked
+        asked += 1
         raise RuntimeError("no such words")
 
     monkeypatch.setattr(module, "plate_sensors", failing)
-    async with opened(tmp_path) as (learning, _):
-        assert learning.status.state == "failed"
+    async with opened(tmp_path) as (learning, _, _):
+        assert "no such words" in learning.event.cause
         await learning.forget()
         await asyncio.sleep(0.1)
-        assert (learning.status.state, estimators.count) == ("failed", 0)
+        learning.open()
+        await asyncio.sleep(0.1)
+        assert (learning.event.state, workers.count, asked) == ("off", 0, 3)
 
 
-def estimator(file: Path, *, now: Callable[[], float] = time.monotonic) -> Estimator:
+@in_virtual_time
+async def test_estimator_that_fails_is_replaced(workers: Workers, tmp_path: Path) -> None:
+    """One that hangs or dies is ended and replaced after a second; its pattern alone is lost."""
+    async with opened(tmp_path) as (learning, _, _):
+        for failure, reason in ((None, "no reply"), (ChildProcessError("it died"), "it died")):
+            workers.reports.put_nowait(failure)
+            workers.reports.put_nowait(FOLLOWED)
+            began = workers.count
+            await hand(learning, count=2)
+            await asyncio.sleep(30.1 if failure is None else 0.0)
+            assert learning.event.state == "off"
+            assert reason in learning.event.cause or failure is None
+            assert (workers.count, workers.ended) == (began, began)
+            await asyncio.sleep(1.5 * began)
+            assert learning.event.state == "following"
+        assert counted(learning, "restarts", "estimates", "discarded") == (2, 2, 2)
+
+
+@in_virtual_time
+async def test_estimator_that_always_fails_is_given_up(workers: Workers, tmp_path: Path) -> None:
+    """After eight in a row, with the remedy; readings end, and `forget` starts anew."""
+    workers.started = ChildProcessError("its process has died")
+    async with opened(tmp_path) as (learning, taking, _):
+        await asyncio.sleep(600.0)
+        assert (workers.count, workers.ended) == (8, 8)
+        assert "era forget" in str(learning.event.remedy)
+        assert not taking.taken
+        assert counted(learning, "restarts") == (7,)
+        learning.open()
+        await asyncio.sleep(1.0)
+        assert workers.count == 8
+        workers.started = FOLLOWED
+        await learning.forget()
+        await asyncio.sleep(1.0)
+        assert learning.event.state == "following"
+
+
+@in_virtual_time
+async def test_rig_of_which_nothing_is_learned_is_not_tried_again(
+    workers: Workers, tmp_path: Path
+) -> None:
+    """Its InputError is the cause."""
+    workers.started = InputError("a plate that does not scale")
+    async with opened(tmp_path) as (learning, _, _):
+        await asyncio.sleep(600.0)
+        assert workers.count == 1
+        assert "does not scale" in learning.event.cause
+
+
+@in_virtual_time
+async def test_patterns_wait_for_a_slow_estimator_up_to_a_number(
+    workers: Workers, tmp_path: Path
+) -> None:
+    """One is estimated, 16 wait, and two more are discarded."""
+    async with opened(tmp_path) as (learning, _, _):
+        await hand(learning)
+        await hand(learning, count=18)
+        assert counted(learning, "readings", "discarded") == (19, 2)
+        for _ in range(17):
+            workers.reports.put_nowait(FOLLOWED)
+        await asyncio.sleep(1.0)
+        assert counted(learning, "estimates", "discarded") == (17, 2)
+
+
+def estimator(file: Path) -> Estimator:
     """Of the paper's rig, with a sensor at each ERA."""
     rig = make_paper_rig(12, 9)
     sensors = tuple(Sensor(era.name, era.name) for era in rig.eras)
-    return Estimator(Start(rig, small_table(), sensors, "switched", file), now=now)
+    return Estimator(rig, small_table(), sensors, "switched", file)
 
 
 def test_pattern_of_nothing_is_noted_and_leaves_no_file(tmp_path: Path) -> None:
-    """Sensors that read 0 give a note and an estimate of no change; nothing is to be saved."""
+    """Sensors that read 0 give a note, no alarm and no table; nothing is to be saved."""
     file = tmp_path / "learned.npz"
     found = estimator(file)
     count = len(small_table().eras)
     nothing = SettledPattern(1.0, 110.0, np.full(count, 1e-5 + 0j), np.zeros(count, dtype=complex))
-    note, estimate = found.take(nothing)
-    assert isinstance(note, Note)
-    assert not note.is_final
-    assert isinstance(estimate, Estimate)
-    assert (estimate.time, estimate.alarm, estimate.answers) == (1.0, False, None)
-    assert found.save() is None
+    report = found.take(nothing)
+    assert "not used" in report.note
+    assert (report.is_alarm, report.table) == (False, None)
+    assert found.keep() == ("", None)
     assert not file.exists()
+
+
+def test_rig_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
+    """Off, with the thickness that an identification would state, and how to get it."""
+    settled, report, cautious = estimator(tmp_path / "learned.npz").start()
+    assert report.state == "off"
+    assert "thickness" in report.cause
+    assert "identify" in str(report.remedy)
+    assert report.table is None
+    assert 0.2 <= settled <= 1.0
+    assert cautious.uncertainty == small_table().uncertainty
 
 
 def test_damaged_file_is_set_aside(tmp_path: Path) -> None:
     """It is renamed, byte for byte, the note names it, and the estimator starts anew."""
     file = tmp_path / "learned.npz"
     file.write_bytes(b"something else")
-    found = estimator(file)
+    _, report, _ = estimator(file).start()
     assert not file.exists()
     assert (tmp_path / "learned.npz.old").read_bytes() == b"something else"
-    assert "learned.npz.old" in found.note
-    assert found.ready().answers is None
+    assert "learned.npz.old" in report.note
+    assert report.table is None
 
 
 def test_folder_without_room_is_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attempts go on with each chore, and the next note is of another error."""
-    clock, errors = [0.0], [OSError(28, "No space left on device")]
+    """Attempts go on, the next note is of another error, and what was written is not again."""
+    errors: list[OSError | None] = [OSError(28, "No space left"), OSError(30, "Read-only"), None]
+    written = 0
 
     def save(learned: LearnedTable) -> None:
-        raise errors[0]
+        nonlocal written
+        if errors[0] is not None:
+            raise errors[0]
+        written += 1
 
-    found = estimator(tmp_path / "learned.npz", now=lambda: clock[0])
+    def take(learned: LearnedTable, pattern: SettledPattern) -> tuple[object, LocalizationTable]:
+        return SimpleNamespace(alarm=False, is_held=False, explanation=None), small_table()
+
     monkeypatch.setattr(LearnedTable, "save", save)
-    monkeypatch.setattr(found, "_is_saved", False)
+    monkeypatch.setattr(LearnedTable, "take", take)
+    found = estimator(tmp_path / "learned.npz")
+    found.take(PATTERN)
     notes = []
-    for second in range(10, 60, 10):
-        clock[0] = float(second)
-        if second == 40:
-            errors[0] = OSError(30, "Read-only file system")
-        notes.append(found.chores())
-    assert [len(each) for each in notes] == [1, 0, 0, 1, 0]
-    assert all(isinstance(note, Note) for each in notes for note in each)
+    for _ in range(3):
+        notes.append([bool(found.keep()[0]) for _ in range(2)])
+        errors.append(errors.pop(0))
+    assert notes == [[True, False], [True, False], [False, False]]
+    assert written == 1
 
 
 def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
@@ -363,23 +505,124 @@ def test_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
     assert other.exists()
 
 
-def test_answers_of_another_table_are_refused() -> None:
-    """By its fingerprint, and nothing is replaced; those of the own one are, and can be reset."""
-    base, taken = small_table(), list[LocalizationTable]()
-    controller = SimpleNamespace(replace_answers=lambda table, timing: taken.append(table))
-    in_use = AnswersInUse(cast(Controller, controller), base, Timing(base))
-    other = replace(base, masses=(), eras=base.eras[::-1])
-    with pytest.raises(InputError, match="table"):
-        in_use.replace(Answers(other.fingerprint, other, is_complete=True))
-    assert taken == []
-    own = replace(base)
-    in_use.replace(Answers(base.fingerprint, own, is_complete=False))
-    in_use.reset()
-    assert taken == [own, base]
+class Busy:
+    """An object of a worker."""
+
+    def nap(self, seconds: float) -> int:
+        """Sleep, and return the process number."""
+        time.sleep(seconds)
+        return os.getpid()
+
+    def grow(self, size: int) -> int:
+        """Take memory."""
+        return len(bytearray(size))
 
 
-def test_no_command_comes_by_a_message() -> None:
-    """What an amplifier could play is refused, wherever it stands in it."""
-    layer = AmplifierLayer(0, (AmplifierTone(0, 110.0, 1.0),))
-    with pytest.raises(pickle.UnpicklingError, match="drivers"):
-        unpacked(pickle.dumps(Note([layer])))  # type: ignore[arg-type]
+@asynccontextmanager
+async def working() -> AsyncIterator[Worker]:
+    """A worker with an object."""
+    worker = Worker()
+    try:
+        await worker.make(60.0, Busy)
+        yield worker
+    finally:
+        worker.end()
+
+
+def exists(pid: int) -> bool:
+    """Whether a process runs."""
+    try:
+        return " Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2][:3]
+    except OSError:
+        return False
+
+
+async def gone(*pids: int) -> bool:
+    """Whether processes end within a minute."""
+    for _ in range(1200):
+        if not any(map(exists, pids)):
+            return True
+        await asyncio.sleep(0.05)
+    return False
+
+
+@pytest.mark.real_time
+async def test_worker_that_hangs_holds_nothing() -> None:
+    """Its call ends in time, the loop goes on meanwhile, and `end` returns at once and kills it."""
+    async with working() as worker:
+        assert await worker.call(60.0, Busy.nap, 0.0) == worker.pid
+        ticks = asyncio.create_task(asyncio.sleep(0.1))
+        with pytest.raises(TimeoutError, match=r"no reply within 0\.3 s"):
+            await worker.call(0.3, Busy.nap, 1e3)
+        assert ticks.done()
+        began = time.monotonic()
+        worker.end()
+        assert time.monotonic() - began < 0.2
+        assert worker.pid is not None
+        assert await gone(worker.pid)
+
+
+@pytest.mark.real_time
+async def test_worker_that_dies_is_reported() -> None:
+    """At the call that it was killed in, and at the next one."""
+    async with working() as worker:
+        assert worker.pid is not None
+        napping = asyncio.create_task(worker.call(60.0, Busy.nap, 1e3))
+        await asyncio.sleep(0.1)
+        os.kill(worker.pid, signal.SIGKILL)
+        for call in (napping, worker.call(60.0, Busy.nap, 0.0)):
+            with pytest.raises(ChildProcessError):
+                await call
+
+
+@pytest.mark.real_time
+async def test_worker_may_not_take_all_memory() -> None:
+    """Twice its limit is refused to it, and it goes on; half of it is not."""
+    async with working() as worker:
+        with pytest.raises(MemoryError):
+            await worker.call(60.0, Busy.grow, 2 * estimator_module.MAX_MEMORY)
+        assert await worker.call(60.0, Busy.grow, 1000) == 1000
+
+
+@pytest.mark.real_time
+async def test_signals_to_all_processes_of_a_daemon_do_not_end_a_worker() -> None:
+    """Such as Ctrl-C, `systemctl kill` and a reload: the daemon ends it when it is done."""
+    async with working() as worker:
+        assert worker.pid is not None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+            os.kill(worker.pid, number)
+        assert await worker.call(60.0, Busy.nap, 0.0) == worker.pid
+
+
+PARENT = """
+import asyncio, os, time
+from controller.learning.estimator import Worker
+
+async def main():
+    worker = Worker()
+    await worker.make(60.0, dict)
+    children = open(f"/proc/self/task/{os.getpid()}/children").read()
+    print(worker.pid, children, flush=True)
+    time.sleep(1000)
+
+if __name__ == "__main__":
+    asyncio.run(main())
+"""
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("is_stopped", [False, True])
+async def test_worker_ends_with_a_daemon_that_was_killed(tmp_path: Path, is_stopped: bool) -> None:
+    """By kill -9, also where the worker is stopped itself; nothing else of it is left either."""
+    file = tmp_path / "parent.py"
+    file.write_text(PARENT)
+    pipe = asyncio.subprocess.PIPE
+    parent = await asyncio.create_subprocess_exec(sys.executable, str(file), stdout=pipe)
+    assert parent.stdout is not None
+    worker, *others = map(int, (await parent.stdout.readline()).split())
+    assert worker in others
+    if is_stopped:
+        os.kill(worker, signal.SIGSTOP)
+    parent.kill()
+    await parent.wait()
+    assert await gone(*others)

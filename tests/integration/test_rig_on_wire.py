@@ -32,8 +32,8 @@ from controller.api.schema import LearningSummary
 from controller.cli.commands import app
 from controller.daemon.daemon import Daemon
 from controller.demo.recorder import FingerVibration, steady_contrast_db
-from controller.learning.estimator_process import EstimatorTimeouts
-from controller.learning.learning import Learning
+from controller.learning import learning as learning_module
+from controller.learning.estimator import Worker
 from controller.process.daemon_process import SocketLock
 from daemons import PATIENCE, daemon_at, far_end, ready
 from drivers.errors import CommandError, LinkError
@@ -290,10 +290,22 @@ IDENTIFIED = (
 )
 """Of a rig's file: what an identification leaves."""
 
-NO_TIMEOUTS = EstimatorTimeouts(start=1e9, estimate=1e9)
 _APART, _MARGIN = 0.05, 0.02  # m
 _FELT = 0.2  # s
 _REAL_WAIT = 0.05  # s; for a reply of the process
+
+
+class BusyWorker(Worker):
+    """A worker whose calls that have no reply yet are counted."""
+
+    calls = 0
+
+    async def _result(self, limit: float, function: Callable[..., Any], *arguments: object) -> Any:
+        BusyWorker.calls += 1
+        try:
+            return await super()._result(limit, function, *arguments)
+        finally:
+            BusyWorker.calls -= 1
 
 
 @dataclass
@@ -311,17 +323,13 @@ class LearningBench:
     def estimator(self) -> int:
         """Process number of the estimator."""
         assert self.daemon.learning is not None
-        assert self.daemon.learning.estimator_pid is not None
-        return self.daemon.learning.estimator_pid
+        assert self.daemon.learning.worker is not None
+        assert self.daemon.learning.worker.pid is not None
+        return self.daemon.learning.worker.pid
 
     def is_estimating(self) -> bool:
         """Whether the estimator works, so that time is to stand still."""
-        learning = self.daemon.learning
-        if learning is None or learning.estimator_pid is None or not self.stands:
-            return False
-        status = learning.status
-        is_starting = status.state in ("starting", "restarting")
-        return is_starting or status.estimates + status.discarded < status.readings
+        return self.stands and BusyWorker.calls > 0
 
     async def learning(self) -> LearningSummary:
         """What it has learned."""
@@ -329,11 +337,11 @@ class LearningBench:
         assert found is not None
         return found
 
-    async def until(self, *states: str) -> LearningSummary:
-        """Wait until it is in one of these states."""
+    async def until(self, state: str, cause: str = "") -> LearningSummary:
+        """Wait until it is in a state for a cause."""
         while True:
             found = await self.learning()
-            if found.state in states:
+            if found.state == state and cause in found.cause:
                 return found
             await asyncio.sleep(0.05)
 
@@ -386,14 +394,16 @@ class LearningBench:
 
 @asynccontextmanager
 async def learning_bench(
-    folder: Path, *, uncertainty: str = IDENTIFIED, timeouts: EstimatorTimeouts = NO_TIMEOUTS
+    folder: Path, *, uncertainty: str = IDENTIFIED, limit: float = 1e9
 ) -> AsyncIterator[LearningBench]:
-    """A daemon that learns of a plate; uncertainty: in its rig's text."""
+    """A daemon that learns of a plate; uncertainty: in its rig's text, limit: for a pattern [s]."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, _StandingLoop)
     changes = [("\nplate:", f"\n{uncertainty}plate:")]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(Learning.__init__.__kwdefaults__, "timeouts", timeouts)  # type: ignore[arg-type]
+        patch.setattr(learning_module, "Worker", BusyWorker)
+        patch.setattr(learning_module, "START_LIMIT", 1e9)
+        patch.setattr(learning_module, "ESTIMATE_LIMIT", limit)
         async with (
             far_end(folder, changes=changes) as far,
             daemon_at(far, folder, "learn: learned.npz\n", changes=changes, table=_table) as bench,
@@ -483,12 +493,11 @@ async def contrast(bench: LearningBench) -> float:
 @beside_a_process
 async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
     """Killed, another follows; stopped, it is replaced; meanwhile and after touches play."""
-    timeouts = EstimatorTimeouts(start=1e9, estimate=3.0)
-    async with learning_bench(tmp_path, timeouts=timeouts) as bench:
+    async with learning_bench(tmp_path, limit=3.0) as bench:
         await bench.until("following")
         first = bench.estimator
         os.kill(first, signal.SIGKILL)
-        await bench.until("restarting")
+        await bench.until("off")
         assert await bench.touch(*PAIR) is not None
         await bench.until("following")
         second = bench.estimator
@@ -506,8 +515,7 @@ async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
 async def test_plate_that_was_not_measured_is_only_watched(tmp_path: Path) -> None:
     """With the thickness of a drawing, to 2 %, answers stay as built, and the cause says so."""
     async with learning_bench(tmp_path, uncertainty="uncertainty: {}\n") as bench:
-        found = await bench.until("only_alarms")
-        assert "thickness" in found.cause
+        await bench.until("off", "thickness")
         found = await bench.patterns(1)
         assert found.corrections == 0
 

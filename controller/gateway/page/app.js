@@ -269,12 +269,12 @@ const HANDLERS = {
     showLatency(at("latency-numbers"), at("latency"), latency_ms);
   },
   plate({ state, cause, remedy, cautious, alarms }) {
-    const isBad = cautious || state === "failed" || state === "restarting";
+    const words = state === "changed" ? "changed, promises lowered until you run era rig check" : state;
     const isAlarm = alarms > knownAlarms;
     knownAlarms = alarms;
-    at("known").textContent = `Plate ${state.replace("_", " ")}: ${cause}`;
-    at("known").classList.toggle("bad", isBad);
-    if (isBad || state === "explaining" || isAlarm) addEvent(log, "warning", cause, remedy);
+    at("known").textContent = `Plate ${words}: ${cause}`;
+    at("known").classList.toggle("bad", cautious);
+    if (cautious || remedy || isAlarm) addEvent(log, "warning", cause, remedy);
   },
   inputs({ inputs, rejected_touches }) {
     const lacking = inputs.filter(({ problem }) => problem);

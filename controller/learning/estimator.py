@@ -194,7 +194,7 @@ class Worker:
 
     def __init__(self) -> None:
         before = {*active_children()}
-        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, (os.getpid(),))
+        self._pool = ProcessPoolExecutor(1, get_context("spawn"), _start_process, (os.getpid(),))
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_DAEMON)  # the process inherits it
         try:
             self._pool.submit(os.getpid)
@@ -233,8 +233,8 @@ class Worker:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _begin(parent: int) -> None:
-    """Begin the process of a worker."""
+def _start_process(parent: int) -> None:
+    """Start the process of a worker."""
     end_with_parent(parent, signal.SIGKILL)
     with contextlib.suppress(OSError):
         os.nice(_NICE)

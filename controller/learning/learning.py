@@ -388,7 +388,7 @@ class Learning:
                 self.worker = None
                 self._discard()
             failures = 1 if self._counts["estimates"] > estimates else failures + 1
-            self._begin_outage()
+            self._start_outage()
             if failures >= MAX_FAILURES:
                 self._say_failed(f"estimator: {reason}")
                 return
@@ -496,7 +496,7 @@ class Learning:
         others = counts["estimates"] + counts["discarded"] + self._waiting.qsize()
         self._count("discarded", counts["readings"] - others)
 
-    def _begin_outage(self) -> None:
+    def _start_outage(self) -> None:
         """Answer cautiously after a while, unless the plate is watched again by then."""
         if self._outage is None:
             loop = asyncio.get_running_loop()
@@ -545,5 +545,5 @@ class Learning:
                 _logger.exception("plate: readings failed")
                 cause = f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s"
                 self._say_failed(cause)
-                self._begin_outage()
+                self._start_outage()
             await asyncio.sleep(_PAUSE)

@@ -7,9 +7,8 @@ import numpy as np
 from benchmarks.identification.hidden import Hidden
 from benchmarks.identification.thin_plate import Mounted, Reals
 from model.estimate.forward import Sensor, jacobian
-from model.estimate.identify import Identification
+from model.estimate.identify import Identification, model_of, relevant
 from model.estimate.space import KINDS
-from model.estimate.stages import Setting, relevant
 
 _WITHIN = 1.96
 _REGION = 5.991  # of two normal numbers
@@ -18,9 +17,9 @@ _PLACES = np.array([(0.25, 0.2), (0.5, 0.5), (0.8, 0.4), (0.35, 0.75)])
 
 def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
     """Errors in standard deviations by kind: springs and dampers over mass, gains, frequencies."""
-    space, posterior, plate = found.posterior.space, found.posterior, found.before.plate
+    space, x, plate = found.fitted.space, found.fitted.x, found.before.plate
     mass = np.log(own.plate.thickness / plate.thickness)
-    model = found.fitted.problem.model
+    model = found.fitted.model
     elastic = np.sort(own.plate.modes[0])[3 : 3 + len(model.shifted_modes)]
     solved = model.free
     theory = solved.modes.eigenvalues[model.shifted_modes]
@@ -36,41 +35,39 @@ def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
         "gain": gain - gain.mean(),
         "phase": phase - phase.mean(),
     }
-    errors, stds = {}, posterior.stds()
+    errors, stds = {}, found.stds()
     for kind, value in true.items():
-        estimate = relevant(space)[kind] @ (space.std * posterior.x)
+        estimate = relevant(space)[kind] @ (space.std * x)
         errors[kind] = (estimate - value) / stds[kind]
     places = space.groups["place"]
     written = np.array([(era.x, era.y) for era in found.before.eras])
-    errors["place"] = (space.std[places] * posterior.x[places] - (own.at - written).ravel()) / stds[
-        "place"
-    ]
+    errors["place"] = (space.std[places] * x[places] - (own.at - written).ravel()) / stds["place"]
     if len(own.masses) and len(found.values.masses):
         x, y, weight = own.masses[0]
         at = space.groups["masses"].start
         off = found.values.masses[0] - [weight, x, y]
-        std = np.hypot(posterior.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
+        std = np.hypot(found.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
         errors["mass"] = off / std
     return errors
 
 
 def fields_held(found: Identification, hidden: Hidden, frequencies: Reals) -> Reals:
     """Squared distances of true fields from those identified, in their covariance, (values,)."""
-    plate, model = found.before.plate, found.fitted.problem.model
+    plate, model = found.before.plate, found.fitted.model
     points = _PLACES * [plate.length, plate.width]
     pads = [Sensor(f"point {n}", x=x, y=y) for n, (x, y) in enumerate(points.tolist())]
-    setting = Setting(found.before, model.free, found.fitted.problem.measurement)
-    tones = frequencies[1::4]
-    wider = replace(setting.model(model.mass_count, more=pads), frequencies=tones)
-    known = found.posterior.within(wider.space)
-    at = wider.at(known.x)
+    masses, tones = model.mass_count, frequencies[1::4]
+    wider = model_of(found.before, model.free, found.fitted.measurement, masses=masses, more=pads)
+    wider = replace(wider, frequencies=tones)
+    x, covariance = found.within(wider.space)
+    at = wider.at(x)
     J = jacobian(at)[:, len(model.sensors) :]
     own_fields = at.responses[:, len(model.sensors) :]
     nothing = np.zeros((0, 4))
     true = np.array([hidden.felt(float(f), points, points, nothing) for f in tones])
     error = own_fields - true
     parts = np.stack([J.real, J.imag], axis=-2)
-    spread = parts @ known.covariance @ parts.swapaxes(-1, -2)
+    spread = parts @ covariance @ parts.swapaxes(-1, -2)
     both = np.stack([error.real, error.imag], axis=-1)
     solved = np.linalg.solve(spread, both[..., None])[..., 0]
     return np.asarray((both * solved).sum(axis=-1)).ravel()

@@ -28,10 +28,10 @@ from model.estimate.calibration_fit import (
     start_at,
     without_form,
 )
-from model.estimate.identify import quality_rows, value_rows
+from model.estimate.fit import relative_rms
+from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
 from model.estimate.measurement import LEAST_SENSORS, Responses, Screening, check_enough_sensors
 from model.estimate.space import KINDS, MASS_CELLS
-from model.estimate.stages import HELD_OUT_FOLDS, relative_rms
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error

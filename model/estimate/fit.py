@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from model.arrays import ComplexArray, FloatArray, best_first
+from model.arrays import ComplexArray, FloatArray, best_by, best_first
 from model.estimate.forward import ForwardModel, PlateAt, by_mass_at, jacobian
 from model.estimate.measurement import Measurement
 from model.estimate.space import Space
@@ -370,6 +370,17 @@ def prediction_errors(
     return other, np.asarray(squares), np.asarray(variance)
 
 
+def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
+    """Root mean square of errors, each relative to the rms of its responses, by their squares.
+
+    0 where what was subtracted from the squares, such as noise, exceeds them; infinite without any
+    finite value.
+    """
+    share = squares / mean_squares
+    known = share[np.isfinite(share)]
+    return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
+
+
 def likeliest(found: Sequence[Fit]) -> Fit:
-    """The fit of least cost, the first of equals."""
-    return min(found, key=lambda each: each.cost)
+    """The fit of least cost, the first of those that are nearly equal."""
+    return best_by(found, lambda each: -each.cost)

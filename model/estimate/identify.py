@@ -1,40 +1,72 @@
 """Identification of a rig by responses measured in place, the contrast it gives, and its report.
 
+Fitting all parameters at once ends in wrong minima. So springs, damping, thickness and gains come
+first, from several thicknesses and with a noise that hides the rest; then one additional mass, from
+where it would explain most; then everything with the noise as measured. A second mass is added only
+where the first leaves something that it explains. A board with a grain is then fitted again with
+the moduli across and of shear that the shifts of its modes suggest: boards of one kind differ in
+each by 10 % and more. To first order shifts m (k,), in standard deviations s, with covariance C,
+follow from logarithms d of factors on the moduli, of prior variance D:
+
+    d = (J^T (1 - C) J + D^-1)^-1 J^T m,   J = (v^T dK v / lambda) / s,
+
+where the first column of J, all ones, stands for a modulus that is fitted anew.
+
+A response to a moving base does not change if mass, springs and dampers are scaled together, nor
+does a contrast if all drives are. Answers depend on each natural frequency, on each spring and
+damper relative to the plate's mass, on each gain relative to the others, and levels on the mean of
+the gains: responses give only its product with that of the sensors (`relevant`).
+
+The fit is checked on paths from an ERA to a sensor that it was not shown, every fifth one, five
+times over; the reverse of a hidden path is hidden as well. Hidden paths show how far fields are off
+that are not measured; hidden tones would show whether a resonance was seen, which the covariance
+knows. Only the part of the error that neither noise nor uncertain parameters explain counts against
+the model. By that part parameters disagree between fits to different paths, beyond their covariance
+(a jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM
+1982, ch. 3). Where the measurement leaves a quantity unknown, `unknowns` names the tone and the
+sensor that would show it.
+
 The contrast to expect is that of answers on plates within the remaining uncertainty, solved
-exactly. Reports are made as text and as JSON."""
+exactly.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from model.answer.plan import query
 from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
-from model.arrays import FloatArray
+from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
+from model.estimate.fit import Fit, fit, likeliest, prediction_errors, relative_rms
+from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.estimate.measurement import Measurement
-from model.estimate.space import KINDS, MAX_GUESSED, Space, Values, rig_with
-from model.estimate.stages import (
-    HELD_OUT_FOLDS,
-    FittedModel,
-    HeldOutPaths,
-    Posterior,
-    Setting,
-    chi2,
-    fit_board,
-    hold_out,
-    unknowns,
+from model.estimate.space import (
+    KINDS,
+    MAX_GUESSED,
+    MODE_SHIFTS,
+    Space,
+    Values,
+    inwards,
+    plate_with,
+    rig_with,
+    space_of,
 )
+from model.finger import Grid
 from model.processes import Progress, unseen
 from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
+from model.spectral.direct_solution import grain_slopes
 from model.spectral.modes import PlateMesh, SpectralMesh
-from model.structure.modal_elasticity import check_measurable
+from model.structure.modal_elasticity import check_measurable, lowest_elastic
+from model.structure.plate import Plate
 from model.study.contrast_maps import MIN_DISTANCE, random_contacts
 from model.study.verification import draw_plates, felt_on
 from model.table.table_file import build_table
@@ -72,6 +104,78 @@ _ALWAYS_LISTED = (
 )
 
 
+_EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
+_THICKNESSES = (0.0, 1.5, -1.5)  # standard deviations from which the first stage starts
+_FREQUENCY_MARGIN = 1.02  # since layers do not stiffen all modes alike
+_GOOD = 0.5  # chi² with the extra noise that needs no further start
+_INWARDS = 0.6  # standard deviations by which places start from an edge
+_MASS_GRID = Grid(8, 6)  # where an additional mass is sought
+_MASS_STARTS = 4
+_MORE_MASS_BEYOND = 1.5  # chi²
+_MASS_GAINS = 25.0  # of the cost: five standard deviations
+
+_SIMPLE = (
+    "thickness",
+    "stiffness",
+    "damping",
+    "damping_each",
+    "loss",
+    "gain",
+    "phase",
+    "inertia",
+    "drag",
+    "delay",
+    "sensor_gain",
+    "sensor_phase",
+)
+_LOCATED = (*_SIMPLE, "place", "masses")
+
+_THEORY = {
+    "frequency": KINDS["mode_shifts"].theory / 2,
+    "stiffness": KINDS["stiffness"].theory,
+    "damping": KINDS["damping_each"].theory,
+    "place": KINDS["place"].theory,
+}
+
+HELD_OUT_FOLDS = 5
+"""One path or sensor in so many is held out."""
+
+_MAX_PREDICTION_ERROR = 0.1  # of the rms at a tone; less certain predictions are no test
+_MIN_PREDICTED = 16  # values
+_IN_COMMON = 2.0  # factor on standard deviations: what no path shows is wrong in all fits alike
+
+_UNKNOWN = 0.5
+"""Share of its standard deviation beforehand, beyond which a quantity was not identified.
+
+The standard deviation is that of a plate that was not measured where the rig states less: answers
+need no more.
+"""
+
+_SUSPENSION_FELT = 120.0  # Hz; above it a suspension that is 20 % off changes fields by under 5 %
+
+_ADVISED_STEP = 20.0  # Hz between the tones that may be advised
+_ADVISED_NOISE = 0.01  # of the rms of the responses at a tone
+_ADVISED_PLACES = (0.13, 0.5, 0.87)  # of the sides, where further sensors may be advised
+
+_GRAIN_PRIOR = 0.15  # standard deviation of the logarithms of a board's moduli by its kind
+_MIN_GRAIN_CHANGE = 3e-3  # of a logarithm, that is worth another fit
+_GRAIN_STARTS = (1.0, 0.85, 1.18)  # factors on the modulus across, since fits end in wrong minima
+_GRAIN_ROUNDS = 3  # fits from a start, each with the grain that the one before shows
+_GRAIN_GOOD = 1.0  # chi², and mean square of the shifts of modes, that need no further start
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutPaths:
+    """Errors of prediction at paths held out of a fit, rms relative to the responses at a tone."""
+
+    total: float
+    """Without the part that noise explains."""
+    unexplained: float
+    """Without the part that noise and the uncertain parameters explain together."""
+    disagreement: FloatArray
+    """Covariance (p, p) of x to add to that of the fit."""
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
     """A rig as its responses show it."""
@@ -81,19 +185,29 @@ class Identification:
     rig: Rig
     """The rig with identified values and, where the model explains the measurement, their
     uncertainty."""
-    values: Values
-    """Values of the parameters, gains of sensors among them."""
-    posterior: Posterior
-    """Distribution of the parameters, wider by the disagreement of held-out paths."""
-    chi2: float
-    """Squared residuals per degree of freedom."""
-    mode_shift: float
-    """Rms by which the lowest modes had to shift, in standard deviations."""
+    fitted: Fit
+    """The most likely parameters."""
+    covariance: FloatArray
+    """Covariance (p, p) of the parameters, wider by the disagreement of held-out paths."""
     held_out: HeldOutPaths | None
     """Prediction of unseen paths, None where there are too few."""
-    fitted: FittedModel
     seed: int
     """Seed of the contacts that a promise draws."""
+
+    @property
+    def chi2(self) -> float:
+        """Squared residuals per degree of freedom."""
+        return self.fitted.chi2
+
+    @property
+    def values(self) -> Values:
+        """Values of the parameters, gains of sensors among them."""
+        return self.fitted.plate.values
+
+    @cached_property
+    def mode_shift(self) -> float:
+        """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
+        return _rms(self.fitted.x[self.fitted.space.of("mode_shifts")])
 
     @property
     def is_explained(self) -> bool:
@@ -104,6 +218,52 @@ class Identification:
     def is_known_well(self) -> bool:
         """Whether the modes are those of the rig's plate, and with them fields between sensors."""
         return self.mode_shift <= MAX_MODE_SHIFT
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard deviation of each parameter in its unit (p,)."""
+        return np.asarray(self.fitted.space.std * np.sqrt(np.diagonal(self.covariance)))
+
+    def stds(self) -> dict[str, FloatArray]:
+        """Standard deviations of what answers depend on, with the errors of the theory, by kind."""
+        space = self.fitted.space
+        own = {kind: std_of(rows, space, self.covariance) for kind, rows in relevant(space).items()}
+        own["place"] = self.std[space.groups["place"]]
+        return {
+            kind: np.where(std > 0, np.hypot(std, _THEORY.get(kind, 0.0)), 0.0)
+            for kind, std in own.items()
+        }
+
+    def within(self, space: Space) -> tuple[FloatArray, FloatArray]:
+        """Parameters (p,) and covariance (p, p) in a space with further ones, 0 and known."""
+        own = [space.index(name) for name in self.fitted.space.names]
+        x, covariance = np.zeros(space.size), np.zeros((space.size, space.size))
+        x[own], covariance[np.ix_(own, own)] = self.fitted.x, self.covariance
+        return x, covariance
+
+    def uncertainty(self, unexplained: float) -> Uncertainty:
+        """The `uncertainty` of the rig after its identification.
+
+        unexplained: share of fields that the model leaves unexplained. Fingers and harmonics stay
+        as they were; the common_gain, which no fit narrows, is added to the error of the gains'
+        mean.
+        """
+        space, before = self.fitted.space, self.fitted.model.rig.uncertainty
+        mean = _rows(space, "gain").mean(axis=0, keepdims=True)
+        rms = {kind: _rms(std) for kind, std in self.stds().items()}
+        return Uncertainty.clipped(
+            gain=math.hypot(rms["gain"], _DRIVE_GAIN),
+            phase_deg=math.hypot(math.degrees(rms["phase"]), _DRIVE_PHASE_DEG),
+            **Uncertainty.of_frequency(rms["frequency"]),
+            stiffness=rms["stiffness"],
+            damping=math.exp(max(rms["damping"], rms["loss"])),
+            fingertip=before.fingertip,
+            common_gain=math.hypot(before.common_gain, std_of(mean, space, self.covariance)[0]),
+            field=unexplained,
+            place=rms["place"],
+            harmonic=before.harmonic,
+            supports=_rms(self.std[space.groups["supports"]]),
+        )
 
 
 def identify(
@@ -118,41 +278,21 @@ def identify(
     that would show it.
     """
     _check(rig, measurement)
-    before, free = rig, solved_for(rig, float(measurement.frequencies[-1]))
-    setting, fitted = fit_board(Setting(rig, free, measurement))
-    rig = setting.rig
-    values = Values.of(rig, fitted.space, fitted.best.x)
-    posterior, shift = Posterior.of(fitted.space, fitted.best), _mode_shift(fitted)
-    found = Identification(
-        before=before,
-        rig=rig,
-        values=values,
-        posterior=posterior,
-        chi2=chi2(fitted),
-        mode_shift=shift,
-        held_out=None,
-        fitted=fitted,
-        seed=seed,
-    )
+    fitted = fit_board(rig, measurement)
+    board = fitted.model.rig
+    found = Identification(rig, board, fitted, fitted.stated_covariance, None, seed)
     if found.is_explained:
-        _check_gains(rig, measurement, values, fitted.space)
-    unknown = unknowns(setting, fitted, posterior)
+        _check_gains(board, measurement, found.values, fitted.space)
+    unknown = unknowns(found)
     if unknown:
-        raise InputError("measurement must show more: " + "; ".join(map(str, unknown)))
-    held_out, uncertainty = hold_out(fitted, progress=progress), rig.uncertainty
+        raise InputError("measurement must show more: " + "; ".join(unknown))
+    held_out, uncertainty = hold_out(fitted, progress=progress), board.uncertainty
     if found.is_explained:
-        uncertainty = posterior.uncertainty(
-            uncertainty,
-            gain=_DRIVE_GAIN,
-            phase_deg=_DRIVE_PHASE_DEG,
-            field=held_out.unexplained if held_out else 0.0,
-        )
-    if held_out:
-        covariance = posterior.covariance + held_out.disagreement
-        posterior = replace(posterior, covariance=covariance)
+        uncertainty = found.uncertainty(held_out.unexplained if held_out else 0.0)
+    covariance = found.covariance + (held_out.disagreement if held_out else 0.0)
     progress(1 + HELD_OUT_FOLDS, 1 + HELD_OUT_FOLDS)
-    known = rig_with(rig, values, uncertainty)
-    return replace(found, rig=known, posterior=posterior, held_out=held_out)
+    known = rig_with(board, found.values, uncertainty)
+    return replace(found, rig=known, covariance=covariance, held_out=held_out)
 
 
 def _check(rig: Rig, measurement: Measurement) -> None:
@@ -191,10 +331,141 @@ def solved_for(rig: Rig, frequency_max: float) -> FreePlate:
     return solve_free_plate(rig.plate, mesh, frequency_max=max(frequency_max, 200.0))
 
 
-def _mode_shift(fitted: FittedModel) -> float:
-    """Root mean square of the shifts of modes in standard deviations, 0 without any."""
-    shifts = fitted.best.x[fitted.space.of("mode_shifts")]
-    return float(np.sqrt((shifts**2).mean())) if len(shifts) else 0.0
+def model_of(
+    rig: Rig,
+    free: FreePlate,
+    measurement: Measurement,
+    *,
+    masses: int,
+    more: Sequence[Sensor] = (),
+) -> ForwardModel:
+    """The rig with a number of additional masses at the tones that were measured.
+
+    free: the rig's free plate, as solved; more: further sensors beside those of the measurement.
+    """
+    sensors, amplifiers = (*measurement.sensors, *more), sorted(measurement.clock_errors)
+    space = space_of(
+        rig,
+        [sensor.name for sensor in sensors],
+        rig.uncertainty,
+        drives_lag=measurement.drives_lag,
+        amplifiers=amplifiers,
+        masses=masses,
+        mode_count=len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS)),
+    )
+    return ForwardModel(rig, sensors, measurement.frequencies, space, free, amplifiers=amplifiers)
+
+
+def fit_board(rig: Rig, measurement: Measurement) -> Fit:
+    """Fit in stages, and for a board with a grain again with the grain that the fit shows.
+
+    The rig of the fit's model has the grain that was found.
+    """
+    if rig.plate.material.orthotropy is None:
+        return fit_in_stages(rig, measurement)
+    found: list[Fit] = []
+    for start in _GRAIN_STARTS:
+        found.append(fit_in_stages(_with_grain(rig, start, 1.0), measurement))
+        for _ in range(_GRAIN_ROUNDS):
+            across, shear = _grain_shown(found[-1])
+            if max(abs(across), abs(shear)) < _MIN_GRAIN_CHANGE:
+                break
+            other = _with_grain(found[-1].model.rig, math.exp(across), math.exp(shear))
+            found.append(fit_in_stages(other, measurement))
+        if any(_is_good(each) for each in found):
+            break
+    return likeliest(found)
+
+
+def _is_good(found: Fit) -> bool:
+    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
+    shifts = found.x[found.space.of("mode_shifts")]
+    return found.chi2 <= _GRAIN_GOOD and float((shifts**2).mean()) <= _GRAIN_GOOD
+
+
+def _grain_shown(found: Fit) -> tuple[float, float]:
+    """Logarithms of the factors on the moduli across and of shear that the shifts of modes show."""
+    shifts, free = found.space.of("mode_shifts"), found.model.free
+    lowest = lowest_elastic(free.modes.eigenvalues, int(shifts.sum()))
+    shapes = [each[:, lowest] for each in free.modes.unknowns(np.empty((0, 3)))]
+    by_grain = grain_slopes(free.plate, (free.mesh.nx, free.mesh.ny), shapes)
+    relative = by_grain / free.modes.eigenvalues[lowest]
+    J = np.column_stack([np.ones(len(lowest)), *relative]) / KINDS["mode_shifts"].std
+    shown = np.eye(len(lowest)) - found.stated_covariance[np.ix_(shifts, shifts)]
+    information = J.T @ shown @ J + np.eye(3) / _GRAIN_PRIOR**2
+    _, across, shear = np.linalg.solve(information, J.T @ found.x[shifts]).tolist()
+    return across, shear
+
+
+def _with_grain(rig: Rig, across: float, shear: float) -> Rig:
+    """The rig of a board with other moduli across and of shear, by factors."""
+    of = rig.plate.material.shares
+    shares = replace(of, e2=of.e2 * across, g12=of.g12 * shear)
+    material = replace(rig.plate.material, orthotropy=shares)
+    return replace(rig, plate=replace(rig.plate, material=material))
+
+
+def fit_in_stages(rig: Rig, measurement: Measurement) -> Fit:
+    """Find the most likely parameters of a measurement."""
+    free = solved_for(rig, float(measurement.frequencies[-1]))
+    std = np.hypot(measurement.std, _EXTRA_NOISE * measurement.tone_rms)
+    rough, model = replace(measurement, std=std), model_of(rig, free, measurement, masses=1)
+    located = _with_mass(model, rough, _simple(model, rough).x, number=0)
+    found = _in_full(located, measurement)
+    if found.chi2 > _MORE_MASS_BEYOND:
+        wider = model_of(rig, free, measurement, masses=2)
+        x = np.insert(found.x, found.space.groups["masses"].stop, np.zeros(3))
+        more = _in_full(_with_mass(wider, rough, x, number=1), measurement)
+        if more.cost <= found.cost - _MASS_GAINS / 2:
+            found = more
+    # With the plate solved for its thickness and modulus, as a table will be.
+    identified = plate_with(rig.plate, found.plate.values)
+    identified = replace(identified, mode_deviations=rig.plate.mode_deviations)
+    anew = replace(found.model, free=solved_with_modes_of(free, identified), last_places={})
+    return fit(anew, measurement, start=found.x)
+
+
+def _simple(model: ForwardModel, rough: Measurement) -> Fit:
+    """Fit without form errors from several thicknesses."""
+    found = []
+    for thickness in _THICKNESSES:
+        start = np.zeros(model.space.size)
+        start[model.space.groups["thickness"]] = thickness
+        found.append(fit(model, rough, searched=model.space.of(*_SIMPLE), start=start))
+        r, _ = likeliest(found).of_values
+        if r @ r < _GOOD * len(r):
+            break
+    return likeliest(found)
+
+
+def _with_mass(model: ForwardModel, rough: Measurement, x: FloatArray, *, number: int) -> list[Fit]:
+    """Fit places and an additional mass from where it explains most, and from none, best first."""
+    space, plate = model.space, model.rig.plate
+    start = inwards(space, x, by=_INWARDS)
+    others = space.uncertain & ~space.of("masses", "mode_shifts", "mode_losses", "fingers")
+    linear = fit(model, rough, searched=others, start=start, evaluations=1)
+    points, own = _MASS_GRID.centres(plate), space.groups["masses"].start + 3 * number
+    starts = [start]
+    for point, mass in linear.loads(points, std=space.std[own])[:_MASS_STARTS]:
+        moved = start.copy()
+        off = points[point] - [plate.length / 2, plate.width / 2]
+        moved[own : own + 3] = [mass, *off] / space.std[own : own + 3]
+        starts.append(moved)
+    located = space.of(*_LOCATED)
+    fits = [fit(model, rough, searched=located, start=each) for each in starts]
+    return ranked_by(fits, lambda each: -each.cost)
+
+
+def _in_full(starts: list[Fit], measurement: Measurement) -> Fit:
+    """Fit everything to the noise as it is, from the two best starts."""
+    return likeliest([fit(each.model, measurement, start=each.x) for each in starts[:2]])
+
+
+def solved_with_modes_of(free: FreePlate, plate: Plate) -> FreePlate:
+    """Solve a plate on the mesh of another one, with all of its modes though it may be stiffer."""
+    stiffer = plate.lowest_bending_frequency / free.plate.lowest_bending_frequency
+    frequency_max = free.frequency_max * max(stiffer * _FREQUENCY_MARGIN, 1.0)
+    return solve_free_plate(plate, free.mesh, frequency_max=frequency_max)
 
 
 def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Space) -> None:
@@ -225,6 +496,139 @@ def _wrong_gains(names: list[str], logarithms: FloatArray, space: Space, whose: 
         if abs(one.real) > max(_GAIN_ALLOWED, _GAIN_STDS * gain)
         or abs(one.imag) > max(_PHASE_ALLOWED, _GAIN_STDS * phase)
     ]
+
+
+def relevant(space: Space) -> dict[str, FloatArray]:
+    """Combinations (m, p) of parameters that answers depend on, by name."""
+    mass = _rows(space, "thickness")
+    by_rigidity = mass + _rows(space, "modulus") / 2
+    gain, phase = _rows(space, "gain"), _rows(space, "phase")
+    damping = _rows(space, "damping_each") + _rows(space, "damping") - mass
+    factor = space.groups["force_factor"]
+    if factor.stop > factor.start:
+        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        damping = damping[space.std[factor] == 0]
+        gain = gain + _rows(space, "force_factor")
+    return {
+        "frequency": by_rigidity + _rows(space, "mode_shifts") / 2,
+        "stiffness": _rows(space, "stiffness") - mass,
+        "damping": damping,
+        "loss": _rows(space, "loss") + _rows(space, "mode_losses"),
+        "gain": gain - gain.mean(axis=0),
+        "phase": phase - phase.mean(axis=0),
+    }
+
+
+def _rows(space: Space, kind: str) -> FloatArray:
+    """One row for each parameter of a kind, (m, p)."""
+    return np.eye(space.size)[space.groups[kind]]
+
+
+def std_of(combinations: FloatArray, space: Space, covariance: FloatArray) -> FloatArray:
+    """Standard deviations (m,) of linear combinations (m, p) of parameters in their units."""
+    scaled = combinations * space.std
+    return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, covariance, scaled)))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
+
+
+def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
+    """Predict paths from fits to the others; None where these do not determine enough of them."""
+    measurement, model = found.measurement, found.model
+    folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % HELD_OUT_FOLDS
+    squares, variance = np.full((2, *measurement.values.shape), np.nan)
+    fits, noise = [], min(found.chi2, 1.0)  # readings may be better than they are stated
+    for fold in range(HELD_OUT_FOLDS):
+        progress(1 + fold, 1 + HELD_OUT_FOLDS)
+        hidden = measurement.known & (folds == fold)
+        if not hidden.any():
+            continue
+        if (hidden == measurement.known).all():
+            return None
+        other, errors, variance[hidden] = prediction_errors(found, hidden)
+        squares[hidden] = errors - 2 * noise * measurement.std[hidden] ** 2
+        fits.append(other.x)
+    mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
+    predicted = variance < _MAX_PREDICTION_ERROR**2 * mean_square
+    if predicted.sum() < _MIN_PREDICTED:
+        return None
+    total, unexplained = (
+        relative_rms(parts[predicted], mean_square[predicted])
+        for parts in (squares, squares - variance)
+    )
+    share = (unexplained / total) ** 2 if unexplained else 0.0
+    off = np.array(fits) - np.mean(fits, axis=0)
+    jackknife = (1 - 1 / len(fits)) * off.T @ off
+    return HeldOutPaths(total, unexplained, share * _IN_COMMON**2 * jackknife)
+
+
+def unknowns(found: Identification) -> list[str]:
+    """Describe what answers depend on and the measurement leaves unknown, and what would show it.
+
+    The standard deviations are those before the measurement and after it.
+    """
+    space, model, rows = found.fitted.space, found.fitted.model, []
+    prior = np.diag(space.uncertain.astype(float))
+    for kind, combinations in relevant(space).items():
+        before, after = (std_of(combinations, space, each) for each in (prior, found.covariance))
+        built = std_of(combinations, space.as_built, prior)
+        unknown = np.flatnonzero((before > 0) & (after > _UNKNOWN * built))
+        if kind == "stiffness" and model.frequencies[0] > _SUSPENSION_FELT:
+            excites = ["force_factor" in era.fields for era in model.rig.eras]
+            unknown = unknown[~np.array(excites)[unknown]]
+        # Of losses and frequencies of single modes only those count that no tone has shown.
+        of_modes = kind in ("frequency", "loss")
+        if not len(unknown) or (of_modes and len(unknown) < len(combinations)):
+            continue
+        worst = unknown[best_of(after[unknown])]
+        name = kind if of_modes else space.names[best_of(np.abs(combinations[worst]))]
+        rows.append(
+            f"{name}: known to {100 * after[worst]:.2g} %, before {100 * before[worst]:.2g} %; "
+            f"{_advice(found, combinations[worst])}"
+        )
+    return rows
+
+
+def _advice(found: Identification, combination: FloatArray) -> str:
+    """ERA, tone and place whose response would narrow a combination (p,) most, in words."""
+    fitted = found.fitted
+    model, rig = fitted.model, fitted.model.rig
+    limits, sides = rig.limits, (rig.plate.length, rig.plate.width)
+    measured = {sensor.era for sensor in model.sensors}
+    more = [Sensor(f"ERA {era.name}", era.name) for era in rig.eras if era.name not in measured]
+    more += [
+        Sensor(f"{x:g} {y:g}", x=x * sides[0], y=y * sides[1])
+        for x in _ADVISED_PLACES
+        for y in _ADVISED_PLACES
+    ]
+    tones = np.arange(limits.frequency_min, limits.frequency_max + 1e-9, _ADVISED_STEP)
+    wider = model_of(rig, model.free, fitted.measurement, masses=model.mass_count, more=more)
+    wider = replace(wider, frequencies=tones)
+    x, covariance = found.within(wider.space)
+    own = [wider.space.index(name) for name in fitted.space.names]
+    direction, unknown = np.zeros(wider.space.size), wider.space.std > 0
+    direction[own], unknown[own] = combination, False
+    covariance += np.diag(unknown.astype(float))
+    at = wider.at(x)
+    noise = _ADVISED_NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
+    narrowed = _narrowed(
+        jacobian(at) / noise[..., None], covariance, covariance @ (direction * wider.space.std)
+    )
+    f, s, e = map(int, np.unravel_index(best_of(narrowed.ravel()), narrowed.shape))
+    sensor = wider.sensors[s]
+    place = f"ERA {sensor.era}" if sensor.era else f"({sensor.x:.3g}, {sensor.y:.3g}) m"
+    return f"play ERA {rig.eras[e].name} at {tones[f]:.0f} Hz and measure at {place}"
+
+
+def _narrowed(J: ComplexArray, covariance: FloatArray, direction: FloatArray) -> FloatArray:
+    """Decrease of a combination's variance by each response measured on its own, (f, s, e)."""
+    total = np.zeros(J.shape[:3])
+    for part in (J.real, J.imag):
+        variance = ((part @ covariance) * part).sum(axis=-1)
+        total += (part @ direction) ** 2 / (1 + variance)
+    return total
 
 
 @dataclass(frozen=True)
@@ -306,7 +710,7 @@ class ParameterEstimate:
 
 def estimates(found: Identification) -> list[ParameterEstimate]:
     """All parameters that were uncertain."""
-    space, posterior = found.posterior.space, found.posterior
+    space = found.fitted.space
     kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
     rows = []
     for number, name in enumerate(space.names):
@@ -315,8 +719,8 @@ def estimates(found: Identification) -> list[ParameterEstimate]:
         kind = kinds[number]
         is_place = kind == "masses" and (number - space.groups[kind].start) % 3
         known = KINDS["place" if is_place else kind]
-        std, error = float(space.std[number]), float(posterior.std[number])
-        difference = std * float(posterior.x[number])
+        std, error = float(space.std[number]), float(found.std[number])
+        difference = std * float(found.fitted.x[number])
         if known.unit == "%":  # of logarithms of factors
             std, error = math.expm1(std), math.exp(difference) * error
             difference = math.expm1(difference)
@@ -344,10 +748,10 @@ class ClockEstimate:
 
 def clock_estimates(found: Identification) -> list[ClockEstimate]:
     """Delays of all amplifiers' clocks to that of the first one by name."""
-    stated = found.fitted.problem.measurement.clock_errors
+    stated = found.fitted.measurement.clock_errors
     first, *others = sorted(stated) or [""]
-    part = found.posterior.space.groups["delay"]
-    rows = zip([first, *others], found.values.delays, found.posterior.std[part], strict=False)
+    part = found.fitted.space.groups["delay"]
+    rows = zip([first, *others], found.values.delays, found.std[part], strict=False)
     estimated = [
         ClockEstimate(name, 1e6 * delay, 1e6 * error, 1e6 * math.hypot(stated[first], stated[name]))
         for name, delay, error in rows

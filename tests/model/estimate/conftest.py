@@ -30,4 +30,4 @@ def found(hidden: Hidden) -> Identification:
 @pytest.fixture(scope="session")
 def known(found: Identification) -> PlateEstimate:
     """What a daemon knows of that plate when it starts: what the identified rig states."""
-    return PlateEstimate.of_rig(found.rig, found.fitted.problem.model.sensors)
+    return PlateEstimate.of_rig(found.rig, found.fitted.model.sensors)

@@ -25,6 +25,7 @@ from model.estimate.measurement import Measurement
 from model.estimate.space import Space
 
 _CONVERGED = 1e-7  # of the cost and of x, relative
+_MIN_VARIANCE = 1e-14  # of a prior, relative to its largest
 _ROUNDS = 8  # of fits and estimates of the noise
 _SETTLED = 0.1  # of the noise between two rounds
 _MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
@@ -131,10 +132,9 @@ class Fit:
         by_load = by_mass_at(self.plate, points)
         if factor is not None:
             by_load = by_load * factor[:, None, None, None]
-        drives = self.measurement.columns
-        _, _, _, columns = best_gains(
-            self.plate.responses[:, :, drives], by_load[:, :, drives], self.measurement
-        )
+        driven = self.measurement.driven
+        responses, by_load = driven(self.plate.responses), driven(by_load)
+        _, _, _, columns = best_gains(responses, by_load, self.measurement)
         by_size = std * np.vstack([columns.real, columns.imag])
         r, J = self.of_values
         kept = np.ones(J.shape[1], bool) if beside is None else beside[self.searched]
@@ -170,14 +170,15 @@ def fit(
     """
     from scipy.optimize import least_squares  # a daemon reads what was fitted, but fits nothing
 
-    space, drives = model.space, measurement.columns
+    space = model.space
     own = space.uncertain if searched is None else searched
     base = np.zeros(space.size) if start is None else start
     low, high = space.lower[own], space.upper[own]
     mean, root = np.zeros(int(own.sum())), np.eye(int(own.sum()))
     if prior is not None:
         mean, covariance = prior[0][own], prior[1][np.ix_(own, own)]
-        root = linalg.inv(linalg.cholesky(covariance, lower=True))
+        variances, axes = linalg.eigh(covariance)
+        root = (axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))).T
     last: dict[bytes, Fit] = {}
 
     def at(y: FloatArray) -> Fit:
@@ -186,8 +187,9 @@ def fit(
         x = base.copy()
         x[own] = y
         plate = model.at(x)
-        slopes = jacobian(plate, own)[..., own][:, :, drives]
-        gains, by_gain, r, J = best_gains(plate.responses[:, :, drives], slopes, measurement)
+        responses = measurement.driven(plate.responses)
+        slopes = measurement.driven(jacobian(plate, own)[..., own])
+        gains, by_gain, r, J = best_gains(responses, slopes, measurement)
         held, by_held = _held(gains, by_gain, measurement.gain_std)
         if soft is not None:
             r, J = _softened(r, J, soft)
@@ -201,7 +203,7 @@ def fit(
             own,
             np.concatenate([r.real, r.imag, root @ (y - mean), held.real]),
             np.vstack([J.real, J.imag, root, by_held.real]),
-            np.nan_to_num(gains)[:, None] * plate.responses[:, :, drives],
+            np.nan_to_num(gains)[:, None] * responses,
             gains,
             by_gain,
         )

@@ -91,6 +91,8 @@ class RestingFinger:
     x: float
     y: float
     fingertip: Fingertip
+    tone: int | None = None
+    """Number of the only tone during which it rests, None for all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +288,7 @@ class PlateAt:
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
         """Force of each ERA on a plate that is held, per unit of its drive, (f, n)."""
         loads = [
-            _finger(each.fingertip, logs, model.omega)
+            _finger(each, logs, model.omega)
             for each, logs in zip(model.fingers, values.fingers, strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
@@ -437,12 +439,15 @@ class PlateAt:
 
 
 def _finger(
-    tip: Fingertip, logs: FloatArray, omega: FloatArray
+    finger: RestingFinger, logs: FloatArray, omega: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Dynamic stiffness (f,) of a finger with scaled parts, and its derivatives by each (f, 4).
 
     logs (4,): logarithms of the factors on contact mass, pulp, phalanx and joint.
     """
+    tip, rests = finger.fingertip, np.ones(len(omega))
+    if finger.tone is not None:
+        rests = (np.arange(len(omega)) == finger.tone).astype(float)
     mass, pulp, phalanx, joint = np.exp(logs)
     w = omega
     Zm = -(w**2) * tip.contact_mass * mass
@@ -452,7 +457,8 @@ def _finger(
     total = Zp + Zb + Zj
     by_pulp, by_bone = ((Zb + Zj) / total) ** 2, (Zp / total) ** 2
     D = Zm + Zp * (Zb + Zj) / total
-    return D, np.column_stack([Zm, by_pulp * Zp, by_bone * Zb, by_bone * Zj])
+    slopes = np.column_stack([Zm, by_pulp * Zp, by_bone * Zb, by_bone * Zj])
+    return rests * D, rests[:, None] * slopes
 
 
 def viscous_difference(model: ForwardModel, x: FloatArray) -> ComplexArray:

@@ -145,6 +145,9 @@ class Measurement:
     """Relative standard deviation of the magnitudes of free gains from 1."""
     drives: tuple[int, ...] = ()
     """Number of the ERA that each of the n channels drives, empty where each drives its own."""
+    bases: ComplexArray | None = None
+    """Amplitude of each ERA (f, eras) where all play together as one channel, None where each plays
+    by itself."""
 
     def __post_init__(self) -> None:
         """Raise InputError for unordered frequencies, missing values or values without an error."""
@@ -191,10 +194,12 @@ class Measurement:
         """The values, 0 where nothing is known (f, s, n)."""
         return np.where(self.known, self.values, 0.0)
 
-    @property
-    def columns(self) -> slice | list[int]:
-        """Index of the model's ERA that each channel drives."""
-        return list(self.drives) or slice(None)
+    def driven(self, responses: ComplexArray) -> ComplexArray:
+        """Responses (f, s, eras, ...) to the ERAs, or their slopes, as those to the n channels."""
+        if self.bases is not None:
+            mixed = np.einsum("fse...,fe->fs...", responses, self.bases)
+            return np.asarray(mixed[:, :, None])
+        return responses[:, :, list(self.drives)] if self.drives else responses
 
     @property
     def count(self) -> int:

@@ -178,11 +178,6 @@ def test_command_fails_where_no_test_had_time(
     assert capfd.readouterr().out.splitlines()[-1].startswith("No test had time")
 
 
-def test_identifiers_avoid_retired_words() -> None:
-    """Each word of the list has a replacement; the glossary of CONTRIBUTING defines it."""
-    assert list(retired_identifiers()) == []
-
-
 def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An example, and a program on a page at its line there; text beside programs is free."""
     files = {

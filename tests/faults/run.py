@@ -181,7 +181,8 @@ def collected(*arguments: str) -> set[str]:
 
 
 def _list_nightly(faults: Sequence[PlantedFault]) -> None:
-    short = collected("-m", "not long", "tests", "tests/faults/one_conformance.py")
+    beside = "tests/faults/one_conformance.py"  # pytest leaves it out of a folder, even if named
+    short = collected("-m", "not long") | collected("-m", "not long", beside)
     nightly = [one for one in faults if one.tests and short.isdisjoint(one.tests)]
     for one in nightly:
         sys.stdout.write(f"{one.name}: {', '.join(one.tests)}\n")

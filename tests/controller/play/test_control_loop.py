@@ -39,7 +39,6 @@ from drivers.host.group import GroupState
 from drivers.opening import Lines
 from drivers.protocol.definition import HEARTBEAT
 from drivers.protocol.records import Refusal, Values
-from long_form import shortly
 from model.answer.answer_report import Timing
 from model.config.fields import Rectangle
 from model.errors import InputError
@@ -368,15 +367,22 @@ async def test_all_fingers_of_a_region_feel_its_effect(count: int) -> None:
             assert len(fingers.applied[-1].contacts) == 20
 
 
-@pytest.mark.parametrize("what", shortly(["stop", "lift"], ["lift"]))
+@pytest.mark.parametrize(
+    ("count", "what"),
+    [
+        (5, "lift"),
+        pytest.param(10, "lift", marks=pytest.mark.long),
+        pytest.param(10, "stop", marks=pytest.mark.long),
+    ],
+)
 @in_virtual_time
-async def test_ten_moving_fingers_with_slow_answers_starve_nothing(
-    what: str, monkeypatch: pytest.MonkeyPatch
+async def test_moving_fingers_with_slow_answers_starve_nothing(
+    count: int, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 0.4 s each: heartbeats as ever, and silence as soon as at rest; nothing plays after it."""
     loop = asyncio.get_running_loop()
     async with fingers_on(table(), ONE_REGION, breaks="touch") as fingers:
-        asked, rest = answers_take(monkeypatch, 0.4), spread(10)
+        asked, rest = answers_take(monkeypatch, 0.4), spread(count)
 
         def move(since: float) -> None:
             fingers.at = {id: (x + 0.03 * since, y) for id, (x, y) in rest.items()}
@@ -386,7 +392,7 @@ async def test_ten_moving_fingers_with_slow_answers_starve_nothing(
         assert fingers.applied
         feeding = fingers.far_end.times("Ping", "Set", "Commit")
         assert max(later - sooner for sooner, later in pairwise(feeding)) <= HEARTBEAT + 0.01
-        begin, count = loop.time(), len(fingers.committed)
+        begin, played = loop.time(), len(fingers.committed)
         if what == "stop":
             fingers.witness.operator_command(begin, "stop")
             stopped = await fingers.controller.stop()
@@ -395,11 +401,11 @@ async def test_ten_moving_fingers_with_slow_answers_starve_nothing(
         else:
             fingers.at = {}
             await fingers.hold(0.02)
-            assert fingers.committed[count][2] == ()
-            assert fingers.committed[count][0] - begin < 0.005
+            assert fingers.committed[played][2] == ()
+            assert fingers.committed[played][0] - begin < 0.005
         await fingers.hold(1.0)
         assert fingers.levels() == {"main": (0.0,) * 4}
-        assert len(fingers.committed) <= count + 1
+        assert len(fingers.committed) <= played + 1
 
 
 @in_virtual_time

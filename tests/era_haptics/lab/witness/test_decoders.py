@@ -50,7 +50,7 @@ def live(kind: str, lines: str, seed: int, *, lossy_steps: int = 0) -> None:
     run_virtual(run(), rng=rng)
 
 
-@pytest.mark.parametrize("seed", shortly(range(12), [1, 11]))
+@pytest.mark.parametrize("seed", shortly(range(12), [1]))
 @pytest.mark.parametrize(("kind", "lines"), in_turn(KINDS, LINES))
 def test_witness_finds_nothing_in_random_days(kind: str, lines: str, seed: int) -> None:
     """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""

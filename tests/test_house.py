@@ -166,6 +166,7 @@ def test_changed_page_is_typed_although_that_is_long(monkeypatch: pytest.MonkeyP
         assert [mark.name for mark in item.own_markers] == left
 
 
+@pytest.mark.long
 def test_command_fails_where_no_test_had_time(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

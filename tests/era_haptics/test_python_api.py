@@ -467,7 +467,8 @@ BACKEND = (
 )
 
 
-@pytest.mark.parametrize("is_installed", shortly([True, False], [True]))
+@pytest.mark.long
+@pytest.mark.parametrize("is_installed", [True, False])
 def test_backend_of_a_notebook_is_kept_where_it_is_installed(
     tmp_path: Path, is_installed: bool
 ) -> None:

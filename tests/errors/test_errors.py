@@ -65,7 +65,13 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-@pytest.mark.parametrize("case", cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=pytest.mark.long if case.long else [])
+        for case in cases()
+    ],
+)
 def test_error_has_its_status_and_place(case: Case, shelf: Path, tmp_path: Path) -> None:
     """A command that fails says where, in one paragraph, and writes nothing."""
     outcome = provoke(case, tmp_path, shelf)

@@ -147,7 +147,7 @@ def starts(four: Chain) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize("arranged", ARRANGED)
+@pytest.mark.parametrize("arranged", shortly(ARRANGED, ["one bus, serial", "four lines, mixed"]))
 @in_virtual_time
 async def test_sixteen_channels_of_four_amplifiers_start_together(arranged: str) -> None:
     """Every channel plays its level; on one bus from one moment, on four lines within a ms."""
@@ -314,6 +314,7 @@ async def test_lost_link_is_one_event_with_its_attempts(tab: Page, tmp_path: Pat
             assert "%" in await tab.evaluate(TILE)
 
 
+@pytest.mark.long
 @pytest.mark.asyncio(loop_scope="module")
 async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> None:
     """Which amplifiers a stop did not silence: beside the button and in the list of events.
@@ -357,6 +358,7 @@ async def test_what_the_daemon_reports_is_shown(tab: Page, tmp_path: Path) -> No
         assert events[1].endswith("amplifier main: cut")
 
 
+@pytest.mark.long
 @pytest.mark.asyncio(loop_scope="module")
 async def test_full_gateway_is_shown_as_full(tab: Page, tmp_path: Path) -> None:
     """Not as unreachable."""

@@ -2,8 +2,9 @@
 
 A case is an entry of a file in tests/errors/cases: `run`, a command line of `era`; `files` of its
 own, or an `edit` of the prepared ones; what happens `before`; the exit `status`, 2 unless given;
-`at`, the file with its line, the key or the option that the message names. Entries under `variants`
-share their command line. A case that names era.sock finds a daemon there.
+`at`, the file with its line, the key or the option that the message names; `long` for one that only
+`make test-long` takes. Entries under `variants` share their command line. A case that names
+era.sock finds a daemon there.
 
 Those `shown` are quoted in docs/reference/errors.md; `make pages` writes these quotations.
 """
@@ -63,7 +64,10 @@ _SOCKET, _DAEMON = "era.sock", "running"
 
 @dataclass(frozen=True)
 class Case:
-    """One way to get an error; blur: a pattern of what differs in each run."""
+    """One way to get an error.
+
+    blur: a pattern of what differs in each run; long: whether `make test-long` alone takes it.
+    """
 
     name: str
     run: str
@@ -75,6 +79,7 @@ class Case:
     said: str = ""
     blur: str | None = None
     shown: bool = False
+    long: bool = False
 
     @property
     def typed(self) -> list[str]:

@@ -287,9 +287,7 @@ PROGRAMS = {
         {
             "swings 30 times a second, 100 Hz",
             "taps 60 ms apart, 60 Hz, large",
-            "two files that beat",
             "failing amid an onset",
-            "steady, 190 Hz, large",
         },
     ),
 )
@@ -512,6 +510,7 @@ async def test_status_says_what_leaks_to_a_finger_that_has_moved() -> None:
         assert moved[3] > rested[3]
 
 
+@pytest.mark.long
 @in_virtual_time
 async def test_weights_follow_a_finger_at_half_a_metre_a_second() -> None:
     """10 cm in 0.2 s: several answers on the way, after which as little leaks as before."""

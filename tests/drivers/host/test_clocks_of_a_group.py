@@ -523,7 +523,11 @@ def test_clocks_on_separate_lines_agree_to_microseconds(lost: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "bound"), [("usb-high-speed", 150e-6), ("usb-full-speed", 300e-6)]
+    ("kind", "bound"),
+    [
+        pytest.param("usb-high-speed", 150e-6, marks=pytest.mark.long),
+        ("usb-full-speed", 300e-6),
+    ],
 )
 @pytest.mark.parametrize("lines", [("a", "b", "c", "d"), ("abcd",)], ids="-".join)
 def test_clocks_are_held_when_a_group_is_armed(

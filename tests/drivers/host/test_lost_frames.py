@@ -118,11 +118,18 @@ async def _recovered(group: Group) -> None:
     await asyncio.sleep(0.15)  # what was late has faded
 
 
-CASES = [(kind, lines, 40) for kind in KINDS for lines in LINES]
-LONG = [pytest.param(*each[:2], 6700, marks=pytest.mark.long) for each in CASES]
+CASES = [
+    pytest.param(
+        *(kind, lines, count),
+        marks=pytest.mark.long if count > 40 or lines == "one line of two" else [],
+    )
+    for count in (40, 6700)
+    for kind in KINDS
+    for lines in LINES
+]
 
 
-@pytest.mark.parametrize(("kind", "lines", "count"), [*CASES, *LONG])
+@pytest.mark.parametrize(("kind", "lines", "count"), CASES)
 def test_sets_play_whole_and_once_though_frames_are_lost(kind: str, lines: str, count: int) -> None:
     """One frame of ten either way, of sets of 1 to 8 parts; the long form: 20 000 on each wire."""
     rng = random.Random(count)

@@ -324,6 +324,7 @@ SHIFTED_AT = ((0.05, 0.04), (0.26, 0.06), (0.24, 0.19), (0.13, 0.12))
 STEP, STIFFER = 1e-4, 1e-3  # m, relative
 
 
+@pytest.mark.long
 def test_places_that_are_off_change_fields_as_much_as_stiffnesses_do() -> None:
     """All fields over the plate, mean square: an ERA off by 1 mm along x and y, and its spring."""
     plain = smooth_rig()

@@ -19,6 +19,7 @@ import era_haptics
 import model
 import rig_page
 from key_tables import quantities
+from long_form import shortly
 from model.commands.plate_cli import show
 from model.config.document import ConfigError, parse_document
 from model.config.fields import Section
@@ -116,7 +117,9 @@ def rig_data(plate: dict[str, Any], mesh: str, stiffness: float) -> dict[str, An
     }
 
 
-@pytest.mark.parametrize("key", [key for key in PLAIN if key != "thickness"])
+@pytest.mark.parametrize(
+    "key", shortly([key for key in PLAIN if key != "thickness"], ["length", "loss_factor"])
+)
 def test_a_key_is_in_elements_and_polynomials_and_in_the_summary(key: str) -> None:
     """Responses, which it changes, within 1 %; three modes of soft springs as of a rigid plate."""
     polynomials = "14x10 Legendre"
@@ -386,8 +389,8 @@ def test_programs_make_and_change_exciters(tmp_path: Path) -> None:
     ("name", "levels"),
     [
         ("DAEX25FHE-4", {150: 41, 200: 42, 300: 29}),
-        ("DAEX25CT-4", {150: 36, 200: 36, 300: 23}),
-        ("DAEX13-4SM", {150: 35, 200: 36, 300: 22}),
+        pytest.param("DAEX25CT-4", {150: 36, 200: 36, 300: 23}, marks=pytest.mark.long),
+        pytest.param("DAEX13-4SM", {150: 35, 200: 36, 300: 22}, marks=pytest.mark.long),
     ],
 )
 def test_show_prints_exciters_and_what_they_reach(

@@ -477,6 +477,7 @@ def test_summary_of_a_plate_too_small_for_two_fingers():
     assert summary["feasible_share"] is None
 
 
+@pytest.mark.long
 def test_weak_cells_are_not_feasible_when_only_19_db_sl_are_reached(table):
     """The map is at 20 dB SL, which no pattern reaches with these strokes."""
     weaker = with_strokes(table, 10 ** ((19.0 - table.available_level_db_sl.max()) / 20))

@@ -215,6 +215,7 @@ def test_build_is_the_same_to_the_bit_by_two_processes(problem, tmp_path):
     assert files[0] == files[1]
 
 
+@pytest.mark.long
 def test_build_states_the_discretisation_error_of_the_worst_era():
     """That of a convergence study, on elements and another raster, with an ERA inside the plate."""
     rig = quick_rig()

@@ -101,7 +101,9 @@ def test_check_says_by_how_much_a_level_cannot_be_had() -> None:
     assert "100 % of the region (1.4 cm²)" in problem
 
 
-@pytest.mark.parametrize(("level", "count"), [(None, 0), (16.9, 1), (17.0, 0)])
+@pytest.mark.parametrize(
+    ("level", "count"), [pytest.param(None, 0, marks=pytest.mark.long), (16.9, 1), (17.0, 0)]
+)
 def test_check_wants_notches_noticed_above_what_lasts(level: float | None, count: int) -> None:
     """3 dB above the 14 of the buzz there; without a level of their own they are."""
     region = Region("slider", SLIDER, on_press="low", on_move="it", band=(170.0, 230.0))

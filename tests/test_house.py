@@ -1,6 +1,7 @@
 """What keeps the house in order: imports of programs, names, retired words, tests of a change.
 
-Import contracts exclude circles within the packages; here the folders beside them are checked.
+Import contracts exclude circles within the packages; here the folders beside them are checked. What
+a machine lacks skips the tests that use it, by name, and fails them in CI.
 """
 
 import ast
@@ -99,7 +100,7 @@ def test_module_of_tests_and_page_lead_to_their_tests() -> None:
     """Over imports within tests/support; a page over its name, whatever folder names it."""
     assert nearest(["tests/support/set_table.py"]).keys() >= importing("set_table")
     assert nearest(["docs/reference/rig.md"])["tests/model/rig/test_rig_summary.py"] == 0
-    assert nearest(["tests/test_docs_site.py"]) == {"tests/test_docs_site.py": 0}
+    assert nearest(["tests/docs/test_pages.py"]) == {"tests/docs/test_pages.py": 0}
     assert len(nearest(["tests/conftest.py"])) == len([*ROOT.glob("tests/**/test_*.py")])
 
 
@@ -192,3 +193,47 @@ def test_what_users_copy_keeps_the_rule(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(vocabulary, "ROOT", tmp_path)
     found = [each.partition(", use")[0] for each in retired_identifiers()]
     assert found == ["examples/one.py:1: begin", "README.md:5: begin"]
+
+
+CONFTEST = """
+import pytest
+from typed_page import needs
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    for mark in item.iter_markers("needs"):
+        needs(*mark.args)
+"""
+TESTS = """
+import pytest
+
+@pytest.fixture
+def server():
+    raise RuntimeError("started without its library")
+
+@pytest.mark.needs("cc", "no-such-library")
+def test_user(server): pass
+
+def test_neighbour(): pass
+"""
+
+
+@pytest.mark.parametrize(("ci", "outcome"), [("", "1 passed, 1 skipped"), ("1", "1 error")])
+def test_missing_component_skips_its_user_and_not_its_neighbour(
+    tmp_path: Path, ci: str, outcome: str
+) -> None:
+    """Before a fixture fails for it; the reason has its name and the remedy."""
+    (tmp_path / "conftest.py").write_text(CONFTEST, "utf-8")
+    (tmp_path / "test_users.py").write_text(TESTS, "utf-8")
+    more = {"PYTHONPATH": str(Path(__file__).with_name("support")), "CI": ci}
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-p", "no:xdist"],
+        cwd=tmp_path,
+        env=os.environ | more | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert outcome in done.stdout.splitlines()[-1]
+    missing = "no-such-library is not installed; on Debian: apt install no-such-library"
+    assert missing in done.stdout

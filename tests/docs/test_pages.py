@@ -1,9 +1,10 @@
-"""Pages of the docs against what they describe.
+"""Pages of the docs against what they describe, and the ways that lead to them.
 
-Generated parts; what pages state and something else decides (constants, URLs, figures of other
-pages, files); the references of commands, of the daemon's file and of the amplifier, read by a
-reader that knows nothing else; the ways through the files in docs/architecture.md; the file of
-tested versions; the comparison of shown with printed output; and the tutorials, typed.
+Generated parts; what pages state and something else decides (constants, URLs, versions, figures of
+other pages, files); the references of commands, of the daemon's file and of the amplifier, read by
+a reader that knows nothing else; the ways through the files in docs/architecture.md; links and
+names of pages in code; the comparison of shown with printed output; and the tutorials, typed.
+`make docs` builds the pages.
 """
 
 import json
@@ -11,6 +12,8 @@ import random
 import re
 import shutil
 import struct
+import subprocess
+import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -25,7 +28,6 @@ from typer.core import TyperCommand, TyperGroup
 from typer.testing import CliRunner
 
 import constraints
-import model
 import pages
 from controller.api.methods import StateEvent
 from controller.api.schema import headline
@@ -383,17 +385,16 @@ def test_the_keys_are_those_that_are_printed(
     assert keys == set(json.loads(result.stdout))
 
 
-CHECKOUT = Path(model.__file__).parents[1]
 FACT_PAGES = [
-    CHECKOUT / "README.md",
-    CHECKOUT / "CONTRIBUTING.md",
-    *(CHECKOUT / "docs").rglob("*.md"),
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(ROOT / "docs").rglob("*.md"),
 ]
 
 
 def text_of(page: str) -> str:
     """A page's text; its name is relative to the root."""
-    return (CHECKOUT / page).read_text("utf-8")
+    return (ROOT / page).read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -460,22 +461,22 @@ def test_page_states_how_many_fingers_kept_the_promise(page: str) -> None:
 
 def test_files_that_pages_name_are_there() -> None:
     """In any folder, and tests by their bare names; decisions name what was there at the time."""
-    tests = {path.name for path in (CHECKOUT / "tests").rglob("test_*.py")}
-    folders = "|".join(path.name for path in CHECKOUT.iterdir() if path.is_dir())
+    tests = {path.name for path in (ROOT / "tests").rglob("test_*.py")}
+    folders = "|".join(path.name for path in ROOT.iterdir() if path.is_dir())
     named = re.compile(rf"`((?:{folders})/[\w./-]+\.(?:py|md|yaml|c|h|js|toml|json|html))`")
     gone = {
         name
         for page in FACT_PAGES
         if "decisions" not in page.parts
         for name in named.findall(page.read_text("utf-8"))
-        if not (CHECKOUT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
+        if not (ROOT / name).exists() and not name.startswith(("dist/", "tests/faults/AREA"))
     }
     pages = [page.read_text("utf-8") for page in FACT_PAGES if "decisions" not in page.parts]
     assert gone == set()
     assert {name for page in pages for name in re.findall(r"`(test_\w+\.py)`", page)} <= tests
 
 
-URLS_PAGE = (CHECKOUT / "docs" / "reference" / "urls.md").read_text("utf-8")
+URLS_PAGE = (ROOT / "docs" / "reference" / "urls.md").read_text("utf-8")
 EXAMPLES = re.findall(r"^\| `(\S+)` \| `(\S+)` \| (\d+) \|$", URLS_PAGE, re.MULTILINE)
 SCHEMES = {url.partition("://")[0] for url, _, _ in EXAMPLES}
 
@@ -657,3 +658,97 @@ def test_registers_hold_what_the_layout_lists() -> None:
     ]
     taken = MESSAGES["Set"].reply.unpack(words, is_strict=False)
     assert (tag, result, taken["token"], taken["staged"], taken["played"]) == (2, 0, 0x0102, 1, 0)
+
+
+def test_every_page_can_be_found() -> None:
+    """Each page stands in the side bar, or its folder's index, which stands there, links to it."""
+    docs = ROOT / "docs"
+    index = (docs / "index.md").read_text("utf-8")
+    listed = set(re.findall(r"^(?:.* <)?([a-z-]+(?:/[\w-]+)?)>?$", index, re.MULTILINE))
+    for name in ("decisions/README", "measured/figures", "gallery"):
+        assert name in listed
+        folder, links = Path(name).parent, (docs / f"{name}.md").read_text("utf-8")
+        listed |= {str(folder / page) for page in re.findall(r"\(([\w/-]+)\.md\)", links)}
+    pages = {path.relative_to(docs) for path in docs.rglob("*.md")}
+    names = {page.with_suffix("").as_posix() for page in pages if page.parts[0] != "_build"}
+    assert names - listed == {"index"}
+
+
+def test_the_search_finds_pages_and_no_decision(tmp_path: Path) -> None:
+    """A word of a page is in the index of the built pages, one of a decision is not."""
+    pytest.importorskip("sphinx", reason="`make docs` installs what builds the pages")
+    for name, text in {
+        "index": "# Pages\n\n```{toctree}\nwire\ndecisions/README\n```\n",
+        "wire": "# A wire\n\nserendipity\n",
+        "decisions/README": "# Decisions\n\n[one](0001-one.md)\n",
+        "decisions/0001-one": "# Juxtaposed\n\nbamboozle\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.md").write_text(text, "utf-8")
+    built = tmp_path / "_build"
+    command = [sys.executable, "-m", "sphinx", "-q", "-b", "html", "-c", ROOT / "docs"]
+    subprocess.run([*command, tmp_path, built], check=True, capture_output=True)
+    index = (built / "searchindex.js").read_text("utf-8").lower()
+    assert "serendip" in index
+    assert "juxtapos" not in index
+    assert "bamboozl" not in index
+
+
+def test_the_version_is_the_same_wherever_it_is_stated() -> None:
+    """The newest release of the changelog, the citation and the packages have one version."""
+    stated = {
+        "pyproject.toml": r'^version = "(.+)"',
+        "CITATION.cff": r"^version: (.+)",
+        "CHANGELOG.md": r"^## \[(.+)\] - \d{4}-\d\d-\d\d$",
+        "examples/javascript/package.json": r'^  "version": "(.+)"',
+        "docs/how-to/installation.md": r"era_haptics-([\d.]+)-py3",
+        "docs/how-to/deployment.md": r"era_haptics-([\d.]+)-py3",
+    }
+    texts = {name: (ROOT / name).read_text("utf-8") for name in stated}
+    versions = {name: re.findall(stated[name], texts[name], re.MULTILINE)[0] for name in stated}
+    assert len(set(versions.values())) == 1, versions
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
+def test_links_beside_the_docs_lead_somewhere(name: str) -> None:
+    """What a link to a file of the project names is there."""
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", (ROOT / name).read_text("utf-8"))
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_pages_that_are_named_in_code_are_there() -> None:
+    """Messages, docstrings and the changelog name pages by their path."""
+    code = ["registry", "controller", "drivers", "era_haptics", "model", "sim"]
+    files = [
+        path for name in (*code, "benchmarks", "examples") for path in (ROOT / name).rglob("*.py")
+    ]
+    files += [
+        ROOT / "CHANGELOG.md",
+        ROOT / "Makefile",
+        ROOT / "SECURITY.md",
+    ]
+    named = {
+        (page, path.name)
+        for path in files
+        for page in re.findall(r"\bdocs/[a-z][\w/-]+\.md\b", path.read_text("utf-8"))
+    }
+    assert len(named) > 10
+    assert {(page, path) for page, path in named if not (ROOT / page).is_file()} == set()
+
+
+def test_decisions_that_are_named_are_there() -> None:
+    """A record that was folded into a later one is named nowhere, in code, tests or pages."""
+    folders = ["controller", "docs", "drivers", "firmware", "model", "sim", "tests"]
+    suffixes = {".py", ".c", ".h", ".md", ".yaml"}
+    files = [path for name in folders for path in (ROOT / name).rglob("*.*")]
+    named = {
+        (number, path.name)
+        for path in files
+        if path.suffix in suffixes and "_build" not in path.parts
+        for number in re.findall(
+            r"(?:\bdecisions?/|\bdecisions? |\[)(0\d{3})\b", path.read_text("utf-8")
+        )
+    }
+    assert len(named) > 50
+    there = {path.name[:4] for path in (ROOT / "docs" / "decisions").glob("0*.md")}
+    assert {(number, name) for number, name in named if number not in there} == set()

@@ -6,7 +6,6 @@ NOTIFY_SOCKET, non-blocking; errors are ignored. Without the variable nothing is
 
 import contextlib
 import os
-import resource
 import socket
 import stat
 from collections.abc import Mapping
@@ -184,6 +183,8 @@ _MAX_DESCRIPTORS = 65_536
 
 def allow_many_descriptors() -> int:
     """Raise the limit, so that idle connections do not use it up; return it."""
+    import resource  # of POSIX alone; a configuration is checked elsewhere, too
+
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = _MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else hard
     with contextlib.suppress(OSError, ValueError):

@@ -51,7 +51,7 @@ from model.arrays import FloatArray
 from model.estimate.measurement import WiredSensor
 from model.finger import fingertips_on
 from model.rig.rig import Rig
-from model.rig.rig_writing import rewritten_text
+from model.rig.rig_writing import save_rig
 
 RESULTS = ROOT / "out" / "weekend_through_jack.json"
 MESH = "13x11 Legendre"
@@ -78,13 +78,11 @@ def played(number: int, count: int) -> Played:
     """Measure, calibrate and touch a board; count: touches for each number of quiet fingers."""
     rig = rig_as_bought()
     built = BuiltBoard.drawn(rig, number)
-    assert rig.document is not None
-    text = rewritten_text(rig.document, rig, built.exactly_known, comment="As it is built.")
     exact = phased_table(_with_lags(built).exactly_known)
     bought = phased_table(rig)
     with tempfile.TemporaryDirectory(prefix="weekend") as name:
         folder = Path(name)
-        (folder / "built.yaml").write_text(text, "utf-8")
+        save_rig(built.exactly_known, folder / "built.yaml")
         (folder / "put.csv").write_text(_as_csv(put_by_hand(sensor_places(rig), number)), "utf-8")
         with desk(
             folder,

@@ -1,4 +1,5 @@
-"""The group `era rig`: `check`, whether a rig is wired and built as its file says; `identify`.
+"""The group `era rig`: `check`, whether a rig is wired and built as its file says; `identify`;
+`show` and `merge` of what a fit found.
 
 `era rig identify` finds the parameters of the plate in place. Both measure by the rig's own ERAs
 and the sensors of its amplifiers, or read a file of responses.
@@ -20,7 +21,6 @@ from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.config.document import Document
     from model.estimate.measurement import MeasuredPlate, Responses
     from model.rig.rig import Rig
 
@@ -41,7 +41,13 @@ def identify(
         Path, typer.Argument(metavar="RIG", help="Rig file, or the daemon's file that names it.")
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="Rig file to write.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="RIG.fitted.yaml",
+            help="File of the fitted rig, in the folder of RIG or above.",
+        ),
     ],
     url: Annotated[
         list[str] | None,
@@ -125,10 +131,11 @@ def identify(
     from controller.plate_measurement import observation_of
     from model.config.units import parse_frequencies
     from model.estimate import identify as identification_report
-    from model.estimate.identify import expected_contrast
+    from model.estimate.identify import expected_contrast, standard_errors
     from model.estimate.identify import identify as fit
     from model.estimate.measurement import DeviceSettings, measure_by_device
     from model.estimate.verdict import check_meaning
+    from model.rig.rig_writing import check_beside
     from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
@@ -153,10 +160,12 @@ def identify(
             periods or 2,
             seed,
         )
-    with rig_of_file(rig_file) as (document, rig):
+    with rig_of_file(rig_file) as rig:
         check_measurable(rig.plate)
-        source = Path(document.source)
+        assert rig.document is not None  # noqa: S101  it was read from a file
+        source = Path(rig.document.source)
         check_rig_output(output, rig_file, source)
+        check_beside(output, rig)
         if measured_file is None:
             require_untouched(is_known=untouched, has_terminal=not as_json)
         if measured_file is not None:
@@ -185,7 +194,7 @@ def identify(
     ]
     made = f"{source.name} identified in place by `era rig identify`:"
     files = (
-        write_fitted_rig(output, document, (rig, found.rig), [made, *rows])
+        write_fitted_rig(output, (rig, found.rig), [made, *rows], standard_errors(found))
         if found.is_explained
         else []
     )
@@ -231,25 +240,24 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
 
 
 @contextmanager
-def rig_of_file(path: Path) -> "Iterator[tuple[Document, Rig]]":
+def rig_of_file(path: Path) -> "Iterator[Rig]":
     """Read a rig's file, or that which a daemon's file names while its daemon cannot run.
 
     Raises InputError, also where the daemon runs: it holds the amplifiers.
     """
-    from controller.daemon.config import daemon_config_of, file_of, is_daemon_document
+    from controller.daemon.config import daemon_config_of, is_daemon_document
     from controller.process.daemon_process import SocketLock
     from model.config.document import read_document
     from model.rig.rig_file import rig_of
 
     document = read_document(path)
     if not is_daemon_document(document):
-        yield document, rig_of(document)
+        yield rig_of(document)
         return
-    config, rig_file = daemon_config_of(document), file_of(document, "rig")
-    assert rig_file is not None  # noqa: S101  else a problem was reported
+    config = daemon_config_of(document)
     lock = SocketLock(config.socket)
     try:
-        yield read_document(rig_file), config.rig
+        yield config.rig
     finally:
         lock.release()
 
@@ -342,6 +350,77 @@ FAILED = 1
 
 
 rig_app.command()(identify)
+
+
+@rig_app.command()
+def show(
+    fitted: Annotated[Path, typer.Argument(metavar="FITTED", help="File of a fitted rig.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Show what a fit found beside the rig file that it began with, with standard errors.
+
+    Values are in SI units, as the rig file states them.
+    """
+    from model.rig.rig_file import load_rig
+    from model.rig.rig_writing import fitted_rows
+
+    rig = load_rig(fitted)
+    changes = fitted_rows(rig)
+    assert rig.document is not None  # noqa: S101  it was read from a file
+    assert rig.document.over is not None  # noqa: S101  else there were no rows
+    base = str(rig.document.over.data["base"])
+    table = [
+        (key, _value_text(before), _value_text(after), "" if error is None else f"± {error:.3g}")
+        for key, before, after, error in changes
+    ]
+    heading = ("", base, fitted.name, "standard error")
+    widths = [max(map(len, column)) for column in zip(heading, *table, strict=True)]
+    rows = [
+        "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in (heading, *table)
+    ]
+    names = ("key", "base", "fitted", "standard_error")
+    answer = {"base": base, "changes": [dict(zip(names, each, strict=True)) for each in changes]}
+    print_report(rows, answer, as_json=as_json)
+
+
+def _value_text(value: object) -> str:
+    """A value of a rig file for people: five digits of a number, the count of rows."""
+    match value:
+        case float():
+            return f"{value:.5g}"
+        case [[*_], *_]:
+            return counted(len(value), "row")
+        case list():
+            return f"[{', '.join(map(_value_text, value))}]"
+        case None:
+            return "-"
+    return str(value)
+
+
+@rig_app.command()
+def merge(
+    fitted: Annotated[Path, typer.Argument(metavar="FITTED", help="File of a fitted rig.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="RIG.yaml", help="Rig file to write.")
+    ],
+) -> None:
+    """Write one rig file with what a fit found and all else of the file that it began with.
+
+    Comments of that file are not in it. The table of the fitted rig serves it, too.
+    """
+    from model.files.array_file import whole_or_nothing
+    from model.rig.rig_file import load_rig
+
+    check_rig_output(output, fitted)
+    rig = load_rig(fitted)
+    assert rig.document is not None  # noqa: S101  it was read from a file
+    if rig.document.over is None:
+        raise InputError(f"{fitted} must be a fitted rig, with a `base`; this one is whole")
+    text = f"# {fitted.name} merged by `era rig merge`:\n\n{rig.document.whole_text}"
+    with whole_or_nothing(output) as stream:
+        stream.write(text.encode())
+    print(f"wrote {output}")
 
 
 @rig_app.command()
@@ -439,7 +518,7 @@ def _measured(
     from controller.plate_measurement import observation_of
     from model.structure.modal_elasticity import check_measurable
 
-    with rig_of_file(rig_file) as (_, rig):
+    with rig_of_file(rig_file) as rig:
         check_measurable(rig.plate)
         require_untouched(is_known=is_untouched, has_terminal=has_terminal)
         plate = measured_by_amplifiers(rig, urls, level=level, is_quick=False)

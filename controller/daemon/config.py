@@ -35,7 +35,7 @@ from model.estimate.learned_plate import was_learned
 from model.finger import STRONG_DB_SL
 from model.rig.actuator_keys import Identifier
 from model.rig.rig import Rig
-from model.rig.rig_file import rig_of
+from model.rig.rig_file import rig_of, with_base
 from model.rig.rig_summary import clock_costs, gain_notes, whole_url
 from model.structure.attachments import check_supported
 
@@ -265,10 +265,10 @@ def _rig(validation: Validation[DaemonSection], file: Path | None) -> tuple[Rig 
     if file is None:
         return None, ""
     try:
-        document = read_document(file)
+        document = with_base(read_document(file))
         rig = rig_of(document)
         check_supported(rig.plate, rig.eras, loads=rig.masses)
-        return rig, document.text
+        return rig, document.whole_text
     except ConfigError as error:
         validation.add(("rig",), "invalid rig:\n    " + str(error).replace("\n", "\n  "))
     except (InputError, OSError) as error:

@@ -157,13 +157,18 @@ def _with_named(path: Path, missing: list[str]) -> Iterable[Path]:
         if path.is_file():  # a missing file is reported when it is read
             missing.append(f"files that {path.name} names ({type(error).__name__})")
         return
+    base = document.data.get("base")
+    if isinstance(base, str) and "\0" not in base:
+        yield document.beside(base)
     if not is_daemon_document(document):
         return
     layouts = document.data.get("layouts")
     names = layouts if isinstance(layouts, dict) else ()
     # A table is large and can be built again.
-    named = [file_of(document, "rig"), *(file_of(document, "layouts", each) for each in names)]
-    yield from filter(None, named)
+    rig = file_of(document, "rig")
+    if rig is not None:
+        yield from _with_named(rig, missing)
+    yield from filter(None, (file_of(document, "layouts", each) for each in names))
     folder = file_of(document, "dumps", "folder")
     if folder is not None:
         dumps = sorted(folder.glob(DUMP_PATTERN), key=lambda file: file.name)

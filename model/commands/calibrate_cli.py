@@ -4,7 +4,7 @@ The file of a fitted rig and the end of the report are shared by all commands th
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,13 +24,13 @@ from model.files.output_paths import check_ending, check_picture, check_place, c
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.config.document import Document
+    from model.config.document import KeyPath
     from model.rig.rig import Rig
 
 NO_FIT = 1
 """Exit status where a fit does not explain the measurement."""
 
-_HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify)`:\s*$|\Z")
+_HEADING = re.compile(rb"# .* by `era (calibrate|outputs|rig identify|rig merge)`:\s*$|\Z")
 """First line of a file that a command fitted, or of an empty one."""
 
 _NO_FIT = (
@@ -69,22 +69,18 @@ def check_rig_output(output: Path, *taken: Path) -> None:
 
 def write_fitted_rig(
     output: Path,
-    document: "Document",
     rigs: "tuple[Rig, Rig]",
     comment: Sequence[str],
-    *,
-    mesh: str | None = None,
+    errors: "Mapping[KeyPath, float]",
 ) -> list[str]:
-    """Write the document of a rig with its fitted values, and return the files written.
+    """Write what a fit found beside the rig's file, and return the files written.
 
-    rigs: before and after the fit; comment: a heading that `_HEADING` matches, then the report.
+    rigs: before and after the fit; comment: a heading that `_HEADING` matches, then the report;
+    errors: standard errors by the path of their key in the file.
     """
-    from model.files.array_file import whole_or_nothing
-    from model.rig.rig_writing import rewritten_text
+    from model.rig.rig_writing import save_fitted
 
-    text = rewritten_text(document, *rigs, comment="\n  ".join(comment), mesh=mesh)
-    with whole_or_nothing(output) as stream:
-        stream.write(text.encode())
+    save_fitted(output, *rigs, comment="\n  ".join(comment), errors=errors)
     return [str(output)]
 
 
@@ -118,7 +114,13 @@ def calibrate(
         Path, typer.Argument(metavar="MEASURED", help="Responses, .uff, .unv or .csv.")
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="RIG2.yaml", help="Rig file to write.")
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="RIG.fitted.yaml",
+            help="File of the fitted rig, in the folder of RIG or above.",
+        ),
     ],
     mesh: MeshOption = None,
     all_scales: Annotated[
@@ -131,9 +133,8 @@ def calibrate(
 ) -> None:
     """Fit a rig to measured responses.
 
-    Write a new rig, and print its values with their uncertainties.
+    Write what was found beside the rig's file, and print its values with their uncertainties.
     """
-    from model.config.document import read_document
     from model.estimate.calibrate import calibrate as fit
     from model.estimate.calibrate import (
         calibration_json,
@@ -141,16 +142,18 @@ def calibrate(
         check_rows,
         finding_rows,
         gain_rows,
+        standard_errors,
     )
     from model.estimate.measurement import LEAST_SENSORS, read_measured, responses_of
     from model.estimate.verdict import check_consistency
-    from model.rig.rig_file import rig_of
+    from model.rig.rig_file import load_rig
+    from model.rig.rig_writing import check_beside
 
     check_rig_output(output, rig_file, measured_file)
     if picture is not None:
         check_picture(picture)
-    document = read_document(rig_file)
-    rig = rig_of(document, mesh=mesh)
+    rig = load_rig(rig_file, mesh=mesh)
+    check_beside(output, rig)
     responses = responses_of(read_measured(measured_file), rig)
     with Stopwatch() as timed, progress_bar("fits") as progress:
         screened = check_consistency(rig, responses)
@@ -164,7 +167,9 @@ def calibrate(
         refusal = _DEAD.format(eras=", ".join(calibration.dead_eras))
     made = f"{rig_file.name} calibrated with {measured_file.name} by `era calibrate`:"
     files = (
-        write_fitted_rig(output, document, (rig, calibration.rig), [made, *rows, *notes], mesh=mesh)
+        write_fitted_rig(
+            output, (rig, calibration.rig), [made, *rows, *notes], standard_errors(calibration)
+        )
         if refusal is None
         else []
     )

@@ -1,27 +1,20 @@
-"""YAML files read strictly, with the line of every key, and written with other values.
+"""YAML files read strictly, with the line of every key, and the text of data.
 
 A file is UTF-8, at most 1 MiB and 50 000 values in 20 levels, one document with a mapping at the
 top, without anchors, aliases or tags, so that nothing expands or gets constructed; all this is
 checked before a value is made. Keys are unique. Words are text unless they are decimal numbers,
-true, false or null (core schema of YAML 1.2). A file that is edited keeps its comments and layout.
+true, false or null (core schema of YAML 1.2).
 """
 
 import errno
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import yaml
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import ScalarNode
-from ruamel.yaml.resolver import BaseResolver, VersionedResolver
 
 from model.errors import InputError
 from registry.files import read_regular
@@ -84,6 +77,13 @@ class Document:
     text: str
     data: dict[str, Value]
     lines: dict[KeyPath, int]
+    over: "Document | None" = None
+    """The file alone, where `data` are its keys over those of the file that it names as `base`."""
+
+    @property
+    def whole_text(self) -> str:
+        """Text with all of its keys, those of a base as well."""
+        return self.text or data_text(self.data)
 
     def value(self, path: KeyPath) -> Value:
         """The value at a path of keys; raises KeyError for a missing one."""
@@ -358,74 +358,31 @@ def _line(at: Any) -> int:
     return at.start_mark.line + 1 if at.start_mark else 1
 
 
-def edited_text(document: Document, change: Callable[[CommentedMap], None]) -> str:
-    """The text of a document after a change of its data in place.
+class _PlainDumper(yaml.SafeDumper):
+    """Quotes each text that reading would take for a number or a word."""
 
-    change: sets, inserts or deletes keys of the mapping that it is called with. Comments, order
-    and numbers as they are written stay, spaces within a line do not. Raises ConfigError if there
-    are comments that cannot be kept.
-    """
-    yaml = YAML(typ="rt", pure=True)
-    yaml.Resolver = _PlainResolver
-    yaml.preserve_quotes = True
-    # Room for new keys on the longest line, which would break elsewhere otherwise.
-    yaml.width = max(map(len, document.text.splitlines())) + 100
-    yaml.indent(**_indentation(document.text))
-    stream = StringIO()
-    with _refused_if_lossy(document):
-        # Comments alone would keep their CR, and tabs between value and comment are refused.
-        data = yaml.load(document.text.replace("\r\n", "\n").replace("\t", " "))
-    change(data)
-    with _refused_if_lossy(document):
-        yaml.dump(data, stream)
-        if parse_document(document.source, stream.getvalue()).data != data:
-            raise AssertionError
-    return stream.getvalue()
+    def text(self, value: str) -> yaml.ScalarNode:
+        """Make the node of a text."""
+        style = None if isinstance(plain_value(value), str) else "'"
+        return self.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write a value that stands twice out twice."""
+        return True
 
 
-class _PlainResolver(VersionedResolver):
-    """Takes for numbers and words what reading takes for them."""
-
-    processing_version = (1, 2)  # ignores %YAML directives
-
-    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
-        """The tag of a node by its kind and text."""
-        if kind is ScalarNode and isinstance(plain_value(value), str):
-            return BaseResolver.DEFAULT_SCALAR_TAG
-        return super().resolve(kind, value, implicit)
-
-
-_BLOCK_MAPPING = re.compile(r"^( +)[^\s#-]", re.MULTILINE)
-_BLOCK_SEQUENCE = re.compile(r"^( *)[^\s#-][^\n]*:[ ]*(?:#[^\n]*)?\n( *)- ", re.MULTILINE)
-
-
-def _indentation(text: str) -> dict[str, int]:
-    """How the first blocks of a text are indented, as ruamel.yaml wants it."""
-    mapping = _BLOCK_MAPPING.search(text)
-    sequence = _BLOCK_SEQUENCE.search(text)
-    offset = len(sequence[2]) - len(sequence[1]) if sequence else 2
-    return {"mapping": len(mapping[1]) if mapping else 2, "sequence": offset + 2, "offset": offset}
-
-
-@contextmanager
-def _refused_if_lossy(document: Document) -> Iterator[None]:
-    """Raise what the library raises at comments that it cannot place as ConfigError."""
-    try:
-        yield
-    except (YAMLError, ConfigError, NotImplementedError, AssertionError) as error:
-        message = (
-            "cannot be edited with its comments kept; write every value on the line of its key, "
-            "and comments on lines of their own"
-        )
-        raise ConfigError(document.source, [ConfigProblem(None, "", message)]) from error
+_PlainDumper.add_representer(str, _PlainDumper.text)
 
 
 def data_text(data: Mapping[str, Value]) -> str:
-    """The text of a new file with this data, in its order."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None  # inner lists and mappings on one line
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment] # typed as None
-    yaml.allow_unicode = True
-    stream = StringIO()
-    yaml.dump(data, stream)
-    return stream.getvalue()
+    """The text of a new file with this data, in its order; inner lists and mappings on one line."""
+    return str(
+        yaml.dump(
+            {**data},
+            Dumper=_PlainDumper,
+            default_flow_style=None,
+            sort_keys=False,
+            allow_unicode=True,
+            width=100,
+        )
+    )

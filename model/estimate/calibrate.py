@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray, best_of
+from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.calibration_fit import (
     CalibrationFit,
@@ -35,6 +36,7 @@ from model.estimate.space import KINDS, MASS_CELLS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
+from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain
 
@@ -665,6 +667,28 @@ def _rms(values: ArrayLike) -> float:
 def _rounded(value: float) -> float:
     """To two digits: an error is hardly known better."""
     return float(f"{value:.2g}")
+
+
+def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
+    """Standard errors of the values that a rig's file states, by the path of their key."""
+    rig, found = calibration.rig, dict[KeyPath, float]()
+    for each in calibration.parameters:
+        parameter = each.parameter
+        if each.standard_error is None:
+            continue
+        if parameter.foot:
+            path: KeyPath = ("supports", parameter.foot, "stiffness")
+        elif parameter.era:
+            keys = ACTUATOR_KEYS[type(rig.era(parameter.era))].keys
+            path = ("eras", parameter.era, keys[parameter.field or parameter.kind])
+        elif parameter.kind == "loss_factor":
+            path = ("plate", "loss_factor")
+        elif rig.laminate is None:
+            path = ("plate", "material", next(iter(rig.plate.material.moduli)))
+        else:
+            continue  # its modulus is that of all layers together
+        found[path] = each.standard_error
+    return found
 
 
 def change_rows(calibration: Calibration) -> list[str]:

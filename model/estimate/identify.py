@@ -41,6 +41,7 @@ import numpy as np
 from model.answer.plan import query
 from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
+from model.config.document import KeyPath
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
 from model.estimate.fit import Fit, fit, likeliest, prediction_errors, relative_rms
@@ -61,6 +62,7 @@ from model.finger import Grid
 from model.processes import Progress, unseen
 from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
+from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
 from model.spectral.direct_solution import grain_slopes
@@ -727,6 +729,24 @@ def estimates(found: Identification) -> list[ParameterEstimate]:
         difference, error, std = (known.per_unit * each for each in (difference, error, std))
         rows.append(ParameterEstimate(name, kind, difference, error, std, known.unit, known.key))
     return rows
+
+
+def standard_errors(found: Identification) -> dict[KeyPath, float]:
+    """Standard errors of the values that a rig's file states, by the path of their key."""
+    rig, space, std = found.rig, found.fitted.space, found.std
+    errors: dict[KeyPath, float] = {}
+    if rig.laminate is None:
+        errors["plate", "thickness"] = rig.plate.thickness * std[space.groups["thickness"].start]
+    errors["plate", "loss_factor"] = rig.plate.loss_factor * std[space.groups["loss"].start]
+    for kind, part in (("stiffness", "stiffness"), ("damping", "damping_each")):
+        for era, error in zip(rig.eras, std[space.groups[part]], strict=True):
+            key = ACTUATOR_KEYS[type(era)].keys[era.fields[kind]]
+            errors["eras", era.name, key] = float(getattr(era, era.fields[kind]) * error)
+    for name, number, error in zip(
+        rig.foot_names, rig.feet, std[space.groups["supports"]], strict=False
+    ):
+        errors["supports", name, "stiffness"] = rig.masses[number].stiffness * float(error)
+    return {path: float(error) for path, error in errors.items() if error > 0}
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,30 @@ A section checks and makes its own part (`model.rig.sections`). Problems between
 valid by themselves are found here, and all problems of a file are reported at once.
 """
 
+import hashlib
 import math
 import re
 from collections.abc import Mapping, Set
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import replace
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple, NoReturn
 
-from model.config.document import Document, KeyPath, key_name, parse_document, read_document
+from model.config.document import (
+    ConfigError,
+    Document,
+    KeyPath,
+    Value,
+    key_name,
+    parse_document,
+    read_document,
+)
 from model.config.fields import Quantity, Section, Validation, section_by_kind
 from model.config.file_kinds import check_is_rig
 from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError, expect_path, shown
 from model.fem import MITC4, Mesh, element_of
 from model.rig.actuator_keys import KINDS, stiff_mount_problems
-from model.rig.rig import SAME_POINT, Channel, Rig
+from model.rig.rig import SAME_POINT, Channel, Rig, canonical_json
 from model.rig.sections import (
     ISOTROPIC,
     ORTHOTROPIC,
@@ -311,6 +321,94 @@ def _given(
     }
 
 
+BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
+"""Keys of a fitted rig beside those of a rig: they say what it differs from, and how surely."""
+
+_NAMED = ("eras", "supports", "amplifiers")  # sections whose entries a fit takes from the base
+_WIRING = ("amplifier", "channel")
+
+
+def with_base(document: Document) -> Document:
+    """Merge a fitted rig's keys over those of the rig file that it names as its `base`.
+
+    Another document is returned as it is. Raises ConfigError for a base that is missing, outside
+    the folder, fitted itself, or not as it was when it was fitted, and for names that it lacks.
+    """
+    if "base" not in document.data or document.over is not None:
+        return document
+
+    def refuse(message: str, *path: str) -> NoReturn:
+        raise ConfigError(document.source, [document.problem(path or ("base",), message)])
+
+    name = document.data["base"]
+    if not isinstance(name, str) or not name:
+        refuse(f"must be the name of a rig file, got {shown(name)}")
+    if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+        refuse(f"must be in the folder of this file or below it, got {name}; put both together")
+    path = base_path(document)
+    if not path.is_file():
+        refuse(f"must be a rig file beside this one, got {name}, which is not there; put it back")
+    base = read_document(path)
+    if "base" in base.data:
+        refuse(f"must be a whole rig, got {name}, which has a base of its own; name that one")
+    if document.data.get("base_fingerprint") != base_fingerprint(base):
+        refuse(
+            f"{name} must have the plate, ERAs and masses that it had when they were fitted; undo "
+            "what was changed there, or fit anew"
+        )
+    over = {key: value for key, value in document.data.items() if key not in BASE_KEYS}
+    for kind in _NAMED:
+        known, given = (each.get(kind) for each in (base.data, over))
+        for each in given if isinstance(given, dict) else ():
+            if not isinstance(known, dict) or each not in known:
+                refuse(f"must be in {name}, which has none of this name; remove it", kind, each)
+    data = merged_keys(base.data, over)
+    return Document(document.source, "", data, document.lines, over=document)
+
+
+def base_path(document: Document) -> Path:
+    """The rig file that a fitted one names as its base."""
+    return Path(document.source).parent / str(document.data["base"])
+
+
+def base_fingerprint(base: Document) -> str:
+    """Sixteen digits that change with the plate, ERAs, masses and supports as a file states them.
+
+    Wiring, limits and thresholds may change: no fit depends on them.
+    """
+    eras = base.data.get("eras")
+    own = {key: base.data.get(key) for key in ("plate", "masses", "supports")}
+    own["eras"] = (
+        eras
+        if not isinstance(eras, dict)
+        else {
+            name: {key: value for key, value in era.items() if key not in _WIRING}
+            if isinstance(era, dict)
+            else era
+            for name, era in eras.items()
+        }
+    )
+    return hashlib.sha256(canonical_json(own).encode()).hexdigest()[:16]
+
+
+def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
+    """Keys of a file with those of another over them, mapping by mapping; lists are replaced.
+
+    is_final: whether null leaves a key out; else it stays, for a later merge.
+    """
+    if not (isinstance(base, dict) and isinstance(over, dict)):
+        return over
+    found = {
+        **base,
+        **{key: merged_keys(base.get(key), each, is_final=is_final) for key, each in over.items()},
+    }
+    return {
+        key: value
+        for key, value in found.items()
+        if not (is_final and value is None and key in over)
+    }
+
+
 def load_rig(path: Path | str, *, mesh: str | None = None) -> Rig:
     """Read a rig file; mesh: `auto` or NXxNY, replaces that of the file.
 
@@ -334,13 +432,19 @@ def parse_rig(source: str, text: str) -> Rig:
 
 def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     """Make the rig of a document, with another mesh if one is given; raises as `load_rig`."""
+    document = with_base(document)
     if "plate" not in document.data:
         check_is_rig(document)
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
-    section = validation.finish()
+    try:
+        section = validation.finish()
+    except ConfigError:
+        if document.over is not None:
+            rig_of(read_document(base_path(document.over)), mesh=mesh)  # raises its own problems
+        raise
     if mesh is not None:
-        document = Document(document.source, "", document.data | {"mesh": mesh}, {})
+        document = replace(document, text="", data=document.data | {"mesh": mesh}, lines={})
     plate = section.plate.made(frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     fingertip: FingertipSection | str = section.fingertip

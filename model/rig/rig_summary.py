@@ -29,7 +29,7 @@ from model.errors import InputError
 from model.quantities import percent
 from model.rig.actuator_keys import STIFF_MOUNT, ExciterSection
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, rig_of
+from model.rig.rig_file import example_rig_path, rig_of, with_base
 from model.rig.sections import PLAIN_KEYS, LimitsSection, RigSection
 from model.structure.attachments import (
     DEFAULT_POINTS,
@@ -339,6 +339,7 @@ _FAR_FROM_SLIDING = 2.0
 
 def _check(document: Document) -> CheckedFile:
     """Check a rig and its amplifiers; return its values in a line, to show unlikely ones."""
+    document = with_base(document)
     problems: list[ConfigProblem] = []
     rig = None
     try:

@@ -1,21 +1,27 @@
-"""Rigs made, changed and written by the keys of a rig file.
+"""Rigs made, changed and written by the keys of a rig file, and what a fit found beside one.
 
 A rig keeps the keys that it was made of, so that dependent values follow a change: the damping of a
-ratio, a mesh that is chosen, the homogeneous plate of a laminate. The text of a file with other
-values keeps its comments and layout.
+ratio, a mesh that is chosen, the homogeneous plate of a laminate. The file that a person wrote is
+never written again: a fitted rig names it as its `base` and states what differs from it.
 """
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, cast
 
 from pydantic_core import to_jsonable_python
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from model.config.document import Document, KeyPath, data_text, edited_text, parse_document
+from model.config.document import (
+    Document,
+    KeyPath,
+    data_text,
+    key_name,
+    parse_document,
+    read_document,
+)
 from model.config.fields import Section, Validation
 from model.config.units import LENGTH, quantity
 from model.errors import InputError, expect, expect_path
@@ -23,78 +29,198 @@ from model.files.array_file import whole_or_nothing
 from model.files.output_paths import check_ending
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig
-from model.rig.rig_file import rig_of
+from model.rig.rig_file import (
+    BASE_KEYS,
+    base_fingerprint,
+    base_path,
+    merged_keys,
+    rig_of,
+)
 from model.rig.sections import PlateSection, RigSection
 from model.structure.material import known_material
 from model.structure.plate import FOLLOWED_FIELDS
 
-_PER_LINE = 4
-_SAME, _NONE = 1e-4, 1e-6  # relative; and what counts as nothing of every quantity
-
-# ruamel.yaml wraps long sequences anywhere, so rows replace placeholders in its text.
-_ROWS_OF = "rows-of-"
-_PLACEHOLDER = re.compile(
-    rf"^(?P<start>(?P<indent> *).*(gains|modes):\s+){_ROWS_OF}(?P<number>\d+)", re.MULTILINE
-)
+_SAME, _NONE = 1e-9, 1e-12  # relative; and what counts as nothing of every quantity
 
 
-def rewritten_text(
-    document: Document, before: Rig, after: Rig, *, comment: str, mesh: str | None = None
-) -> str:
-    """Return a rig file's text with the values of another rig of the same ERAs, after a comment.
+def save_beside(
+    output: Path,
+    document: Document,
+    keys: Mapping[str, Any],
+    *,
+    comment: str,
+    errors: Mapping[KeyPath, float] | None = None,
+) -> Rig:
+    """Write the keys of a rig that a command found beside its file, which stays as it is.
 
-    Written are plate, ERAs, feet and uncertainty where they differ, further masses after its own.
-    mesh: that replaces the file's. Raises ConfigError if a comment of the file would be lost,
-    InputError where the text, read as a rig, has other values.
+    document: that the rig was made of; of a fitted one the keys stay where these say nothing else.
+    errors: standard errors by the path of their key. Returns the rig as it reads back. Raises
+    InputError for an output that cannot name the rig's file, OSError if it cannot be written.
     """
-    section = Validation(document, RigSection).finish()
-    rows: list[Rows] = []
-
-    def change(data: CommentedMap) -> None:
-        own = _values(before, section)
-        for path, value in _values(after, section).items():
-            if value != own[path] or path in _restated(after):
-                _put(data, path, value, rows)
-        for era in after.eras:
-            entry = data["eras"][era.name]
-            for key, others in KINDS[type(era)].instead.items():
-                for other in others if key in entry else ():
-                    entry.pop(other, None)
-        for mass in after.masses[len(before.masses) :]:
-            masses = data.setdefault("masses", CommentedMap())
-            numbers = range(1, len(masses) + 2)
-            name = next(name for n in numbers if (name := f"found{n}") not in masses)
-            masses[name] = _flow({"at": [mass.x, mass.y], "mass": mass.mass})
-
-    def rows_text(match: re.Match[str]) -> str:
-        """Rows in brackets, a few on each line."""
-        texts = [str(_rounded(row)) for row in rows[int(match["number"])]]
-        lines = [texts[at : at + _PER_LINE] for at in range(0, len(texts), _PER_LINE)]
-        joined = f",\n{match['indent']}    ".join(map(", ".join, lines))
-        return f"{match['start']}[\n{match['indent']}    {joined}]"
-
+    over = document.over
+    base = Path(document.source) if over is None else base_path(over)
+    own = {} if over is None else {k: v for k, v in over.data.items() if k not in BASE_KEYS}
+    fingerprint = base_fingerprint(document) if over is None else over.data["base_fingerprint"]
+    data = {
+        "base": _beside(output, base),
+        "base_fingerprint": fingerprint,
+        **merged_keys(own, {**keys}, is_final=False),
+    }
+    if errors:
+        data["standard_errors"] = _nested({path: float(f"{e:.3g}") for path, e in errors.items()})
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
-    text = f"{lines}\n{_PLACEHOLDER.sub(rows_text, edited_text(document, change))}"
-    back = rig_of(parse_document(document.source, text), mesh=mesh)
-    read, expected = ([*_numbers(each, section)] for each in (back, after))
-    if len(read) != len(expected) or not all(
-        math.isclose(one, other, rel_tol=_SAME, abs_tol=_NONE)
-        for one, other in zip(read, expected, strict=True)
-    ):
+    text = f"{lines}\n{data_text(data)}"
+    rig = rig_of(parse_document(str(output), text))
+    with whole_or_nothing(output) as stream:
+        stream.write(text.encode())
+    return rig
+
+
+def save_fitted(
+    output: Path,
+    before: Rig,
+    after: Rig,
+    *,
+    comment: str,
+    errors: Mapping[KeyPath, float] | None = None,
+) -> None:
+    """Write a fitted rig beside the file of the rig that its fit began with, as `save_beside`.
+
+    Written are plate, ERAs, feet, uncertainty and masses that differ. Raises InputError where the
+    file reads back with other values.
+    """
+    document = _document_of(before)
+    keys = fitted_keys(before, after)
+    section = Validation(document, RigSection).finish()
+    back = save_beside(output, document, keys, comment=comment, errors=errors)
+    if not _is_same(back, after, section):
+        output.unlink()
         raise InputError(
             f"{document.source}: values read back must be those written; write plate and ERAs as "
             "`era config init` does, and try again"
         )
-    return text
 
 
-Rows: TypeAlias = list[list[float]]
+def check_beside(output: Path, rig: Rig) -> None:
+    """Raise InputError unless a file at this path can name that of a rig as its base."""
+    document = _document_of(rig)
+    _beside(output, Path(document.source) if document.over is None else base_path(document.over))
+
+
+def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
+    """Keys of a rig file that make of one rig another one of the same ERAs, and no others.
+
+    A key that must be left out is None.
+    """
+    document = _document_of(before)
+    section, data = Validation(document, RigSection).finish(), cast("dict[str, Any]", document.data)
+    own = _values(before, section)
+    restated = {("plate", "loss_factor")} | {
+        ("eras", era.name, key) for era in after.eras for key in KINDS[type(era)].instead
+    }
+    found = {
+        path: value
+        for path, value in _values(after, section).items()
+        if value != own[path] or path in restated
+    }
+    for path, value in found.items():
+        if path[-1] == "material":
+            found[path] = _restated_material(data, path, value)
+    keys = _nested(found, data)
+    for era in after.eras:
+        entry, stated_keys = keys["eras"][era.name], data["eras"][era.name]
+        for key, others in KINDS[type(era)].instead.items():
+            if key in entry:
+                entry |= dict.fromkeys(other for other in others if other in stated_keys)
+    names = {*(data.get("masses") or ())}
+    for mass in after.masses[len(before.masses) :]:
+        name = next(each for n in range(1, len(names) + 2) if (each := f"found{n}") not in names)
+        names.add(name)
+        keys.setdefault("masses", {})[name] = {"at": [mass.x, mass.y], "mass": mass.mass}
+    return keys
+
+
+def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
+    """Key, value of the base, value and standard error of all that a fitted rig has otherwise.
+
+    Numbers in SI units; None without a standard error. Raises InputError for a rig without a base.
+    """
+    document = _document_of(rig)
+    if document.over is None:
+        raise InputError(
+            f"{document.source} must be a fitted rig, with a `base` beside it; `era calibrate` and "
+            "`era rig identify` write one"
+        )
+    base = rig_of(read_document(base_path(document.over)))
+    own = dict(_leaves(_nested(_values(base, Validation(_document_of(base), RigSection).finish()))))
+    written = dict(_leaves(_document_of(base).data)) | own
+    errors = dict(_leaves(document.over.data.get("standard_errors") or {}))
+    return [
+        (key_name(path), written.get(path), value, errors.get(path))
+        for path, value in _leaves(
+            {k: v for k, v in document.over.data.items() if k not in BASE_KEYS}
+        )
+        if value != written.get(path)
+    ]
+
+
+def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
+    """Yield what is in nested mappings, with its path; a list is one value."""
+    if not isinstance(value, Mapping):
+        yield path, value
+        return
+    for key, each in value.items():
+        yield from _leaves(each, (*path, key))
+
+
+def _beside(output: Path, base: Path) -> str:
+    """The name by which a file at a path names another one in its folder or below it."""
+    folder = output.absolute().parent
+    try:
+        return base.absolute().relative_to(folder).as_posix()
+    except ValueError:
+        raise InputError(
+            f"--output must be in the folder of {base}, which it names, or above it, got {output}; "
+            f"write it to {base.with_name(output.name)}"
+        ) from None
+
+
+def _document_of(rig: Rig) -> Document:
+    """The document that a rig was made of; raises InputError without one."""
+    if rig.document is None:
+        raise InputError("rig must be read from a file or made by era.rig, got one without keys")
+    return rig.document
+
+
+def _nested(values: Mapping[KeyPath, Any], data: Any = None) -> dict[str, Any]:
+    """Values by path as nested mappings; a list on the way is that of the data, changed."""
+    found: dict[str, Any] = {}
+    for path, value in values.items():
+        at: Any = found
+        own = data
+        for part in path[:-1]:
+            own = own.get(part) if isinstance(own, Mapping) else own and own[part]
+            if isinstance(at, dict):
+                at = at.setdefault(part, deepcopy(own) if isinstance(own, list) else {})
+            else:
+                at = at[part]
+        at[path[-1]] = value
+    return found
+
+
+def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of a fitted material with all else that the file says of it, by name or by keys."""
+    for part in path:
+        data = data[part]
+    if isinstance(data, Mapping):
+        return {**data, **value}
+    by_frequency = known_material(data).by_frequency
+    return value | ({"by_frequency": [*map(list, by_frequency)]} if by_frequency else {})
 
 
 def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     """Values of a rig that a fit may change, by where its file has them, as it states them."""
     found: dict[KeyPath, Any] = {("uncertainty",): asdict(rig.uncertainty)}
-    # New keys come first in their block.
     of_plate = section.plate.stated(rig.plate, rig.laminate)
     found |= {("plate", *path): value for path, value in of_plate.items()}
     for era in rig.eras:
@@ -105,12 +231,12 @@ def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     return found
 
 
-def _restated(after: Rig) -> set[KeyPath]:
-    """Where values are that are written in any case: others of the file would change them."""
-    own: set[KeyPath] = {
-        ("eras", era.name, key) for era in after.eras for key in KINDS[type(era)].instead
-    }
-    return {("plate", "loss_factor"), *own}
+def _is_same(one: Rig, other: Rig, section: RigSection) -> bool:
+    """Whether all numbers of two rigs that are written agree, but for rounding of logarithms."""
+    here, there = ([*_numbers(each, section)] for each in (one, other))
+    return len(here) == len(there) and all(
+        math.isclose(a, b, rel_tol=_SAME, abs_tol=_NONE) for a, b in zip(here, there, strict=True)
+    )
 
 
 def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
@@ -128,51 +254,6 @@ def _numbers(rig: Rig, section: RigSection) -> Iterator[float]:
                 parts += values.values()
             case list() | tuple() as values:
                 parts += values
-
-
-def _put(data: CommentedMap, path: KeyPath, value: Any, rows: list[Rows]) -> None:
-    """Set a value in the data of a file; rows of numbers are added to those given."""
-    entry, key = data, path[-1]
-    for part in path[:-1]:
-        entry = entry[part]
-    if key in ("gains", "modes"):
-        rows.append(value)
-        value = f"{_ROWS_OF}{len(rows) - 1}"
-    if key == "material":
-        given = entry[key]
-        texts = {name: f"{value[name] / 1e9:.7g} GPa" for name in value if name[0] in "EG"}
-        if isinstance(given, CommentedMap):
-            given.update(texts)
-            return
-        by_frequency = known_material(given).by_frequency
-        value |= texts | ({"by_frequency": by_frequency} if by_frequency else {})
-    # A new key comes first in a block, where it separates no comment.
-    if key in entry or entry.fa.flow_style():
-        entry[key] = _flow(value)
-    else:
-        entry.insert(0, key, _flow(value))
-
-
-def _flow(value: Any) -> Any:
-    """A value of a file on one line, its numbers rounded."""
-    rounded = _rounded(value)
-    if not isinstance(rounded, dict | list):
-        return rounded
-    found = CommentedMap(rounded) if isinstance(rounded, dict) else CommentedSeq(rounded)
-    found.fa.set_flow_style()
-    return found
-
-
-def _rounded(value: Any) -> Any:
-    """A value with six digits of each of its numbers."""
-    match value:
-        case float():
-            return float(f"{value:.6g}")
-        case Mapping():
-            return {key: _rounded(each) for key, each in value.items()}
-        case list() | tuple():
-            return [*map(_rounded, value)]
-    return value
 
 
 _SECTIONS = RigSection.model_fields.keys() - {"plate", "eras"}
@@ -245,10 +326,9 @@ def rig(
 
 
 def save_rig(rig: Rig, path: Path | str) -> None:
-    """Write a rig file that reads back as this rig: its file's text, or its keys.
+    """Write a rig file that reads back as this rig: its file's text, or all of its keys.
 
-    Values of a fitted rig, as of `calibrate`, are rounded. Raises InputError for a rig that no file
-    states, OSError if the file cannot be written.
+    Raises InputError for a rig that no file states, OSError if the file cannot be written.
 
     Example:
         >>> era.save_rig(mine, "mine.yaml")
@@ -258,7 +338,7 @@ def save_rig(rig: Rig, path: Path | str) -> None:
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)
     check_ending(place, ".yaml", ".yml", what="a rig file")
-    written = parse_document(str(place), document.text or data_text(document.data))
+    written = parse_document(str(place), document.whole_text)
     rig_of(written)
     with whole_or_nothing(place) as stream:
         stream.write(written.text.encode())
@@ -311,22 +391,22 @@ def _merged(own: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 def stated(rig: Rig) -> Document:
     """A document that states a rig; raises InputError for one that was not made of keys.
 
-    Of a rig that was fitted it has the plate, ERAs, masses and uncertainty, rounded.
+    Of a rig that was fitted it has the plate, ERAs, masses and uncertainty.
     """
-    document = rig.document
-    if document is None:
-        raise InputError("rig must be read from a file or made by era.rig, got one without keys")
-    if rig_of(document) == rig:
+    document = _document_of(rig)
+    before = rig_of(document)
+    if before == rig:
         return document
-    before = parse_document(document.source, document.text or data_text(document.data))
-    text = rewritten_text(before, rig_of(document), rig, comment="Fitted")
-    document = parse_document(document.source, text)
-    if replace(rig_of(document), **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
+    data = merged_keys(document.data, fitted_keys(before, rig))
+    found = Document(document.source, "", data, {})
+    back = rig_of(found)
+    is_same = _is_same(back, rig, Validation(document, RigSection).finish())
+    if not is_same or replace(back, **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
         raise InputError(
             "rig must have other plate, ERAs, masses and uncertainty than its keys alone; change "
             "others by rig.replaced"
         )
-    return document
+    return found
 
 
 def _document(source: str, keys: Mapping[str, Any]) -> Document:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ruamel.yaml import YAML
 
 from chain import FINGER, OTHER, Chain
 from drivers import errors
@@ -29,6 +28,7 @@ from model.vibration import Tone
 from registry import threads
 from sim.faults import FaultKind
 from virtual_lines import run_virtual
+from yaml_files import read_yaml
 
 Step = str | Mapping[str, Any]
 FINGERS = {
@@ -331,7 +331,7 @@ def _coded(what: str, value: Any) -> Any:
 
 def courses(path: Path) -> dict[str, Mapping[str, Any]]:
     """The courses of a file by their names: `steps`, and options of what they are played on."""
-    return dict(YAML(typ="safe").load(path))
+    return dict(read_yaml(path))
 
 
 def follow(

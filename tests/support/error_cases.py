@@ -24,8 +24,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-
 from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
@@ -33,6 +31,7 @@ from gateway_bench import real_daemon, wait_for
 from model.estimate.measurement import read_measured, responses_of, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
 from plates import DISTORTIONS, every
+from yaml_files import read_yaml
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "errors.md"
@@ -106,7 +105,7 @@ def cases() -> tuple[Case, ...]:
     """All cases, in the order of their files."""
     found: list[Case] = []
     for path in sorted((ROOT / "tests" / "errors" / "cases").glob("*.yaml")):
-        entries: list[dict[str, Any]] = YAML(typ="safe", pure=True).load(path.read_text("utf-8"))
+        entries: list[dict[str, Any]] = read_yaml(path)
         flat = [
             {"run": entry["run"], **variant}
             for entry in entries

@@ -442,7 +442,12 @@ def outputs(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="RIG2", help="Write the rig with these channels."),
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="RIG.wired.yaml",
+            help="Write these channels beside the rig, as fits do.",
+        ),
     ] = None,
     count: Annotated[
         int | None,

@@ -33,12 +33,11 @@ from era_haptics.lab.measuring.sound_card import (
 from model.arrays import ComplexArray, FloatArray, IntArray
 from model.commands.calibrate_cli import check_rig_output
 from model.commands.options import next_line
-from model.config.document import edited_text, read_document
 from model.errors import InputError
-from model.files.array_file import whole_or_nothing
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
+from model.rig.rig_writing import check_beside, save_beside
 from registry.plugins import did_you_mean
 
 TONE = 160.0
@@ -225,9 +224,11 @@ def find_outputs(
     beside: input of an accelerometer, None to ask on the terminal; output: rig to write; frequency
     [Hz]: of the tone that is felt. Raises InputError, LinkError.
     """
+    rig = load_rig(rig_file)
     if output is not None:
         check_rig_output(output, rig_file)
-    desk = Desk(load_rig(rig_file), ())
+        check_beside(output, rig)
+    desk = Desk(rig, ())
     desk.check(level)
     count = count or desk.output - 1
     with closing(open_card(device, outputs=count, inputs=beside or 0, limit=level)) as card:
@@ -242,7 +243,10 @@ def find_outputs(
     files = []
     rows = [*_rows(heard, own, channels, missing)]
     if output is not None and not missing:
-        _write(rig_file, output, channels)
+        assert rig.document is not None  # noqa: S101  it was read from a file
+        keys = {"eras": {name: {"channel": channel} for name, channel in channels.items()}}
+        comment = f"{rig_file.name} with channels as found by `era outputs`:"
+        save_beside(output, rig.document, keys, comment=comment)
         files = [str(output)]
         rows.append(f"wrote {output}")
     elif not (missing or is_right):
@@ -285,18 +289,6 @@ def _requested(
         era = names.pop(said, None)
         found.append(OutputFinding(number, era, verdict="ok" if era else "moves nothing"))
     return found
-
-
-def _write(rig_file: Path, output: Path, channels: Mapping[str, int]) -> None:
-    """Write the rig with these channels."""
-
-    def change(data: Any) -> None:
-        for name, channel in channels.items():
-            data["eras"][name]["channel"] = channel
-
-    text = edited_text(read_document(rig_file), change)
-    with whole_or_nothing(output) as stream:
-        stream.write(f"# Channels as found by `era outputs`:\n{text}".encode())
 
 
 def _rows(

@@ -3,27 +3,36 @@
 Full levels, gains of ERAs and layouts; text with the values of a fitted rig.
 """
 
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.direct_plate import direct_acceleration
+from controller.cli.main import run
 from model.answer.stimulus import Placement
-from model.config.document import ConfigError, parse_document, read_document
+from model.config.document import ConfigError, KeyPath, read_document
 from model.errors import InputError
 from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import reduce_plate
 from model.rig import rig_writing
 from model.rig.rig import FOUR_ERA_LAYOUTS, Channel, Rig, Uncertainty, diagonal_pair, edge_pair
-from model.rig.rig_file import load_rig, parse_mesh, parse_rig, rig_of
+from model.rig.rig_file import load_rig, parse_mesh, parse_rig
 from model.rig.rig_summary import RIG as RIG_SUMMARY_RIG
 from model.rig.rig_summary import gain_notes
-from model.rig.rig_writing import rewritten_text
+from model.rig.rig_writing import (
+    check_beside,
+    fitted_keys,
+    save_beside,
+    save_fitted,
+    save_rig,
+)
 from model.structure.attachments import Fingertip, PointLoad, footprints_of
 from model.structure.material import material
 from model.structure.plate import Plate
@@ -683,27 +692,6 @@ def other_values(rig: Rig) -> Rig:
     )
 
 
-def test_gains_are_rewritten_wherever_yaml_wraps_the_line() -> None:
-    """An ERA of several short lines becomes a long one; some lengths break it at its gains."""
-    lines = RIG.read_text("utf-8").splitlines()
-    text = "\n".join(line for line in lines if not line.startswith("#"))
-    text = text.replace("main", 32 * "m")
-    for zeros in range(8, 29, 4):
-        longer = text.replace(
-            "0.05, bolt_mass: 0, stroke: 100 um", f"0.05,\n     stroke: 0.0001{zeros * '0'}"
-        )
-        document = parse_document("rig.yaml", longer)
-        rig = rig_of(document)
-        gains = ((50.0, 1.25, 0.5), (60.0, 1.5, 0.25))
-        eras = tuple(
-            replace(era, x=0.99 * era.x + 0.0005678, stiffness=1.0123 * era.stiffness, gains=gains)
-            for era in rig.eras
-        )
-        after = rewritten_text(document, rig, replace(rig, eras=eras), comment="measured")
-        read = rig_of(parse_document("new.yaml", after))
-        assert [[row[0] for row in era.gains] for era in read.eras] == [[50.0, 60.0]] * 4
-
-
 TEXTS = {
     "flow": FLOW,
     "block": BLOCK,
@@ -714,86 +702,204 @@ TEXTS = {
 }
 
 
+def fitted(
+    folder: Path,
+    text: str,
+    change: Callable[[Rig], Rig],
+    errors: Mapping[KeyPath, float] | None = None,
+) -> tuple[Rig, Rig, Path]:
+    """A rig of a file in a folder, what a fit made of it, and the file that was written beside."""
+    file, output = folder / "rig.yaml", folder / "rig.fitted.yaml"
+    file.write_text(text, "utf-8")
+    rig = load_rig(file)
+    after = change(rig)
+    save_fitted(output, rig, after, comment="new\nvalues", errors=errors)
+    assert file.read_text("utf-8") == text
+    return rig, after, output
+
+
 @pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
-def test_rewritten_text_keeps_comments_and_has_every_value(text: str) -> None:
-    """Comments of any style stay, and values are those of the other rig, layers' moduli too."""
-    document = parse_document("rig.yaml", text)
-    rig = rig_of(document)
-    other = other_values(rig)
-    written = rewritten_text(document, rig, other, comment="new\nvalues")
-    assert written.startswith("# new\n# values\n\n")
-    for line in text.splitlines():
-        if "#" in line:
-            assert line[line.index("#") :] in written
-    back = rig_of(parse_document("new.yaml", written))
-    if back.plate.laminate is None or "layers" not in document.data["plate"]:
-        before, after = (
-            each.laminate.layers[0].material if each.laminate else each.plate.material
-            for each in (rig, back)
-        )
-        expected = {key: 1.2345678 * each for key, each in before.moduli.items()}
-        assert after.moduli == pytest.approx(expected, rel=1e-6)
-    else:
-        moduli = [layer.material.E for layer in back.plate.laminate.layers]
-        assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-6)
-    assert back.plate.loss_factor == 0.0234
-    for era, expected in zip(back.eras, other.eras, strict=True):
-        assert era.stiffness == pytest.approx(expected.stiffness, rel=1e-5)
-        assert era.damping == pytest.approx(expected.damping, rel=1e-5)
-        assert era.bolt_mass == pytest.approx(expected.bolt_mass, rel=1e-5)
-        np.testing.assert_allclose(era.gains, expected.gains, rtol=1e-5)
-    assert back.wiring == rig.wiring
-    assert back.plate.mass == pytest.approx(rig.plate.mass, rel=1e-9)
+def test_what_a_fit_found_stands_beside_the_rig_and_is_read_in_its_place(
+    text: str, tmp_path: Path
+) -> None:
+    """Values are those of the other rig, layers' moduli too, also once both are merged."""
+    rig, other, output = fitted(tmp_path, text, other_values)
+    assert output.read_text("utf-8").startswith("# new\n# values\n\nbase: rig.yaml\n")
+    save_rig(load_rig(output), tmp_path / "whole.yaml")
+    for back in (load_rig(output), load_rig(tmp_path / "whole.yaml")):
+        if back.plate.laminate is None or "layers:" not in text:
+            before, after = (
+                each.laminate.layers[0].material if each.laminate else each.plate.material
+                for each in (rig, back)
+            )
+            expected = {key: 1.2345678 * each for key, each in before.moduli.items()}
+            assert after.moduli == pytest.approx(expected, rel=1e-12)
+        else:
+            moduli = [layer.material.E for layer in back.plate.laminate.layers]
+            assert moduli == pytest.approx([1.2345678 * 70e9, 1.2345678 * 60e9], rel=1e-12)
+        assert back.plate.loss_factor == 0.0234
+        for era, found in zip(back.eras, other.eras, strict=True):
+            assert (era.stiffness, era.bolt_mass) == (found.stiffness, found.bolt_mass)
+            assert era.damping == pytest.approx(found.damping, rel=1e-12)
+            np.testing.assert_allclose(era.gains, found.gains, rtol=1e-12)
+        assert back.wiring == rig.wiring
+        assert back.limits == rig.limits
+        assert back.uncertainty == other.uncertainty
+        assert back.plate.mass == pytest.approx(rig.plate.mass, rel=1e-9)
+
+
+def test_a_fit_of_a_fitted_rig_keeps_the_first_base(tmp_path: Path) -> None:
+    """Channels found first and stiffness found later stand in one file beside the first one."""
+    file, wired = tmp_path / "rig.yaml", tmp_path / "wired.yaml"
+    file.write_text(FLOW, "utf-8")
+    document = load_rig(file).document
+    assert document is not None
+    keys = {"eras": {"A": {"channel": 1}, "B": {"channel": 0}}}
+    rig = save_beside(wired, document, keys, comment="wired")
+    after = replace(rig, eras=tuple(replace(era, stiffness=8e3) for era in rig.eras))
+    save_fitted(tmp_path / "both.yaml", load_rig(wired), after, comment="fitted")
+    back = load_rig(tmp_path / "both.yaml")
+    assert [back.wiring[name].number for name in "ABC"] == [1, 0, 2]
+    assert [era.stiffness for era in back.eras] == [8e3] * 3
+    assert back.document is not None
+    assert back.document.over is not None
+    assert back.document.over.data["base"] == "rig.yaml"
 
 
 @pytest.mark.parametrize(("key", "off"), [("material", 0.2), ("loss_factor", 5e-5)])
-def test_text_that_reads_back_otherwise_is_refused(
-    monkeypatch: pytest.MonkeyPatch, key: str, off: float
+def test_a_file_that_reads_back_otherwise_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, key: str, off: float
 ) -> None:
     """A file whose plate cannot be changed, also by a quarter of a percent, is not the other's."""
-    document = parse_document("rig.yaml", FLOW)
-    rig, put = rig_of(document), rig_writing._put
-    plate = replace(rig.plate, loss_factor=rig.plate.loss_factor + off)
-    other = replace(rig, plate=plate if key == "loss_factor" else plate.scaled(modulus=1 + off))
-    monkeypatch.setattr(
-        rig_writing, "_put", lambda data, path, *more: path[-1] == key or put(data, path, *more)
-    )
+
+    def change(rig: Rig) -> Rig:
+        plate = replace(rig.plate, loss_factor=rig.plate.loss_factor + off)
+        return replace(rig, plate=plate if key == "loss_factor" else plate.scaled(modulus=1 + off))
+
+    def without(before: Rig, after: Rig) -> dict[str, Any]:
+        keys = fitted_keys(before, after)
+        del keys["plate"][key]
+        return keys
+
+    monkeypatch.setattr(rig_writing, "fitted_keys", without)
     with pytest.raises(InputError, match="read back"):
-        rewritten_text(document, rig, other, comment="")
+        fitted(tmp_path, FLOW, change)
+    assert not (tmp_path / "rig.fitted.yaml").exists()
 
 
-def test_a_mass_that_is_found_comes_beside_supports() -> None:
+def test_a_mass_that_is_found_comes_beside_supports(tmp_path: Path) -> None:
     """Supports stay, and the mass is read back where it was found."""
-    document = parse_document("rig.yaml", REWRITTEN_BOARD)
-    rig = rig_of(document)
     found = PointLoad(0.05, 0.15, mass=0.004)
-    text = rewritten_text(document, rig, replace(rig, masses=(*rig.masses, found)), comment="")
-    back = rig_of(parse_document("rig.yaml", text)).masses
+    *_, output = fitted(
+        tmp_path, REWRITTEN_BOARD, lambda rig: replace(rig, masses=(*rig.masses, found))
+    )
+    back = load_rig(output).masses
     assert sorted(each.stiffness for each in back) == [0.0, 2000.0]
     assert found in back
 
 
-def test_feet_are_read_back_whichever_is_stiffer_by_a_hair() -> None:
-    """Two that differ by less than is written: the order of their stiffness says nothing."""
+def test_feet_are_read_back_whichever_is_stiffer_by_a_hair(tmp_path: Path) -> None:
+    """Two that differ by less than a micronewton per metre keep their places and their order."""
     feet = "supports: {a: {at: [0.1, 0.1], kind: foam}, b: {at: [0.2, 0.1], kind: foam}}"
-    document = parse_document("rig.yaml", FLOW.replace("mesh: 12x9", f"{feet}\nmesh: 12x9"))
-    rig = rig_of(document)
-    one, other = rig.masses
-    masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
-    known = replace(rig.uncertainty, supports=0.05)
-    found = replace(rig, masses=masses, uncertainty=known)
-    text = rewritten_text(document, rig, found, comment="")
-    back = rig_of(parse_document("rig.yaml", text)).masses
-    assert [each.x for each in back] == [0.1, 0.2]
-    assert [each.stiffness for each in back] == pytest.approx([345.678, 345.678])
+
+    def change(rig: Rig) -> Rig:
+        one, other = rig.masses
+        masses = (replace(one, stiffness=345.67800001), replace(other, stiffness=345.678))
+        return replace(rig, masses=masses, uncertainty=replace(rig.uncertainty, supports=0.05))
+
+    *_, output = fitted(tmp_path, FLOW.replace("mesh: 12x9", f"{feet}\nmesh: 12x9"), change)
+    back = load_rig(output).masses
+    assert [(each.x, each.stiffness) for each in back] == [(0.1, 345.67800001), (0.2, 345.678)]
 
 
-def test_rewritten_text_keeps_how_uncertain_feet_are_that_it_states() -> None:
+def test_feet_stay_as_uncertain_as_the_rig_states(tmp_path: Path) -> None:
     """A foot of foam, uncertain by its kind, gets a stiffness and stays as uncertain: by 0.3."""
-    document = parse_document("rig.yaml", REWRITTEN_BOARD)
-    rig = rig_of(document)
-    (foot,) = rig.masses
-    softer = replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
-    back = rig_of(parse_document("b.yaml", rewritten_text(document, rig, softer, comment="")))
+
+    def softer(rig: Rig) -> Rig:
+        (foot,) = rig.masses
+        return replace(rig, masses=(replace(foot, stiffness=0.8 * foot.stiffness),))
+
+    _, after, output = fitted(tmp_path, REWRITTEN_BOARD, softer)
+    back = load_rig(output)
     assert back.uncertainty.supports == 0.3
-    assert back.masses[0].stiffness == pytest.approx(0.8 * foot.stiffness)
+    assert back.masses == after.masses
+
+
+BASES = {
+    "missing": ("base: rig.yaml", "base: ring.yaml", r":\d+: base: must be a rig file beside"),
+    "outside": ("base: rig.yaml", "base: ../rig.yaml", r"base: must be in the folder of this file"),
+    "absolute": ("base: rig.yaml", "base: /rig.yaml", r"base: must be in the folder of this file"),
+    "itself": ("base: rig.yaml", "base: rig.fitted.yaml", r"base: must be a whole rig, got"),
+    "a number": ("base: rig.yaml", "base: 3", r"base: must be the name of a rig file, got 3"),
+    "another ERA": ("  A:", "  Z:", r"eras.Z: must be in rig.yaml, which has none of this name"),
+    "no fingerprint": ("base_fingerprint", "#", r"base: rig.yaml must have the plate, ERAs and"),
+    "unknown key": ("    stiffness:", "    stifness:", r"eras.A.stifness: "),
+}
+
+
+@pytest.mark.parametrize(("text", "other", "error"), BASES.values(), ids=BASES)
+def test_a_base_that_does_not_fit_is_refused_with_its_line(
+    tmp_path: Path, text: str, other: str, error: str
+) -> None:
+    """Missing, elsewhere, circular, of no name, and keys of what the base does not have."""
+    *_, output = fitted(tmp_path, FLOW, other_values)
+    written = output.read_text("utf-8")
+    output.write_text(written.replace(text, other, 1), "utf-8")
+    with pytest.raises(ConfigError, match=rf"rig\.fitted\.yaml.*{error}"):
+        load_rig(output)
+
+
+def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
+    """URL, channels and limits of the base hold; another plate or ERA needs another fit."""
+    *_, output = fitted(tmp_path, FLOW, other_values)
+    base, text = tmp_path / "rig.yaml", FLOW.replace("sim://", "serial:///dev/ttyS9")
+    base.write_text(text.replace("channel: 2", "channel: 5"), "utf-8")
+    back = load_rig(output)
+    assert back.amplifiers == {"m": "serial:///dev/ttyS9"}
+    assert back.wiring["C"].number == 5
+    for one, other in (("2 mm", "3 mm"), ("[0.3, 0]", "[0.2, 0]")):
+        base.write_text(FLOW.replace(one, other), "utf-8")
+        with pytest.raises(ConfigError, match=r"rig.yaml must have the plate, ERAs and masses"):
+            load_rig(output)
+    base.write_text(FLOW.replace("mesh: 12x9", "mesh: 12x"), "utf-8")
+    with pytest.raises(ConfigError, match=r"rig\.yaml:3: mesh: "):
+        load_rig(output)
+
+
+def test_show_and_merge_of_what_a_fit_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both values side by side with the standard error, as rows and as JSON; one file of both."""
+    errors: dict[KeyPath, float] = {("eras", "B", "stiffness"): 123.4}
+    _, after, output = fitted(tmp_path, FLOW, other_values, errors)
+    assert run(["rig", "show", str(output)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert rows[0] == ["rig.yaml", "rig.fitted.yaml", "standard", "error"]
+    assert ["eras.B.stiffness", "9000", "9901", "±", "123"] in rows
+    assert ["eras.A.damping_ratio", "0.1", "-"] in rows
+    assert ["eras.A.gains", "[]", "2", "rows"] in rows
+    assert run(["rig", "show", str(output), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["base"] == "rig.yaml"
+    row = {"key": "eras.B.stiffness", "base": 9000, "fitted": 9901, "standard_error": 123}
+    assert pytest.approx(row) in shown["changes"]
+    whole = tmp_path / "whole.yaml"
+    assert run(["rig", "merge", str(output), "-o", str(whole)]) == 0
+    assert load_rig(whole) == load_rig(output)
+    assert run(["rig", "merge", str(whole), "-o", str(tmp_path / "again.yaml")]) == 2
+    assert run(["rig", "show", str(whole)]) == 2
+    assert run(["rig", "merge", str(output), "-o", str(tmp_path / "rig.yaml")]) == 2
+    assert (tmp_path / "rig.yaml").read_text("utf-8") == FLOW
+    assert after.eras != load_rig(tmp_path / "rig.yaml").eras
+
+
+def test_output_elsewhere_says_where_it_may_be(tmp_path: Path) -> None:
+    """A fitted rig names the file of the rig, which must be beside it or below."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "rig.yaml").write_text(FLOW, "utf-8")
+    rig = load_rig(tmp_path / "in" / "rig.yaml")
+    with pytest.raises(InputError, match=r"write it to .*/in/new\.yaml$"):
+        check_beside(tmp_path / "out" / "new.yaml", rig)
+    save_fitted(tmp_path / "new.yaml", rig, other_values(rig), comment="above")
+    assert load_rig(tmp_path / "new.yaml").eras[0].x == 0.00123

@@ -31,6 +31,7 @@ _SETTLED = 0.1  # of the noise between two rounds
 _MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_ALIKE = 0.9  # of a correlation of errors: beyond it two values are hardly told apart
 _MAX_GROUPS = 12  # of weak to strong rows, each with a noise of its own
 
 
@@ -381,6 +382,28 @@ def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
     share = squares / mean_squares
     known = share[np.isfinite(share)]
     return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
+
+
+def confusions(space: Space, covariance: FloatArray) -> list[str]:
+    """Name what each parameter is hardly told apart from, "" where it is from all others.
+
+    By the largest correlation of the errors of a covariance (p, p) of x.
+    """
+    std = np.sqrt(np.diagonal(covariance))
+    std = np.where(std > 0, std, np.inf)
+    alike = np.abs(covariance / np.outer(std, std)) * ~np.eye(len(std), dtype=bool)
+    nearest = alike.argmax(axis=1)
+    return [
+        space.names[other] if alike[own, other] > _ALIKE else ""
+        for own, other in enumerate(nearest.tolist())
+    ]
+
+
+def estimate_table(rows: Sequence[tuple[str, str, str, str, str]]) -> list[str]:
+    """Table of what was found: name, value, standard error, what was known before, and a note."""
+    cells = [("", "found", "standard error", "before", "note"), *rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]
 
 
 def likeliest(found: Sequence[Fit]) -> Fit:

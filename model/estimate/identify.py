@@ -44,7 +44,15 @@ from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
 from model.config.document import KeyPath
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
-from model.estimate.fit import Fit, fit, likeliest, prediction_errors, relative_rms
+from model.estimate.fit import (
+    Fit,
+    confusions,
+    estimate_table,
+    fit,
+    likeliest,
+    prediction_errors,
+    relative_rms,
+)
 from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.estimate.measurement import Measurement
 from model.estimate.space import (
@@ -813,18 +821,25 @@ def fit_rows(found: Identification) -> list[str]:
 def parameter_rows(found: Identification) -> list[str]:
     """Table of parameters: those that a rig file states, and all others that clearly differ.
 
-    Those of the plate come first, then ERA by ERA.
+    Those of the plate come first, then ERA by ERA. What was found is the difference from the rig.
     """
     places = {era.name: place for place, era in enumerate(found.rig.eras)}
+    confused = dict(
+        zip(found.fitted.space.names, confusions(found.fitted.space, found.covariance), strict=True)
+    )
     rows = []
     for each in estimates(found):
         if each.kind in _ALWAYS_LISTED or abs(each.difference) > _LISTED_STDS * each.error:
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
-            after = f"{with_error(each.difference, each.error, sign='+')}{unit}"
+            value, _, error = with_error(each.difference, each.error, sign="+").partition(" ± ")
+            other = confused[each.name]
+            note = f"hardly told apart from {other}" if other else ""
             if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
-                after = "not identified"
-            rows.append((each.name, f"± {each.before:.2g}{unit}", after))
-    return value_rows(sorted(rows, key=lambda row: places.get(row[0].rpartition(" ")[2], -1)))
+                note = "not identified"
+            before = f"± {float(f'{each.before:.2g}'):g}{unit}"
+            rows.append((each.name, f"{value}{unit}", f"± {error}{unit}", before, note))
+    rows.sort(key=lambda row: places.get(row[0].rpartition(" ")[2], -1))
+    return estimate_table(rows)
 
 
 def clock_rows(found: Identification) -> list[str]:

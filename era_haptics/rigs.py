@@ -12,7 +12,7 @@ from model.errors import InputError, expect_path, shown
 from model.estimate.calibrate import Calibration
 from model.estimate.calibrate import calibrate as fit
 from model.estimate.measurement import read_measured, responses_of
-from model.estimate.verdict import check_consistency
+from model.estimate.rig_check import check_consistency
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig

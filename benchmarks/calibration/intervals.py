@@ -20,7 +20,7 @@ from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
 from model.estimate.measurement import Responses, read_measured, responses_of
-from model.estimate.verdict import check_consistency
+from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

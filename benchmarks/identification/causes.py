@@ -20,7 +20,7 @@ from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
 from model.estimate.measurement import Responses
-from model.estimate.verdict import Verdict, diagnose, judged_by_promises
+from model.estimate.rig_check import Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 
@@ -48,14 +48,14 @@ class Fault:
     shift: float = 0.0
 
 
-def _beyond(kind: str) -> Callable[[Verdict], bool]:
-    return lambda verdict: verdict.beyond is not None and verdict.beyond.kind == kind
+def _finds(kind: str) -> Callable[[Verdict], bool]:
+    return lambda verdict: bool(verdict.of_kinds(kind))
 
 
 def _is_loose(verdict: Verdict) -> bool:
     """Whether a spring alone explains the plate."""
-    best = verdict.explanations[0].cause if verdict.explanations else None
-    return best is not None and best.what == "stiffness" and bool(best.era)
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    return best is not None and bool(best.era)
 
 
 def _states(state: str) -> Callable[[Verdict], bool]:
@@ -70,14 +70,14 @@ def _at(factor: float) -> Callable[[Complexes], Complexes]:
 FAULTS = {
     "none": Fault("plain", lambda verdict: verdict.is_well),
     "none, with form errors and 3 g": Fault("form", lambda verdict: verdict.is_well),
-    "bonded frame": Fault("frame", _beyond("unnamed")),
-    "thickness ± 3 % from end to end": Fault("plain", _beyond("thickness"), taper=0.03),
-    "the same with form errors and 3 g": Fault("wedge", _beyond("thickness")),
-    "thickness ± 1.5 %, form errors and 3 g": Fault("uneven", _beyond("thickness")),
-    "10 g": Fault("plain", _beyond("mass"), mass=10e-3),
-    "30 g": Fault("plain", _beyond("mass"), mass=30e-3),
-    "twice 5 g, with form errors": Fault("two", _beyond("mass")),
-    "a resting finger": Fault("plain", _beyond("finger"), has_finger=True),
+    "bonded frame": Fault("frame", _finds("unnamed")),
+    "thickness ± 3 % from end to end": Fault("plain", _finds("thickness"), taper=0.03),
+    "the same with form errors and 3 g": Fault("wedge", _finds("thickness")),
+    "thickness ± 1.5 %, form errors and 3 g": Fault("uneven", _finds("thickness")),
+    "10 g": Fault("plain", _finds("mass"), mass=10e-3),
+    "30 g": Fault("plain", _finds("mass"), mass=30e-3),
+    "twice 5 g, with form errors": Fault("two", _finds("mass")),
+    "a resting finger": Fault("plain", _finds("finger"), has_finger=True),
     "one ERA at 0.35 of its spring, form errors and 3 g": Fault("loose", _is_loose),
     "ERA at 70 %": Fault("plain", _states("weak"), change=_at(0.7)),
     "ERA at 35 %": Fault("plain", _states("weak"), change=_at(0.35)),
@@ -85,7 +85,7 @@ FAULTS = {
     "dead": Fault("plain", _states("dead"), change=_at(1e-4)),
     "swapped": Fault("plain", _states("other ERA"), change=lambda values: values[:, [0, 2, 1, 3]]),
     "a sensor 30 mm from its place": Fault(
-        *("plain", lambda verdict: bool(verdict.bad_sensors) or not verdict.is_well), shift=_SHIFTED
+        *("plain", lambda verdict: bool(verdict.findings)), shift=_SHIFTED
     ),
 }
 """Faults by name."""

@@ -33,7 +33,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
 from model.estimate.measurement import Responses, WiredSensor, read_sensors, write_responses
-from model.estimate.verdict import check_consistency
+from model.estimate.rig_check import check_consistency
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty

@@ -134,7 +134,7 @@ def identify(
     from model.estimate.identify import expected_contrast, standard_errors
     from model.estimate.identify import identify as fit
     from model.estimate.measurement import DeviceSettings, measure_by_device
-    from model.estimate.verdict import check_meaning
+    from model.estimate.rig_check import check_meaning
     from model.rig.rig_writing import check_beside
     from model.structure.modal_elasticity import check_measurable
 
@@ -221,7 +221,7 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     import numpy as np
 
     from model.estimate.measurement import MeasuredPlate, read_measured, responses_of
-    from model.estimate.verdict import check_consistency
+    from model.estimate.rig_check import check_consistency
 
     responses = responses_of(read_measured(path), rig)
     screened = check_consistency(rig, responses)
@@ -468,8 +468,8 @@ def check(
     import time
     from dataclasses import replace
 
-    from model.estimate import diagnosis_report
-    from model.estimate.verdict import diagnose, judged_by_promises
+    from model.estimate import rig_check
+    from model.estimate.rig_check import diagnose, judged_by_promises
 
     if (measured is None) == (url is None):
         raise InputError("give --url, of an amplifier with sensors, or --measured, a file")
@@ -499,14 +499,14 @@ def check(
         f"from {low:g} to {high:g} Hz, {elapsed:.1f} s",
         rig.uncertainty_note,
         "",
-        *diagnosis_report.channel_table(verdict),
+        *rig_check.channel_table(verdict),
         "",
-        *diagnosis_report.verdict_rows(verdict),
-        *diagnosis_report.difference_rows(verdict),
+        *rig_check.verdict_rows(verdict),
+        *rig_check.difference_rows(verdict),
     ]
     exactly_known = [*rig.exactly_known]
     answer = {"exactly_known": exactly_known, "elapsed_s": elapsed}
-    print_report(rows, {**diagnosis_report.as_json(verdict), **details, **answer}, as_json=as_json)
+    print_report(rows, {**rig_check.as_json(verdict), **details, **answer}, as_json=as_json)
     if not verdict.is_well:
         raise typer.Exit(FAILED)
 

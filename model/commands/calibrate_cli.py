@@ -145,7 +145,7 @@ def calibrate(
         standard_errors,
     )
     from model.estimate.measurement import LEAST_SENSORS, read_measured, responses_of
-    from model.estimate.verdict import check_consistency
+    from model.estimate.rig_check import check_consistency
     from model.rig.rig_file import load_rig
     from model.rig.rig_writing import check_beside
 

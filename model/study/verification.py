@@ -60,6 +60,7 @@ from model.structure.attachments import (
 from model.structure.modal_elasticity import check_scales, modal_receptance
 from model.study.contrast_maps import random_contacts
 from model.table.table import LocalizationTable, read_fingertips
+from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset
 from model.transients.shaping import SAMPLE_RATE, Transients
 from model.transients.time_response import PlateInTime, plate_in_time
@@ -297,6 +298,7 @@ MIN_KEPT_SHARE = 0.8
 
 SAMPLED_FREQUENCIES = 3
 
+_ANSWERS = 30  # on another plate, ten each with one, two and three quiet fingers
 _ALL_OVER = Grid(8, 6)  # where the root mean square is taken
 
 _WINDOW = 0.25  # s, in which steady amplitudes are read
@@ -590,3 +592,30 @@ def _random_answer(table: LocalizationTable, rng: np.random.Generator, *, others
         f"no random contacts on this plate of {length:g} x {width:g} m have an answer at 20 dB "
         "SL to verify; is it smaller than two fingers, or its stroke too small?"
     )
+
+
+def promise_margins(rig: Rig, plate: Rig) -> tuple[float, ...]:
+    """Margins [dB] of contrasts over those that the table of a rig promises, on another plate.
+
+    For random fingers, on the plate solved exactly. None where the rig has no table or no room for
+    four fingers.
+    """
+    rng, margins = np.random.default_rng(0), []
+    try:
+        table = build_table(rig, drive_mode="phased")
+        there = build_table(plate, frequencies=table.frequencies, drive_mode="phased")
+        for number in range(_ANSWERS):
+            fingers = 2 + number % 3
+            places = random_contacts(rng, fingers, rig.plate)
+            placed = Placement(places[:1], places[1:])
+            answer = query(table, placed)
+            none = Uncertainty.none()
+            exact = draw_plates(rng, none, of=there, count=1, contact_count=fingers)
+            _, felt = felt_on(there, placed, answer.layers[0].excitation, exact)
+            promised = answer.fingers[0].promised_contrast_db
+            assert felt is not None  # noqa: S101  there are quiet fingers
+            assert promised is not None  # noqa: S101
+            margins.append(float(20 * np.log10(felt[0])) - promised)
+    except InputError:
+        return ()
+    return tuple(margins)

@@ -128,7 +128,7 @@ LONG = {
     "table show table.npz": "model.study.overview.find_overview",
     "table verify table.npz rig.yaml": "model.study.verification.verify_table",
     "plate convergence rig.yaml": "model.vibration.study_convergence",
-    "rig check rig.yaml --measured measured.csv": "model.estimate.verdict.diagnose",
+    "rig check rig.yaml --measured measured.csv": "model.estimate.rig_check.diagnose",
     "demo --wire sim": "model.table.table_file.cached_table",
 }
 """Other slow commands, with their slow function."""

@@ -47,7 +47,7 @@ SLOWEST = (
     "test_daemon_commands.py",
     "test_examples.py",
     "test_layout_check.py",
-    "test_verdict.py",
+    "test_rig_check.py",
     "test_calibrate.py",
     "test_link_faults.py",
     "test_rig_on_wire.py",

@@ -25,7 +25,7 @@ from model.estimate.calibrate import (
     finding_rows,
 )
 from model.estimate.measurement import Responses
-from model.estimate.verdict import check_consistency
+from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

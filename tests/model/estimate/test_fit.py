@@ -24,11 +24,11 @@ from benchmarks.calibration.hidden_plates import (
 )
 from model.arrays import ComplexArray, FloatArray
 from model.estimate import calibration_fit as fit
-from model.estimate import least_squares, plate_match
+from model.estimate import findings, least_squares
 from model.estimate.calibrate import calibrate
 from model.estimate.calibration_fit import SensedPlate, sensed_plate
+from model.estimate.rig_check import check_consistency
 from model.estimate.space import KINDS, MASS_CELLS, reduced_modes
-from model.estimate.verdict import check_consistency
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.spectral.modes import SpectralMesh, stretched
@@ -65,7 +65,7 @@ def match_a_plate() -> None:
     values = measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
     values[:, 1] = np.nan
     plate = sensed_plate(RIG, POINTS, FREQUENCIES)
-    plate_match.match_plate(plate, values, drives=[0, 2, 1, 3])
+    findings.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from model.estimate.measurement import (
     write_responses_csv,
     write_responses_uff,
 )
-from model.estimate.verdict import check_consistency
+from model.estimate.rig_check import check_consistency
 from model.fem import Mesh, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

@@ -1,0 +1,806 @@
+"""Rig check: compare measured responses with a rig, and screen them before a calibration.
+
+`diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring,
+and gives a `Verdict`: its findings, and a state for each channel. What is right or wrong is decided
+by the functions of `model.estimate.findings`.
+
+`check_consistency` refuses responses that are not what they claim to be. A fit can absorb almost
+any error of a measurement: gains take wrong units, springs a swapped plug, outlier rejection whole
+sensors. Each check looks for one such error alone, in what the fit would leave free, and names it.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.arrays import ComplexArray, FloatArray, best_by, best_of
+from model.errors import InputError
+from model.estimate.calibrate import wrong_size
+from model.estimate.calibration_fit import SensedPlate, plate_of
+from model.estimate.findings import (
+    FALSE_ALARM,
+    MAX_FIT_ERROR,
+    MAX_FORM_ERROR,
+    MIN_COST_REDUCTION,
+    MODEL_ERROR,
+    Finding,
+    Hypothesis,
+    Match,
+    ShapeMatch,
+    at_start,
+    best_wiring,
+    compared,
+    exchanged_sensors,
+    gains_of,
+    match_plate,
+    match_responses,
+    match_shapes,
+    match_with_form,
+    other_meaning,
+    plate_finding,
+    reversed_axes,
+)
+from model.estimate.fit import row_rms
+from model.estimate.measurement import (
+    LEAST_SENSORS,
+    Responses,
+    Screening,
+    check_enough_sensors,
+    silent_sensors,
+    typical,
+)
+from model.quantities import counted, percent
+from model.rig.rig import Rig
+from model.structure.attachments import Era, PointLoad
+from model.structure.exciter import Exciter
+from model.study.verification import MIN_KEPT_SHARE, promise_margins
+
+STRONG = 1.25
+"""Gain from which a channel is strong, or weak below its inverse: 2 dB.
+
+That is four times the variation of drives.
+"""
+
+LOOSE = 0.7
+"""Share of its own stiffness below which an exciter that explains a plate is loose."""
+
+MISSED_DB = 1.0
+"""Largest miss of the promises of a table by half of its answers [dB]."""
+
+_LEAST_FREQUENCIES = 4
+_GAIN_STDS = 3.5  # of the rig's uncertainty, where that allows more
+_NEARLY_ALL = 0.75  # of the channels
+_MIN_COHERENCE = 0.6  # length of the mean of unit phasors of a reliable phase
+_MAX_PHASE_ERROR = 45.0  # degrees
+_DEAD = 0.03  # of the response that the rig predicts
+_FAINT = 0.3  # of it: dead if its shape is not that of an ERA either
+_NO_SHAPE = 0.6  # MAC
+_SENSOR_SCALE = (0.7, 1.4)
+_MUTE = 0.1  # of the others' scale
+_UPSIDE_DOWN = -0.5
+_MIN_CHANGE = 0.03  # relative, of a reported value
+
+_GLUES = np.geomspace(100.0, 1e5, 61)  # N/m
+_RISES = 0.2  # of the logarithm of a gain over the frequencies
+_EXPLAINS = 0.6  # of the median deviation without glue
+_MIN_CHANNELS = 3  # of which a median shows what is the amplifier's
+
+_MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
+_MAX_FREQUENCIES = 16  # ample for every check before a calibration
+GRAVITY = 9.80665  # m/s², standard
+_QUANTITIES = (
+    ("g", f"multiply by {GRAVITY}", 1 / GRAVITY, 0),
+    ("mm/s² per m", "divide by 1000", 1e3, 0),
+    ("m/s² per mm", "multiply by 1000", 1e-3, 0),
+    ("m/s² per µm", "multiply by 1000000", 1e-6, 0),
+    ("g per mm", f"multiply by {1000 * GRAVITY}", 1e-3 / GRAVITY, 0),
+    ("g per µm", f"multiply by {1e6 * GRAVITY}", 1e-6 / GRAVITY, 0),
+    ("velocity in m/s", "multiply by i omega, 2 pi times the frequency", 1.0, -1),
+    ("velocity in mm/s", "multiply by i omega / 1000", 1e3, -1),
+    ("displacement in m", "multiply by -omega², omega 2 pi times the frequency", 1.0, -2),
+    ("displacement in mm", "multiply by -omega² / 1000", 1e3, -2),
+    ("displacement in µm", "multiply by -omega² / 1000000", 1e6, -2),
+)
+"""Quantities that responses may be by mistake: name, remedy, factor and power.
+
+They are factor * (i omega)^power times acceleration per displacement.
+"""
+
+_CORRECTIONS = ("mirrored", "reversed", "exchanged", "grain", "resonance")
+SENSORS = ("silent", "mute", "upside down", "off scale")
+"""Kinds of findings of sensors that are left out."""
+
+_BEYOND = ("mass", "finger", "thickness", "unnamed")
+
+
+@dataclass(frozen=True)
+class ChannelVerdict:
+    """A channel: the ERA to which the rig wires it, the one that it drives, and its states."""
+
+    era: str
+    """ERA to which the rig wires it."""
+    amplifier: str
+    """Name of its amplifier."""
+    channel: int
+    """Its number there."""
+    states: tuple[str, ...]
+    """What is wrong with it, as kinds of findings; "well" alone if nothing is, and "not driven"."""
+    drives: str | None = None
+    """ERA that it drives, None for a dead channel or one that was not driven."""
+    gain: float | None = None
+    """Gain relative to the command and the rig's gains."""
+    phase: float | None = None
+    """Phase error [degrees], None if unknown."""
+    mac_own: float | None = None
+    """Median MAC with the rig's ERA."""
+    mac_found: float | None = None
+    """Median MAC with the ERA that it drives."""
+    confidence: float = 0.0
+    """Confidence 0..1 in `drives` and `states`."""
+
+    @property
+    def wiring(self) -> str:
+        """The channel in words."""
+        return f"channel {self.channel} of amplifier {self.amplifier} (ERA {self.era} in the rig)"
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Result of a diagnosis."""
+
+    channels: tuple[ChannelVerdict, ...]
+    findings: tuple[Finding, ...]
+    """What was found, in the order in which to look at it."""
+    sensors: tuple[str, ...]
+    """Names of the sensors that were used."""
+    frequencies: FloatArray
+    """Tones that were used (f,) [Hz]."""
+    plate_matches: bool = True
+    """Whether the rig's plate within its priors explains the measurement."""
+    match: Match | None = None
+    """That plate."""
+    hypotheses: tuple[Hypothesis, ...] = ()
+    """Other plates that explain it if the rig's does not, most likely first."""
+    changes: Mapping[str, float] | None = None
+    """Relative differences from the rig as `plate_changes`, None without a plate that fits."""
+    promise_margins: tuple[float, ...] = ()
+    """Margins [dB] of the plate's contrasts over those that the rig's table promises; empty if they
+    were not compared."""
+
+    def of_kinds(self, *kinds: str) -> list[Finding]:
+        """The findings of some kinds."""
+        return [each for each in self.findings if each.kind in kinds]
+
+    @property
+    def wiring_matches(self) -> bool:
+        """Whether every driven channel drives its ERA as the rig says."""
+        return all(set(channel.states) <= {"well", "not driven"} for channel in self.channels)
+
+    @property
+    def is_well(self) -> bool:
+        """Whether no fault was found."""
+        return not any(each.is_fault for each in self.findings)
+
+    @property
+    def kept_share(self) -> float | None:
+        """Share of the table's promises that the plate keeps, None where they were not compared."""
+        return float(np.mean(np.array(self.promise_margins) >= 0)) if self.promise_margins else None
+
+
+def diagnose(
+    rig: Rig,
+    observation: Responses,
+    *,
+    false_alarm: float = FALSE_ALARM,
+    has_form: bool = False,
+    refuses: bool = False,
+    skipped: tuple[Finding, ...] = (),
+) -> Verdict:
+    """Compare a measurement with the rig's prediction.
+
+    false_alarm: share of plates as written with a value that may be called wrong; has_form: whether
+    the plate may have form errors, so that deviations beyond their tolerances are sought, by
+    sensors of known scale; refuses: whether responses that are not what they claim to be are an
+    error; skipped: findings of sensors that were left out before. Raises InputError for fewer than
+    three usable sensors or four frequencies.
+    """
+    if not observation.measured.any():
+        raise InputError("no channel was driven; drive each in turn and measure again")
+    check_enough_sensors(np.ones(len(observation.sensors), dtype=bool), observation)
+    if len(observation.frequencies) < _LEAST_FREQUENCIES:
+        raise InputError(
+            f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
+            f"{len(observation.frequencies)}"
+        )
+    plate = plate_of(rig, observation)
+    dead = _dead_channels(plate, observation.values.swapaxes(1, 2))
+    alive = observation.values[:, ~dead]
+    if np.isfinite(alive).any():
+        silent = silent_sensors(replace(observation, values=alive))
+        check_enough_sensors(~silent, observation)
+        skipped += tuple(Finding("silent", n) for n in compress(observation.sensors, silent))
+        if silent.any():
+            observation = observation.without(silent)
+            plate = plate_of(rig, observation)
+
+    def again(correction: Finding, rig: Rig, observation: Responses, has_form: bool) -> Verdict:
+        if refuses:
+            raise InputError(correction.rows[0].partition(": ")[2])
+        found = diagnose(
+            rig, observation, false_alarm=false_alarm, has_form=has_form, skipped=skipped
+        )
+        return replace(found, findings=(correction, *found.findings))
+
+    live = replace(observation, values=np.where(dead[:, None], np.nan, observation.values))
+    of_live = match_shapes(plate, live.values.swapaxes(1, 2))
+    if found := reversed_axes(plate, of_live, live, may_be_plugs=refuses):
+        return again(*found, has_form)
+    if other := other_meaning(plate, of_live, live):
+        verdict = again(*other, observation, False)
+        # The board of the file is corrected first.
+        kept = tuple(each for each in verdict.findings if each.kind not in ("plate", "outliers"))
+        return replace(verdict, findings=kept, plate_matches=False, changes=None)
+    values = observation.values.swapaxes(1, 2)
+    shapes = match_shapes(plate, values)
+    if refuses:
+        _check_quantity(plate, shapes, values)
+        _check_phases(plate, shapes, values)
+    dead |= _dead_channels(plate, values, shapes)
+    values = np.where(dead, np.nan, values)
+    if not np.isfinite(values).any():
+        channels = tuple(_without_response(rig, n, is_dead=bool(dead[n])) for n in range(len(dead)))
+        found_dead = (*_channel_findings(channels), *skipped)
+        return Verdict(channels, found_dead, observation.sensors, observation.frequencies)
+    shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
+    match, drives = best_wiring(plate, values, shapes)
+    if exchanged := exchanged_sensors(observation, match.responses[..., drives], values):
+        return again(exchanged[0], rig, exchanged[1], has_form)
+    # With more noise than usual parameters are less certain.
+    error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
+    if error > MODEL_ERROR:
+        match = match_plate(plate, values, drives=drives, model_error=error, starts=shapes.starts)
+    off = _off_scale(observation.sensors, values, match)
+    if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
+        wrong = np.isin(observation.sensors, [each.of for each in off])
+        return diagnose(
+            rig,
+            observation.without(wrong),
+            false_alarm=false_alarm,
+            has_form=has_form,
+            skipped=(*skipped, *off),
+        )
+    beyond: list[Finding] = []
+    if has_form:
+        with_form, beyond = match_with_form(plate, observation, values, drives)
+        match = with_form if with_form.error <= MAX_FORM_ERROR else match
+    # Values that stand in for a form error that is less likely say nothing of themselves.
+    limit = min([false_alarm, *(each.details["chance"] for each in beyond)])
+    matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
+    hypotheses: list[Hypothesis] = []
+    if not matches:
+        hypotheses = compared(plate, observation, values, drives=drives, model_error=error)
+    fitted = best_by([match, *(each.match for each in hypotheses)], lambda each: -each.fit.cost)
+    channels = _channels(rig, observation, values, drives, fitted, dead)
+    if not matches:
+        channels = tuple(_loose(each, rig, match, hypotheses) for each in channels)
+    behind_glue = _behind_glue(fitted, values, drives)
+    channels = tuple(
+        _as_loose(each) if off else each for each, off in zip(channels, behind_glue, strict=True)
+    )
+    findings = [*_channel_findings(channels), *skipped]
+    if not matches and not any("loose" in each.states for each in channels):
+        findings.append(plate_finding(match, hypotheses))
+    elif match.outliers.any():
+        by_sensor = match.outliers.sum(axis=(0, 2))
+        worst, count = best_of(by_sensor), counted(int(by_sensor.sum()), "value")
+        name = observation.sensors[worst]
+        findings.append(Finding("outliers", name, int(by_sensor[worst]), details={"count": count}))
+    return Verdict(
+        channels,
+        (*findings, *(beyond if matches else ())),
+        observation.sensors,
+        observation.frequencies,
+        matches,
+        match,
+        tuple(hypotheses),
+        plate_changes(rig, match) if match.error <= MAX_FIT_ERROR else None,
+    )
+
+
+def _dead_channels(
+    plate: SensedPlate, values: ComplexArray, shapes: ShapeMatch | None = None
+) -> NDArray[np.bool_]:
+    """Mask (n,) of driven channels with values (f, s, n) far below the model's.
+
+    shapes: if given, weak channels without the shape of an ERA, whose response is noise, count too.
+    """
+    share = np.abs(values / at_start(plate))
+    size = np.array([typical(share[..., number]) for number in range(share.shape[2])])
+    dead = size < _DEAD
+    if shapes is not None:
+        best = np.nan_to_num(shapes.medians).max(axis=1)
+        dead |= (size < _FAINT) & (best < _NO_SHAPE)
+    return np.asarray(dead)
+
+
+def _off_scale(sensors: Sequence[str], values: ComplexArray, match: Match) -> list[Finding]:
+    """Find sensors with a scale unlike that of the others, if the plate fits."""
+    if match.median_error > MAX_FIT_ERROR:
+        return []
+    known = np.isfinite(values) & np.isfinite(match.predicted) & ~match.outliers
+    model, measured = np.where(known, match.predicted, 0), np.where(known, values, 0)
+    inner = model.conj() * measured
+    inner = inner * np.exp(-1j * np.angle(inner.sum(axis=1, keepdims=True)))
+    power = (np.abs(model) ** 2).sum(axis=(0, 2))
+    scales = inner.real.sum(axis=(0, 2)) / np.maximum(power, 1e-300)
+    found = []
+    for name, scale in zip(sensors, (scales / np.median(scales)).tolist(), strict=True):
+        if not _SENSOR_SCALE[0] <= scale <= _SENSOR_SCALE[1]:
+            kind = "mute" if abs(scale) < _MUTE else "off scale"
+            found.append(Finding("upside down" if scale < _UPSIDE_DOWN else kind, name, scale))
+    return found
+
+
+def _channels(
+    rig: Rig,
+    observation: Responses,
+    values: ComplexArray,
+    drives: Sequence[int],
+    match: Match,
+    dead: NDArray[np.bool_],
+) -> tuple[ChannelVerdict, ...]:
+    """Judge all channels by the plate that fits best."""
+    shapes = match_responses(match.responses, values)
+    predicted = np.where(match.outliers, np.nan, match.predicted)
+    known = rig.uncertainty
+    found: list[ChannelVerdict] = []
+    for n, driven in enumerate(drives):
+        era, own = rig.eras[n], rig.eras[driven]
+        if dead[n] or not np.isfinite(values[..., n]).any():
+            found.append(_without_response(rig, n, is_dead=bool(dead[n])))
+            continue
+        # Commands are shares of the stroke of the ERA to which the rig wires the channel.
+        gain = float(match.gains[n]) * era.full_level / own.full_level
+        gain /= float(np.median(np.abs(own.gain(observation.frequencies))))
+        others = (other for other in range(len(drives)) if other != driven)
+        confidence = min(shapes.confidence(n, driven, other) for other in others)
+        # No response tells a force factor from a gain.
+        varies = 0.0 if isinstance(era, Era) else known.stiffness
+        strong = max(STRONG, math.exp(_GAIN_STDS * math.hypot(known.gain, varies)))
+        phase, coherence = None, 0.0
+        if observation.has_phases:
+            phase, coherence = mean_phase(values[..., n], predicted[..., n])
+        states = ["other ERA"] if driven != n else []
+        if not 1 / strong <= gain <= strong:
+            states.append("weak" if gain < 1 else "strong")
+        if phase is not None and abs(phase) >= 90:
+            states.append("inverted")
+            confidence = min(confidence, coherence)
+        elif phase is not None and abs(phase) > _MAX_PHASE_ERROR:
+            states.append("out of phase")
+        wired, mac = rig.wiring[era.name], shapes.medians[n]
+        found.append(
+            ChannelVerdict(
+                era.name,
+                wired.amplifier,
+                wired.number,
+                tuple(states) or ("well",),
+                own.name,
+                gain,
+                phase,
+                float(mac[n]),
+                float(mac[driven]),
+                confidence,
+            )
+        )
+    return tuple(found)
+
+
+def _without_response(rig: Rig, number: int, *, is_dead: bool) -> ChannelVerdict:
+    """Verdict on a channel that is dead or was not driven."""
+    name = rig.eras[number].name
+    wired = rig.wiring[name]
+    found = ChannelVerdict(name, wired.amplifier, wired.number, ("not driven",))
+    return replace(found, states=("dead",), gain=0.0, confidence=0.99) if is_dead else found
+
+
+def mean_phase(measured: ComplexArray, predicted: ComplexArray) -> tuple[float | None, float]:
+    """Mean phase [degrees] of values (f, s) relative to predicted ones, and its coherence 0..1.
+
+    The phase is None where the coherence is too low.
+    """
+    products = predicted.conj() * measured
+    inner = np.where(np.isfinite(products), products, 0).sum(axis=1)
+    inner = inner[np.abs(inner) > 0]
+    mean = complex(np.mean(inner / np.abs(inner))) if len(inner) else 0j
+    reliable = abs(mean) >= _MIN_COHERENCE
+    return (math.degrees(np.angle(mean)) if reliable else None), abs(mean)
+
+
+def _loose(
+    channel: ChannelVerdict, rig: Rig, match: Match, hypotheses: Sequence[Hypothesis]
+) -> ChannelVerdict:
+    """Mark a channel as loose if its exciter deviates most, or is the likeliest hypothesis.
+
+    It must act with less than its own stiffness.
+    """
+    drives = channel.drives
+    if drives is None or isinstance(rig.era(drives), Era):
+        return channel
+    shares = [each.value / each.expected for each in hypotheses[:1] if each.era == drives]
+    if match.plate.rows[best_of(np.abs(match.z))].era == drives:
+        acts = [row for row in match.plate.rows if row.era == drives and row.is_factor]
+        shares += [row.of(match.rig) / row.of(rig) for row in acts]
+    return channel if min(shares, default=1.0) > LOOSE else _as_loose(channel)
+
+
+def _as_loose(channel: ChannelVerdict) -> ChannelVerdict:
+    """Mark a channel as loose, in place of weak."""
+    others = (each for each in channel.states if each not in ("well", "weak", "loose"))
+    return replace(channel, states=("loose", *others))
+
+
+def _behind_glue(match: Match, values: ComplexArray, drives: Sequence[int]) -> list[bool]:
+    """Whether the exciter of each channel clearly acts through a spring of glue.
+
+    What comes through a spring z between coil and plate is g_f ~ G |z / (z + D(w_f))|, with the
+    gains g_f of a channel and the dynamic stiffness D of its exciter, which falls above the
+    resonance of the magnet: the gain rises with frequency. What all channels have in common is the
+    amplifier's. values (f, s, n), NaN for channels to be skipped.
+    """
+    kept = np.where(match.outliers, np.nan, values)
+    gains = np.abs(gains_of(match.responses[..., list(drives)], kept))
+    sizes = np.log(np.where(gains > 0, gains, np.nan))
+    driven: NDArray[np.bool_] = np.asarray(np.isfinite(sizes).any(axis=0))
+    if driven.sum() < _MIN_CHANNELS:
+        return [False] * len(drives)
+    sizes[:, driven] -= np.nanmedian(sizes[:, driven], axis=0)
+    found = []
+    for n, number in enumerate(drives):
+        era, others = match.rig.eras[number], driven & (np.arange(len(drives)) != n)
+        own = sizes[:, n] - np.nanmedian(sizes[:, others], axis=1)
+        found.append(
+            bool(driven[n])
+            and isinstance(era, Exciter)
+            and _rises_behind_glue(own, era.dynamic_stiffness(match.plate.model.omega))
+        )
+    return found
+
+
+def _rises_behind_glue(sizes: FloatArray, stiffness: ComplexArray) -> bool:
+    """Whether logarithms of gains (f,) rise as those of an exciter [N/m] behind a spring."""
+    shares = -np.log(np.abs(1 + stiffness / _GLUES[:, None]))  # (glues, f)
+    left = np.vstack([sizes, sizes - shares])
+    left -= np.nanmedian(left, axis=1, keepdims=True)
+    without, *behind = np.nanmedian(np.abs(left), axis=1).tolist()
+    best = int(np.argmin(behind))
+    rise = np.ptp(shares[best][np.isfinite(sizes)])
+    return bool(behind[best] < _EXPLAINS * without and rise > _RISES)
+
+
+def plate_changes(rig: Rig, match: Match) -> dict[str, float]:
+    """Relative differences of the most probable plate from a rig's, by kind of value.
+
+    For ERAs it is their mean; bolts are skipped, since most rigs have none.
+    """
+    changes = {}
+    for kind in ("modulus", "loss_factor", "stiffness", "damping"):
+        rows = [row for row in match.plate.rows if row.kind == kind and row.of(rig)]
+        if rows:
+            changes[kind] = float(np.mean([row.of(match.rig) / row.of(rig) - 1 for row in rows]))
+    return changes
+
+
+def cycles(channels: Sequence[ChannelVerdict]) -> list[list[ChannelVerdict]]:
+    """Cycles of channels that drive each other's ERAs, each from its first channel."""
+    by_era = {each.era: each for each in channels}
+    found: list[list[ChannelVerdict]] = []
+    for channel in channels:
+        cycle = [channel]
+        while (after := cycle[-1].drives) is not None and by_era[after] not in cycle:
+            cycle.append(by_era[after])
+        is_known = any(channel in each for each in found)
+        if after == channel.era and len(cycle) > 1 and not is_known:
+            found.append(cycle)
+    return found
+
+
+def _channel_findings(channels: Sequence[ChannelVerdict]) -> Iterator[Finding]:
+    """Find what is wrong with channels: what they have in common first."""
+    swapped = cycles(channels)
+    for cycle in swapped:
+        names, confidence = [each.era for each in cycle], min(each.confidence for each in cycle)
+        details = {"one": cycle[0].wiring, "other": cycle[1].wiring}
+        details |= {"first": names[0], "second": names[1]}
+        kind = "swapped" if len(cycle) == 2 else "cycle"
+        yield Finding(kind, ", ".join(names), confidence=confidence, details=details)
+    driven = [each for each in channels if each.drives is not None]
+    common = set()
+    for state in ("strong", "weak"):
+        gains = {each.era: each.gain for each in driven if state in each.states and each.gain}
+        if len(gains) > 1 and len(gains) >= _NEARLY_ALL * len(driven):
+            sizes, said = [*gains.values()], {"state": state.upper(), "least": min(gains.values())}
+            yield Finding("all strong or weak", ", ".join(gains), max(sizes), details=said)
+            common.add(state)
+            break
+    inverted = ["inverted" in each.states for each in driven]
+    if len(inverted) > 1 and all(inverted):
+        yield Finding("all inverted", "all")
+        common.add("inverted")
+    in_cycle = [each for cycle in swapped for each in cycle]
+    for each in channels:
+        known = {"well", "not driven", *common} | ({"other ERA"} if each in in_cycle else set())
+        values = {**vars(each), "wiring": each.wiring}
+        for state in each.states:
+            if state not in known:
+                yield Finding(state, each.era, each.gain or 0.0, each.confidence, values)
+
+
+def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
+    """Add the margins of the promises that the rig's table makes, on the matched plate.
+
+    The verdict stays as it is where no plate fits, and for a rig that has no table or no room for
+    four fingers.
+    """
+    if verdict.match is None or verdict.changes is None:
+        return verdict
+    # The plate of a table has no finger on it.
+    loads: list[object] = [*verdict.match.rig.masses]
+    masses = tuple(each for each in loads if isinstance(each, PointLoad))
+    margins = promise_margins(rig, replace(verdict.match.rig, masses=masses))
+    missed = -float(np.median(margins)) if margins else 0.0
+    found = [Finding("promise", "table", missed)] if missed > MISSED_DB else []
+    return replace(verdict, promise_margins=margins, findings=(*verdict.findings, *found))
+
+
+def check_meaning(rig: Rig, observation: Responses) -> None:
+    """Raise InputError for a rig whose grain or resonances are clearly the wrong ones."""
+    plate = plate_of(rig, observation)
+    found = other_meaning(
+        plate, match_shapes(plate, observation.values.swapaxes(1, 2)), observation
+    )
+    if found:
+        raise InputError(found[0].rows[0].partition(": ")[2])
+
+
+def check_consistency(rig: Rig, responses: Responses) -> Screening:
+    """Check that responses are what they claim to be, and screen them for a fit.
+
+    A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped
+    plug, outlier rejection whole sensors. Raises InputError that names the cause: too few sensors
+    or frequencies, another quantity or unit, a grain along the other side, the other meaning of a
+    resonance, conjugated phases, sensors at swapped places, swapped or inverted channels.
+    """
+    rows = np.unique(
+        np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
+    )
+    observation = replace(
+        responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
+    )
+    if observation.measured.any() and not (np.abs(observation.values) > 0).any():
+        raise InputError("measured responses must not all be zero; check that ERAs were driven")
+    # Values of the plate that are off are what a calibration is for.
+    verdict = diagnose(rig, observation, false_alarm=0.0, refuses=True)
+    _check_wiring(verdict)
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    if best and best.key in ("plate.length", "plate.width") and best.match.error <= MAX_FIT_ERROR:
+        raise wrong_size(best.key, best.expected, best.value)
+    assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
+    return Screening(
+        np.array(["dead" in channel.states for channel in verdict.channels]),
+        np.isin(responses.sensors, [each.of for each in verdict.of_kinds("silent", "mute")]),
+        verdict.match.fit.x[verdict.match.plate.numbers],
+    )
+
+
+def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
+    """Raise InputError where gains of all channels are those of another quantity or unit."""
+    model = plate.model.at(plate.moved(*shapes.start)).responses[..., shapes.nearest]
+    gains = gains_of(model, values)
+    size = np.log(row_rms(values) / row_rms(model))[:, 0]
+    known = np.isfinite(gains)
+    omega = plate.model.omega[:, None]
+
+    def distance(factor: float, power: int) -> float:
+        """Distance of gains from those of a quantity, by size and by phase."""
+        expected = factor * (1j * omega) ** power
+        off = np.abs(size - np.log(np.abs(expected)))[known]
+        phase = np.angle(gains / expected)[known]
+        return float(np.median(off) + 1 - np.median(np.cos(phase)))
+
+    level = float(np.median(size[known]))
+    name, remedy, factor, power = best_by(_QUANTITIES, lambda each: -distance(*each[2:]))
+    gap = distance(factor, power)
+    if abs(level) < np.log(_MAX_GAIN) or distance(1.0, 0) < gap:
+        return
+    if gap < np.log(_MAX_GAIN):
+        raise InputError(
+            f"responses must be acceleration per base displacement in 1/s², got {name}, as "
+            f"it looks: all are {np.exp(level):.3g} of what the rig predicts; {remedy}"
+        )
+    raise InputError(
+        f"responses must be those of the rig to a factor of {_MAX_GAIN:g}, got "
+        f"{np.exp(level):.3g} of what it predicts; check their unit and the stroke of the ERAs"
+    )
+
+
+def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
+    """Raise InputError for conjugated phases."""
+    match, _ = best_wiring(plate, values, shapes)
+    other, _ = best_wiring(plate, values.conj(), shapes)
+    if other.fit.cost < match.fit.cost - MIN_COST_REDUCTION:
+        raise InputError(
+            "phases must be for exp(+i omega t), got conjugated ones, as it looks: with the signs "
+            "of all imaginary parts changed the plate explains the responses better "
+            f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
+            "change them"
+        )
+
+
+def _check_wiring(verdict: Verdict) -> None:
+    """Raise InputError for channels that drive another ERA or have the opposite sign."""
+    for cycle in cycles(verdict.channels):
+        raise InputError(
+            f"channels must drive the ERAs of the rig, got swapped ones: those of "
+            f"{_joined([each.era for each in cycle])} drive each other's ERA, as it looks; correct "
+            "the plugs, the names in the file, or the channels in the rig, or the sensors' "
+            "positions if they are mirrored, and measure again"
+        )
+    for channel in verdict.channels:
+        if "other ERA" in channel.states:
+            raise InputError(
+                f"channels must drive the ERAs of the rig, got ERA {channel.drives} driven by that "
+                f"of {channel.era}, as it looks; correct the plug or the names in the file"
+            )
+    inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
+    if inverted:
+        raise InputError(
+            f"signs must be upwards positive for sensors and ERAs, got opposite ones of "
+            f"{_joined(inverted)}; swap the two wires of these, or turn the sensors over if it is "
+            "all of them"
+        )
+
+
+def _joined(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def verdict_rows(verdict: Verdict) -> list[str]:
+    """Lines of findings with their remedies, or one that all is well."""
+    rows = [row for each in verdict.findings for row in each.rows]
+    if not verdict.is_well or verdict.of_kinds(*SENSORS):
+        return rows
+    if difference_rows(verdict):
+        return [*rows, "WIRING WELL: every channel that was driven drives its ERA as the rig says"]
+    return [*rows, "ALL WELL: plate and channels match the rig"]
+
+
+def difference_rows(verdict: Verdict) -> list[str]:
+    """Line on a plate that keeps too little of the rig's promises; empty if it keeps enough."""
+    kept = verdict.kept_share
+    if verdict.changes is None or kept is None or kept >= MIN_KEPT_SHARE:
+        return []
+    names = {"loss_factor": "loss factor", "stiffness": "ERA stiffness", "damping": "ERA damping"}
+    changes = ", ".join(
+        f"{names.get(kind, kind)} {100 * change:+.0f} %"
+        for kind, change in verdict.changes.items()
+        if abs(change) >= _MIN_CHANGE
+    )
+    within = "within tolerances, but not as written: " if verdict.plate_matches else ""
+    if verdict.of_kinds("thickness", "unnamed"):
+        within, changes = "", "by what has no name"
+    return [
+        f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
+        f"{percent(kept)} of what the rig's table promises: calibrate it with "
+        "`era calibrate`"
+    ]
+
+
+def channel_table(verdict: Verdict) -> list[str]:
+    """Table of the channels with a header line."""
+    rows = [f"{'ERA':8} {'channel':12} {'drives':8} {'gain':>6} {'phase':>7} {'MAC':>6}  verdict"]
+    for channel in verdict.channels:
+        gain = "-" if channel.gain is None else f"{channel.gain:.2f}"
+        phase = "-" if channel.phase is None else f"{channel.phase:+.0f}°"
+        mac = "-" if channel.mac_found is None else f"{channel.mac_found:.3f}"
+        rows.append(
+            f"{channel.era:8} {f'{channel.amplifier}:{channel.channel}':12} "
+            f"{channel.drives or '-':8} {gain:>6} {phase:>7} {mac:>6}  "
+            f"{', '.join(channel.states)}"
+        )
+    return rows
+
+
+def as_json(verdict: Verdict) -> dict[str, Any]:
+    """Verdict as JSON; units are in the keys."""
+    match, beyond = verdict.match, verdict.of_kinds(*_BEYOND)
+    corrections: dict[str, Any] = {
+        "grain": None,
+        "resonance_is": {},
+        "exchanged_sensors": {},
+        "reversed_axes": [],
+    }
+    for each in verdict.of_kinds(*_CORRECTIONS):
+        corrections |= each.details["json"]
+    return {
+        "all_well": verdict.is_well,
+        "channels": [
+            {
+                "era": channel.era,
+                "amplifier": channel.amplifier,
+                "channel": channel.channel,
+                "states": list(channel.states),
+                "drives": channel.drives,
+                "gain": channel.gain,
+                "phase_deg": channel.phase,
+                "mac_of_the_rigs_era": channel.mac_own,
+                "mac_of_the_era_found": channel.mac_found,
+                "confidence": channel.confidence,
+            }
+            for channel in verdict.channels
+        ],
+        "swapped": [[each.era for each in cycle] for cycle in cycles(verdict.channels)],
+        "wiring_matches": verdict.wiring_matches,
+        "plate": {
+            "matches": verdict.plate_matches,
+            **corrections,
+            "beyond": _beyond_json(beyond) if beyond else None,
+            "changes": verdict.changes or {},
+            "kept_share": verdict.kept_share,
+            "promise_margins_db": [*verdict.promise_margins],
+            "unexplained": match and match.error,
+            "farthest_standard_deviations": match and match.worst,
+            "parameters": []
+            if match is None
+            else [
+                {
+                    "parameter": parameter.name,
+                    "unit": parameter.unit,
+                    "expected": parameter.of(match.plate.rig),
+                    "found": parameter.of(match.rig),
+                    "standard_deviations": float(z),
+                }
+                for parameter, z in zip(match.plate.rows, match.z, strict=True)
+            ],
+            "explanations": [
+                {
+                    "key": each.key,
+                    "unit": each.unit,
+                    "expected": each.expected,
+                    "found": each.value,
+                    "explains": each.explains,
+                    "likelihood": each.share,
+                    "unexplained": each.match.error,
+                }
+                for each in verdict.hypotheses
+            ],
+        },
+        "bad_sensors": [
+            {"sensor": each.of, "problem": each.problem} for each in verdict.of_kinds(*SENSORS)
+        ],
+        "sensor_count": len(verdict.sensors),
+        "drive_frequencies_hz": verdict.frequencies.tolist(),
+        "findings": verdict_rows(verdict),
+    }
+
+
+def _beyond_json(found: Sequence[Finding]) -> dict[str, Any]:
+    first = found[0].details
+    return {
+        "kind": found[0].kind,
+        "loads": [
+            {key: each.details.get(key) for key in ("x_m", "y_m", "mass_kg")}
+            for each in found
+            if "x_m" in each.details
+        ],
+        "thicker_at_end_of_x": first.get("of_x"),
+        "thicker_at_end_of_y": first.get("of_y"),
+        "farthest": first.get("farthest") or None,
+        "standard_deviations": first.get("standard_deviations") or None,
+        "unexplained": first["error"],
+    }

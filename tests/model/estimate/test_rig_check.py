@@ -1,0 +1,580 @@
+"""Rig check: what is planted on boards that another solver computes is found, and nothing else.
+
+Truth of the paper's plate comes from one sparse solve a frequency (`model.fem`), of exciters and
+hidden plates from functions over the whole plate; the comparison is of the reduced plate. Gains of
+5 % and 5 degrees at random and noise of 2 % of each row are in every measurement of the paper's.
+`scenarios.yaml` has what is planted and what must be found.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import controller.cli.rig_cli
+from benchmarks.identification import causes
+from benchmarks.identification.hidden import draw
+from benchmarks.identification.mistakes import on_glue
+from benchmarks.weekend.chain import FOLDER, BuiltBoard
+from controller.cli.main import run
+from long_form import shortly
+from model.errors import InputError
+from model.estimate import findings
+from model.estimate.calibrate import MAX_OUTLIERS, calibrate
+from model.estimate.calibration_fit import sensed_plate, without_outliers
+from model.estimate.findings import MAX_FIT_ERROR, TEXTS, ShapeMatch, match_plate
+from model.estimate.measurement import (
+    MeasuredPlate,
+    Responses,
+    read_measured,
+    responses_of,
+    write_responses,
+)
+from model.estimate.rig_check import (
+    Verdict,
+    as_json,
+    channel_table,
+    check_consistency,
+    check_meaning,
+    diagnose,
+    judged_by_promises,
+    mean_phase,
+    verdict_rows,
+)
+from model.fem import Mesh
+from model.rig.rig import Rig
+from model.rig.rig_file import load_rig
+from model.spectral.direct_solution import direct_spectral_acceleration
+from model.spectral.modes import SpectralMesh
+from model.structure.exciter import Exciter
+from plates import DISTORTIONS, exciter_rig, make_paper_rig, noise_like, perturbed, random_gains
+from plates import measured as measured_by_plates
+from yaml_files import read_yaml
+
+TONES = np.arange(91.0, 300.0, 20.0)
+NAMES = ("NE", "NW", "SW", "SE")
+PAPER_TONES = np.linspace(57.0, 487.0, 10)
+SOLD_TONES = np.arange(41.0, 300.0, 20.0)
+PLACES = np.array([(0.3 * x, 0.23 * y) for x in (0.1, 0.4, 0.88) for y in (0.15, 0.5, 0.85)])
+PARTS = "uncertainty: {gain: 0.2, phase_deg: 10, stiffness: 0.2, modulus: 0.1, thickness: 0.02}"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "weekend"
+SCENARIOS: list[dict[str, Any]] = read_yaml(Path(__file__).with_name("scenarios.yaml"))
+
+
+def given_as(which: str, resonance: float = 306.0) -> Rig:
+    """The board of the page, whose file has a resonance, by default its sheet's, as one of both."""
+    keys = {"resonance": resonance, "resonance_is": which}
+    return load_rig(FOLDER / "rig.yaml").replaced(eras=dict.fromkeys(NAMES, keys))
+
+
+def measured(rig: Rig, seed: int) -> Responses:
+    """What one moved sensor reads of a board whose parts deviate, at every place or at four."""
+    found = BuiltBoard.drawn(rig, seed).measured(TONES, seed)
+    return found if seed % 2 else found.without(np.arange(12) % 3 > 0)
+
+
+def within_tolerance(rig: Rig, rng: np.random.Generator) -> Rig:
+    """A plate as builders build it by the rig's file: E ±5 %, h ±2 %, k ±10 %, damping x2."""
+    material = replace(rig.plate.material, E=rig.plate.material.E * rng.uniform(0.95, 1.05))
+    plate = replace(
+        rig.plate,
+        material=material,
+        thickness=rig.plate.thickness * rng.uniform(0.98, 1.02),
+        loss_factor=rig.plate.loss_factor * 2 ** rng.uniform(-1, 1),
+    )
+    eras = tuple(
+        replace(
+            era,
+            stiffness=era.stiffness * rng.uniform(0.9, 1.1),
+            damping=era.damping * 2 ** rng.uniform(-1, 1),
+            bolt_mass=rng.uniform(0, 0.004),
+        )
+        for era in rig.eras
+    )
+    return replace(rig, plate=plate, eras=eras)
+
+
+def longer(rig: Rig, factor: float) -> Rig:
+    """A longer plate with its ERAs at its corners."""
+    plate = replace(rig.plate, length=factor * rig.plate.length)
+    eras = tuple(replace(era, x=factor * era.x) for era in rig.eras)
+    mesh = Mesh(14, 9, plate.length, plate.width)
+    return replace(rig, plate=plate, eras=eras, mesh=mesh)
+
+
+def another(rig: Rig, change: Mapping[str, Any]) -> Rig:
+    """A plate that is not the rig's, by one factor or with a loose bolt."""
+    ((what, value),) = change.items()
+    match what:
+        case "thickness":
+            return replace(rig, plate=replace(rig.plate, thickness=value * rig.plate.thickness))
+        case "length":
+            return longer(rig, value)
+        case "stiffness":
+            return replace(rig, eras=tuple(era.varied(stiffness=value) for era in rig.eras))
+        case _:
+            loose = replace(rig.era(value), stiffness=200.0, damping=0.05)
+            return replace(rig, eras=tuple(loose if e.name == value else e for e in rig.eras))
+
+
+def on_paper(truth: Rig, rng: np.random.Generator) -> Responses:
+    """Responses with the gains and the noise of every measurement."""
+    eras = tuple(
+        replace(era, gains=random_gains(rng, PAPER_TONES, size=0.05, phase=np.radians(5)))
+        for era in truth.eras
+    )
+    return measured_by_plates(replace(truth, eras=eras), frequencies=PAPER_TONES, noise=0.02)
+
+
+def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Responses]:
+    """A board of another rigidity (10 %) with exciters whose parts differ (20 %, 10 degrees).
+
+    Read by nine sensors with 0.5 % of noise; glue [N/m]: below exciters by name.
+    """
+    rig = exciter_rig("type: DAEX25FHE-4, power: 1 W", frequency="[40, 300]", more=PARTS)
+    assert isinstance(rig.mesh, SpectralMesh)
+    rng = np.random.default_rng(seed)
+
+    def factor(deviation: float) -> float:
+        return float(np.exp(deviation * rng.standard_normal()))
+
+    eras = []
+    for era in rig.eras:
+        assert isinstance(era, Exciter)
+        stiffness = factor(0.2) * era.in_time.stiffness
+        magnet, force = factor(0.2) * era.magnet_mass, factor(0.2) * era.force_factor
+        gains = ((100.0, factor(0.2), float(np.radians(10) * rng.standard_normal())),)
+        eras.append(
+            replace(era, stiffness=stiffness, magnet_mass=magnet, force_factor=force, gains=gains)
+        )
+    plate = rig.plate.scaled(modulus=factor(0.1))
+    sources = [on_glue(era, glue[era.name]) if era.name in glue else era for era in eras]
+    values = direct_spectral_acceleration(
+        plate, rig.mesh, sources, SOLD_TONES, PLACES, loads=rig.masses
+    )
+    values = values / np.array([era.full_level for era in rig.eras])[:, None]
+    size = np.sqrt((np.abs(values) ** 2).mean(axis=2, keepdims=True))
+    noise = np.random.default_rng([seed, 1]).standard_normal((2, *values.shape))
+    names = tuple(f"P{number}" for number in range(1, len(PLACES) + 1))
+    heard = values + 0.005 * size * (noise[0] + 1j * noise[1])
+    return rig, Responses(names, PLACES, SOLD_TONES, heard)
+
+
+def board_of(case: Mapping[str, Any]) -> tuple[Rig, Responses]:
+    """The rig of a scenario's board, and what is measured on it before more is planted."""
+    kind, _, seed = case["board"].partition(" ")
+    if kind == "paper":
+        rig, rng = make_paper_rig(12, 9), np.random.default_rng(int(seed))
+        true = within_tolerance(rig, rng) if case.get("plate") != {"stiffness": 2.2} else rig
+        return rig, on_paper(another(true, case["plate"]) if "plate" in case else true, rng)
+    if kind == "sold":
+        return sold(int(seed), case.get("glue", {}))
+    if kind == "hidden":
+        return load_rig(causes.RIG), causes.measured(causes.FAULTS[case["fault"]], int(seed))
+    rig = load_rig(EXAMPLE / "rig.yaml")
+    if kind == "weekend":
+        true = rig.replaced(eras={name: case.get("eras", {}) for name in NAMES})
+        return rig, measured(true, int(seed))
+    right = responses_of(read_measured(EXAMPLE / "measured.uff"), rig)
+    few = np.flatnonzero(right.frequencies < 400)[:: len(right.frequencies) // 12]
+    return rig, replace(right, frequencies=right.frequencies[few], values=right.values[few])
+
+
+def with_glitches(built: Responses, share: float) -> Responses:
+    """A share of the values wrong by far, one way or another."""
+    rng = np.random.default_rng(0)
+    broken = built.values.copy()
+    wrong = rng.random(broken.shape) < share
+    broken[wrong] *= rng.choice([0.1, 4.0, -1.0], wrong.sum())
+    return replace(built, values=broken)
+
+
+def planted(case: Mapping[str, Any]) -> tuple[Rig, Responses]:
+    """The rig that is checked, and a measurement with all that a scenario plants."""
+    rig, right = board_of(case)
+    values, eras, sensors = right.values.copy(), [e.name for e in rig.eras], [*right.sensors]
+    plugs, places = case.get("plugs", {}), case.get("places", {})
+    values = values[:, [eras.index(plugs.get(name, name)) for name in eras]]
+    if places:
+        values = values[:, :, [sensors.index(places.get(name, name)) for name in sensors]]
+    for name, factor in case.get("channels", {}).items():
+        values[:, eras.index(name)] *= factor
+    for name, factor in case.get("sensors", {}).items():
+        values[:, :, sensors.index(name)] *= factor
+    for name in case.get("undriven", ()):
+        values[:, eras.index(name)] = np.nan
+    if "noise" in case:
+        noise = noise_like(right.values, 0.1, np.random.default_rng(3))
+        values[:, eras.index(case["noise"])] = noise[:, eras.index(case["noise"])]
+    if "loose_contact" in case:
+        values[:8:2, :, sensors.index(case["loose_contact"])] *= -1
+    if case.get("without_phases"):
+        turned = np.random.default_rng(5).uniform(0, 6, (*values.shape[:2], 1))
+        right, values = replace(right, has_phases=False), values * np.exp(1j * turned)
+    axes = case.get("mirrored", ())
+    size = np.array([rig.plate.length, rig.plate.width])
+    points = np.where(["x" in axes, "y" in axes], size - right.points, right.points)
+    values = values[::-1] if "frequency" in axes else values
+    found = replace(right, values=values, points=points)
+    if "glitches" in case:
+        found = with_glitches(found, case["glitches"])
+    match case.get("rig", {}):
+        case {"gain": gain}:
+            rig = replace(
+                rig, eras=tuple(replace(era, gains=((200.0, gain, 0.0),)) for era in rig.eras)
+            )
+        case {"stroke of SE": factor}:
+            sw, se, *others = rig.eras
+            rig = replace(rig, eras=(sw, replace(se, stroke=factor * sw.stroke), *others))
+        case {"eras": keys}:
+            rig = rig.replaced(eras=dict.fromkeys(NAMES, keys))
+        case {"plate": keys}:
+            rig = rig.replaced(plate=keys)
+    return rig, found
+
+
+@pytest.fixture(autouse=True, scope="module")
+def solved_once():
+    """Free plates of the hypotheses that are tried are those of one rig in all tests."""
+    solved = {}
+
+    def solve(rig, points, frequencies, *, masses):
+        key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
+        if key not in solved:
+            solved[key] = sensed_plate(rig, points, frequencies, masses=masses)
+        return solved[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(findings, "sensed_plate", solve)
+        yield
+
+
+def _scenarios() -> list[Any]:
+    return [
+        pytest.param(
+            case,
+            id=case["planted"].replace(" ", "-").replace(",", ""),
+            marks=pytest.mark.long if case.get("long") else (),
+        )
+        for case in SCENARIOS
+    ]
+
+
+@pytest.mark.parametrize("case", _scenarios())
+def test_a_check_finds_what_is_planted_and_nothing_else(case: dict[str, Any]) -> None:
+    """Kinds and names in order, values, and the same in the report for programs."""
+    rig, observation = planted(case)
+    is_hidden = "fault" in case
+    verdict = diagnose(rig, observation, has_form=is_hidden)
+    if is_hidden:
+        verdict = judged_by_promises(verdict, rig)
+    assert [{each.kind: each.of} for each in verdict.findings] == case["finds"]
+    assert verdict.is_well == case.get("well", not case["finds"])
+    for each, value in zip(verdict.findings, case.get("values", ()), strict=False):
+        assert each.value == pytest.approx(value, rel=0.12, abs=1e-6)
+    for each in verdict.of_kinds("swapped", "cycle"):
+        assert each.confidence > 0.95
+    if "explains" in case:
+        first = verdict.hypotheses[0]
+        assert first.value == pytest.approx(case["explains"], rel=0.12)
+        assert first.share > 0.5
+    report = json.loads(json.dumps(as_json(verdict)))
+    assert report["all_well"] == verdict.is_well
+    assert report["findings"] == verdict_rows(verdict)
+    assert len(channel_table(verdict)) == len(report["channels"]) + 1 == len(rig.eras) + 1
+    for path, expected in case.get("json", {}).items():
+        found = report
+        for key in path.split("."):
+            found = found[key]
+        assert found == expected
+    if case.get("placed"):
+        _are_placed(report["plate"]["beyond"], case)
+
+
+def _are_placed(beyond: Mapping[str, Any], case: Mapping[str, Any]) -> None:
+    """Each mass of a hidden plate is found within 1.5 cm and 1.5 g."""
+    seed, fault = int(case["board"].split()[1]), causes.FAULTS[case["fault"]]
+    masses = draw(fault.kind, seed).mounted.masses.tolist()
+    if fault.mass:
+        at = np.random.default_rng([seed, 93]).uniform(0.1, 0.9, 2) * [0.3048, 0.2286]
+        masses = [[*at, fault.mass]]
+    assert len(beyond["loads"]) == len(masses)
+    for x, y, mass in masses:
+        near = min(beyond["loads"], key=lambda each: math.dist((x, y), (each["x_m"], each["y_m"])))
+        assert math.dist((x, y), (near["x_m"], near["y_m"])) < 0.015
+        assert near["mass_kg"] == pytest.approx(mass, abs=1.5e-3)
+
+
+def test_every_kind_of_finding_has_a_scenario_or_a_test() -> None:
+    """A new row of text comes with a scenario; sizes that need a table or a bench are named."""
+    shown = {kind for case in SCENARIOS for each in case["finds"] for kind in each}
+    assert TEXTS.keys() - shown == {"promise", "out of phase", "strong", "mute", "off scale"}
+
+
+@pytest.fixture(scope="module")
+def weekend() -> Rig:
+    """The board of the page, grain along its length."""
+    return load_rig(FOLDER / "rig.yaml")
+
+
+@pytest.mark.parametrize(
+    ("true", "written", "glued"), [("free", "mounted", 60), ("mounted", "free", 306)]
+)
+def test_the_other_resonance_is_named_before_anything_is_fitted(
+    true: str, written: str, glued: int
+) -> None:
+    """Six boards: 306 Hz of a coil of 1.29 g are 306 sqrt(1.29 / 33.5) = 60 Hz of a magnet."""
+    said = rf"^resonance_is of NE, NW, SW, SE must be {true}, got {written}: .* at {glued} Hz"
+    for seed in range(6):
+        with pytest.raises(InputError, match=said):
+            check_consistency(given_as(written), measured(given_as(true), seed))
+
+
+def test_a_resonance_that_differs_little_is_refused_with_what_is_at_a_bound() -> None:
+    """60 Hz of the magnet, given as of its coil, are 12 Hz: from 91 Hz on both move alike."""
+    found, rig = measured(given_as("free"), 1), given_as("free", 60.0)
+    with pytest.raises(InputError, match=r"^stiffness of .* 10 times it.* resonance_is"):
+        calibrate(rig, found, check_consistency(rig, found))
+
+
+def test_feet_of_another_kind_are_refused_at_their_bound(tmp_path: Path) -> None:
+    """Of foam below the board and of rubber in its file, ten times as stiff or more."""
+    text = (FOLDER / "rig.yaml").read_text(encoding="utf-8")
+    (tmp_path / "rig.yaml").write_text(text.replace("foam", "rubber"), encoding="utf-8")
+    found, rubber = measured(given_as("free"), 1), load_rig(tmp_path / "rig.yaml")
+    with pytest.raises(InputError, match=r"^stiffness of feet .* 0\.1 times it"):
+        calibrate(rubber, found, check_consistency(rubber, found))
+
+
+def test_a_dead_exciter_is_no_calibrated_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file would say that it moves the plate: exit status 1, and what to type instead."""
+    found, made = measured(given_as("free"), 1), tmp_path / "made.yaml"
+    values = found.values.copy()
+    values[:, 2] *= 1e-4
+    write_responses(tmp_path / "m.uff", replace(found, values=values), given_as("free"))
+    assert run(["calibrate", str(FOLDER / "rig.yaml"), f"{tmp_path}/m.uff", "-o", str(made)]) == 1
+    said = "".join(capsys.readouterr())
+    assert "SW did not; no rig is written. Find out why by era rig check" in said
+    assert "Next:" not in said
+    assert not made.exists()
+
+
+def test_shapes_that_are_alike_beyond_rounding_have_no_error() -> None:
+    """A MAC of one place is 1 but for rounding, as 1 + 2.2e-16."""
+    assert ShapeMatch(np.full((3, 1, 1), 1 + 2.3e-16)).error([0]) == 0.0
+
+
+def test_boards_cut_as_their_file_says_are_not_accused(weekend: Rig) -> None:
+    """Twenty whose parts deviate as bought ones do, half of them by four of the twelve places."""
+    for seed in range(20):
+        check_meaning(weekend, measured(weekend, seed))
+
+
+def test_boards_cut_the_other_way_are_accused_of_that_alone(weekend: Rig) -> None:
+    """Ten, before anything is fitted in full."""
+    across = weekend.replaced(plate={"grain": "width"})
+    for seed in range(10):
+        with pytest.raises(InputError, match=r"^plate\.grain must be width, got length: "):
+            check_consistency(weekend, measured(across, seed))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "calibrate {rig} {file} -o {made}",
+        "rig identify {rig} --measured {file} -o {made}",
+        "rig identify {rig} --yes -o {made}",
+        "rig check {rig} --measured {file}",
+    ],
+)
+def test_commands_say_so_and_write_no_rig(
+    command: str,
+    weekend: Rig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """By a file, and of what amplifiers would have measured."""
+    turned = measured(weekend.replaced(plate={"grain": "width"}), 1)
+    here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
+    monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
+    file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
+    write_responses(file, turned, weekend)
+    typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)
+    assert run(typed.split()) != 0
+    assert "plate.grain must be width, got length" in "".join(capsys.readouterr())
+    assert not made.exists()
+
+
+FREQUENCIES = np.arange(60.0, 421.0, 40.0)
+
+NAMED = {
+    "g": "9.80665",
+    "velocity": "velocity in m/s",
+    "displacement": "displacement in m",
+    "opposite": "SW, SE, NE and NW",
+    "conjugated": "exp",
+    "swapped_channels": "SW and SE",
+    "swapped_sensors": "P1 at that of P6, P6 at that of P1",
+    "two_sensors": "got 2",
+}
+"""By distortion, what the refusal names."""
+
+
+@pytest.fixture(scope="module")
+def consistency_rig() -> Rig:
+    """The paper's plate on a coarse mesh."""
+    return make_paper_rig(16, 12)
+
+
+@pytest.fixture(scope="module")
+def responses(consistency_rig: Rig) -> Responses:
+    """Of a plate within a builder's tolerances, with 1 % noise."""
+    return measured_by_plates(
+        perturbed(consistency_rig, frequencies=FREQUENCIES), frequencies=FREQUENCIES
+    )
+
+
+@pytest.mark.parametrize(
+    "name", shortly(DISTORTIONS, ["g", "velocity", "displacement", "two_sensors"])
+)  # the errors of the others are provoked in tests/errors
+def test_distorted_responses_are_refused_by_their_cause(
+    consistency_rig: Rig, responses: Responses, name: str
+) -> None:
+    """Each distortion alone, with its own cause named."""
+    with pytest.raises(InputError, match=NAMED[name]):
+        check_consistency(consistency_rig, DISTORTIONS[name](responses))
+
+
+def test_plate_of_another_length_is_refused_by_its_length(
+    consistency_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate that is a fifth longer than the rig's, sensors where they are said to be.
+
+    Of few sizes and causes; whole searches are tested with diagnoses.
+    """
+    monkeypatch.setattr(findings, "_SIZES", (0.82, 1.21))
+    monkeypatch.setattr(findings, "_FITTED", 3)
+    monkeypatch.setattr(findings, "_REFINED", 1)
+    monkeypatch.setattr(findings, "_REFINEMENTS", 3)
+    found = measured_by_plates(
+        perturbed(longer(consistency_rig, 1.2), frequencies=FREQUENCIES), frequencies=FREQUENCIES
+    )
+    with pytest.raises(InputError, match=r"plate\.length"):
+        check_consistency(consistency_rig, found)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 80.0, -80.0, 100.0, -100.0, 180.0])
+def test_mean_phase_is_the_angle_by_which_values_are_turned(degrees: float) -> None:
+    """Measured is what was predicted, turned by an angle; that is found, and is coherent."""
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((5, 4)) + 1j * rng.standard_normal((5, 4))
+    phase, coherence = mean_phase(predicted * np.exp(1j * math.radians(degrees)), predicted)
+    assert phase == pytest.approx(degrees, abs=1e-6)
+    assert coherence == pytest.approx(1.0)
+
+
+def verdict_on(consistency_rig: Rig, *, loss: float, stiffness: float) -> Verdict:
+    """Verdict on a plate with these factors, from responses of the sparse solve."""
+    eras = tuple(replace(era, stiffness=stiffness * era.stiffness) for era in consistency_rig.eras)
+    plate = replace(consistency_rig.plate, loss_factor=loss * consistency_rig.plate.loss_factor)
+    truth = replace(consistency_rig, plate=plate, eras=eras)
+    responses = measured_by_plates(truth, frequencies=FREQUENCIES, noise=0.005)
+    return judged_by_promises(diagnose(consistency_rig, responses), consistency_rig)
+
+
+def test_plate_with_more_loss_and_less_stiffness_has_a_verdict_of_its_own() -> None:
+    """60 % more loss and 20 % less stiffness: wiring well, both named."""
+    verdict = verdict_on(make_paper_rig(16, 12), loss=1.6, stiffness=0.8)
+    assert verdict.wiring_matches
+    told = as_json(verdict)
+    assert told["wiring_matches"]
+    assert told["plate"]["changes"]["loss_factor"] == pytest.approx(0.6, abs=0.15)
+    assert told["plate"]["changes"]["stiffness"] == pytest.approx(-0.2, abs=0.03)
+
+
+def test_plate_as_written_costs_nothing() -> None:
+    """The rig's own plate: no change of more than 5 %, and more than nine of ten promises kept."""
+    verdict = verdict_on(make_paper_rig(16, 12), loss=1.0, stiffness=1.0)
+    assert verdict.is_well
+    assert verdict.changes is not None
+    assert max(map(abs, verdict.changes.values())) < 0.05
+    assert verdict.kept_share is not None
+    assert verdict.kept_share > 0.9
+
+
+def test_axes_noted_the_other_way_round_are_refused_before_a_calibration() -> None:
+    """Places from the other corner, and frequencies backwards."""
+    for case in SCENARIOS:
+        if case["planted"] in ("places from the other corner", "frequencies backwards"):
+            with pytest.raises(InputError, match=" and ".join(case["mirrored"])):
+                check_consistency(*planted(case))
+
+
+@pytest.fixture(scope="module")
+def built(coarse_rig: Rig) -> Responses:
+    """Responses of one plate within tolerance."""
+    rng = np.random.default_rng(7)
+    return on_paper(within_tolerance(coarse_rig, rng), rng)
+
+
+def test_mirrored_places_on_a_symmetric_plate_may_be_exchanged_channels(
+    coarse_rig: Rig, built: Responses
+) -> None:
+    """The paper's corners: a calibration says both, a check what plugs would be."""
+    mirrored = np.array([coarse_rig.plate.length, 0]) - built.points * [1, -1]
+    noted = replace(built, points=mirrored)
+    with pytest.raises(InputError, match=r"mirrored in x.*channels"):
+        check_consistency(coarse_rig, noted)
+    found = diagnose(coarse_rig, noted).findings
+    assert [{each.kind: each.of} for each in found] == [
+        {"swapped": "SW, SE"},
+        {"swapped": "NE, NW"},
+    ]
+
+
+def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
+    """Two sensors, three frequencies, or no channel at all."""
+    with pytest.raises(InputError, match=r"at least 3 sensors .* got 2"):
+        diagnose(coarse_rig, DISTORTIONS["two_sensors"](built))
+    few = replace(built, frequencies=PAPER_TONES[:3], values=built.values[:3])
+    with pytest.raises(InputError, match="got 3"):
+        diagnose(coarse_rig, few)
+    with pytest.raises(InputError, match="driven"):
+        diagnose(coarse_rig, replace(built, values=np.full_like(built.values, np.nan)))
+
+
+def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
+    """They move parameters by a tenth of their prior."""
+    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    clean, found = (
+        match_plate(plate, each.values.swapaxes(1, 2), drives=range(4))
+        for each in (built, with_glitches(built, 0.03))
+    )
+    assert np.sqrt(((found.z - clean.z) ** 2).mean()) < 0.1
+
+
+def test_chance_counts_all_values(coarse_rig, built):
+    """3.385 standard deviations are 1 normal number in 1400, and 1 in 100 sets of 14."""
+    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    match = match_plate(plate, built.values.swapaxes(1, 2), drives=range(4))
+    match.__dict__["z"] = 3.385 * np.eye(14)[3]
+    assert match.chance == pytest.approx(0.01, rel=0.01)
+
+
+def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
+    """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
+    rng = np.random.default_rng(1003)
+    built = on_paper(longer(within_tolerance(coarse_rig, rng), 1.03), rng)
+    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    match = match_plate(plate, built.values.swapaxes(1, 2), drives=range(4))
+    used = without_outliers(built.values, match.predicted.swapaxes(1, 2))[-1]
+    assert 0.05 < (~used).mean() < MAX_OUTLIERS
+    assert match.error > MAX_FIT_ERROR

@@ -26,11 +26,10 @@ from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Mounted
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, random_contacts, use_one_thread
+from model.estimate.following import LivePlate, PatternReport, PlateEstimate, SettledPattern
 from model.estimate.forward import RestingFinger, Sensor
 from model.estimate.identify import identify
-from model.estimate.learned_plate import LivePlate, PatternReport, PlateEstimate
 from model.estimate.measurement import Measurement
-from model.estimate.settled_patterns import SettledPattern
 from model.finger import fingertip_points, fingertip_weights
 from model.rig.rig_file import load_rig
 from model.structure.attachments import Fingertip

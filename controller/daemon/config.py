@@ -31,7 +31,7 @@ from model.config.file_kinds import CheckedFile, ConfigKind
 from model.config.units import LENGTH, LEVEL
 from model.drive_modes import DRIVE_MODES
 from model.errors import InputError
-from model.estimate.learned_plate import was_learned
+from model.estimate.following import was_learned
 from model.finger import STRONG_DB_SL
 from model.rig.actuator_keys import Identifier
 from model.rig.rig import Rig

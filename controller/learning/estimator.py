@@ -24,9 +24,8 @@ from controller.plate_measurement import settling
 from controller.process.child import end_with_parent
 from model.answer.plan import prepare_answers
 from model.errors import InputError
+from model.estimate.following import LearnedTable, PlateEstimate, SettledPattern
 from model.estimate.forward import Sensor
-from model.estimate.learned_plate import LearnedTable, PlateEstimate
-from model.estimate.settled_patterns import SettledPattern
 from model.files.array_file import remove_partial
 from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
@@ -87,11 +86,11 @@ class Estimator:
         remove_partial(file)
         self._note, self._is_kept = "", True
         self._cause, self._alarms = "the plate is followed from the rig as built on", 0
+        self._learned = LearnedTable(table, known, file=file)
         try:
-            self._learned = LearnedTable.resumed(table, known, file=file, now=time.monotonic())
+            self._learned.resume(time.monotonic())
         except InputError as error:
             self._note = f"learning anew: {error}; {_set_aside(file)}"
-            self._learned = LearnedTable(table, known, file=file)
 
     def start(self) -> tuple[float, PlateReport, LocalizationTable]:
         """The time [s] until the plate has settled, what was learned before, the cautious table."""
@@ -104,7 +103,7 @@ class Estimator:
 
     def take(self, pattern: SettledPattern) -> PlateReport:
         """Take a pattern; of one of no plate nothing is learned, and a note says so."""
-        was_known = not self._learned.change and self._cause != _HELD
+        was_known = not self._learned.live.known.change and self._cause != _HELD
         try:
             found, table = self._learned.take(pattern)
         except ValueError as error:  # InputError and LinAlgError are such
@@ -139,8 +138,8 @@ class Estimator:
     def _report(
         self, table: LocalizationTable | None, *, is_alarm: bool = False, note: str = ""
     ) -> PlateReport:
-        if self._learned.change:
-            said = PlateReport("changed", self._learned.change, _CHANGED_REMEDY)
+        if self._learned.live.known.change:
+            said = PlateReport("changed", self._learned.live.known.change, _CHANGED_REMEDY)
         elif self._why_off:
             as_built = f"answers stay as built: {self._why_off}"
             said = PlateReport("off", self._cause if self._alarms else as_built, _IDENTIFY)
@@ -150,7 +149,7 @@ class Estimator:
         return replace(said, is_alarm=is_alarm, table=table, note=note)
 
     def _cautious(self) -> LocalizationTable:
-        return self._prepared(table_following(self._table, self._learned.cautious_rig))
+        return self._prepared(table_following(self._table, self._learned.live.known.cautious_rig))
 
     def _prepared(self, table: LocalizationTable) -> LocalizationTable:
         table = replace(table)  # not the one that the next correction starts from

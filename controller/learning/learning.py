@@ -43,8 +43,8 @@ from drivers.errors import CommandError, DriverError, Preempted
 from drivers.host.amplifier import Reading, finish_reading, start_reading
 from model.answer.answer_report import Timing
 from model.errors import InputError
+from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger
-from model.estimate.settled_patterns import SettledPattern
 from model.rig.rig import Rig
 from model.table.table import LocalizationTable
 from registry import threads

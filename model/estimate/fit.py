@@ -139,7 +139,8 @@ class Fit:
         by_size = std * np.vstack([columns.real, columns.imag])
         r, J = self.of_values
         kept = np.ones(J.shape[1], bool) if beside is None else beside[self.searched]
-        J, rows = J[:, kept], np.append(np.ones(len(r), bool), kept)
+        J, rows = J[:, kept], np.ones(len(self.slopes), bool)
+        rows[len(r) : len(r) + len(kept)] = kept
         whole = self.slopes[rows][:, kept]
         H = linalg.cho_factor(whole.T @ whole)
         left = r - J @ linalg.cho_solve(H, whole.T @ self.residuals[rows])

@@ -24,9 +24,8 @@ from controller.play.loop import Controller
 from drivers.errors import CommandError, LinkError
 from model.answer.answer_report import Timing
 from model.errors import InputError
+from model.estimate.following import LearnedTable, SettledPattern
 from model.estimate.forward import Sensor
-from model.estimate.learned_plate import LearnedTable
-from model.estimate.settled_patterns import SettledPattern
 from model.table.table import LocalizationTable
 from plates import make_paper_rig, small_table
 from virtual_lines import in_virtual_time

@@ -39,7 +39,7 @@ from interrupted import full_disk, interrupted
 from long_form import shortly
 from model.errors import InputError
 from model.estimate import calibrate
-from model.estimate.learned_plate import load_learned
+from model.estimate.following import load_learned
 from model.estimate.measurement import WiredSensor, read_measured, read_places, read_sensors
 from model.files.array_file import UNREADABLE, read_arrays
 from model.rig.rig_file import example_rig_path, load_rig

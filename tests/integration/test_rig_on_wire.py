@@ -50,7 +50,7 @@ from gateway_bench import (
 )
 from long_form import shortly
 from model.errors import InputError
-from model.estimate.learned_plate import load_learned
+from model.estimate.following import load_learned
 from model.estimate.measurement import write_responses_csv, write_responses_uff
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
@@ -481,7 +481,7 @@ async def test_loose_mount_is_named_and_its_contrast_comes_back(tmp_path: Path) 
         while not bench.file.exists():  # written now and then
             await bench.patterns(1)
     table = _table(load_rig(bench.file.with_name("rig.yaml")))
-    assert load_learned(bench.file, table=table.fingerprint).names
+    assert load_learned(bench.file, table=table.fingerprint)[0]["names"]
 
 
 async def contrast(bench: LearningBench) -> float:

@@ -31,9 +31,9 @@ from model.answer.promise import FingersOnPlate
 from model.answer.stimulus import Placement
 from model.arrays import ComplexArray, FloatArray
 from model.drive_modes import Drive, Forms
+from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger
 from model.estimate.measurement import Responses
-from model.estimate.settled_patterns import SettledPattern
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid
 from model.reduction.reduced_plate import modal_matrices, reduce_plate

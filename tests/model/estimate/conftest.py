@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.identification.hidden import Hidden, draw
+from model.estimate.following import PlateEstimate
 from model.estimate.forward import Sensor
 from model.estimate.identify import Identification, identify
-from model.estimate.learned_plate import PlateEstimate
 from model.estimate.measurement import Measurement
 from model.rig.rig_file import example_rig_path, load_rig
 from plates import SETTLED_PATTERNS_FREQUENCIES

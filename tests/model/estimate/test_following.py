@@ -25,23 +25,22 @@ from benchmarks.identification.thin_plate import Complexes, Mounted, Reals
 from long_form import shortly
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate import learned_plate
+from model.estimate import following
 from model.estimate.fit import Fit
-from model.estimate.forward import Sensor
-from model.estimate.identify import fit_in_stages, model_of, solved_with_modes_of
-from model.estimate.learned_plate import LearnedTable, LivePlate, PlateEstimate
-from model.estimate.measurement import Measurement
-from model.estimate.settled_patterns import (
+from model.estimate.following import (
     WINDOW,
     Alarm,
+    LearnedTable,
+    LivePlate,
     NoiseLevel,
     Observation,
-    PatternModel,
+    PlateEstimate,
     SettledPattern,
-    State,
-    StateUpdate,
     update,
 )
+from model.estimate.forward import Sensor
+from model.estimate.identify import fit_in_stages, model_of, solved_with_modes_of
+from model.estimate.measurement import Measurement
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig
@@ -59,12 +58,19 @@ def table(known: PlateEstimate) -> LocalizationTable:
     return build_table(known.before, frequencies=TONES, drive_mode="phased")
 
 
+def resumed(table: LocalizationTable, known: PlateEstimate, file: Path) -> LearnedTable:
+    """A table with what its file holds."""
+    found = LearnedTable(table, known, file=file)
+    found.resume(0.0)
+    return found
+
+
 @pytest.mark.long
 def test_answers_wait_for_an_explanation(
-    hidden: Hidden, known: PlateEstimate, table: LocalizationTable
+    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, tmp_path: Path
 ) -> None:
     """A quiet pattern gives a new table, odd ones that raise an alarm none."""
-    learned = LearnedTable(table, known)
+    learned = LearnedTable(table, known, file=tmp_path / "learned.npz")
     quiet = played(learned.take, hidden, hidden.mounted, count=12)
     assert all(table is not None for _, table in quiet)
     odd = replace(hidden.mounted, stiffness=hidden.mounted.stiffness * [0.5, 1.0, 2.0, 1.0])
@@ -93,16 +99,20 @@ def test_unexplained_change_widens_the_errors_of_answers(
     wide, built = learned.current.uncertainty, Uncertainty()
     assert (wide.gain, wide.thickness, wide.damping) == (built.gain, built.thickness, built.damping)
     learned.save()
-    resumed = LearnedTable.resumed(table, known, file=file)
-    assert resumed.change == learned.change != ""
-    assert resumed.current.uncertainty == wide
+    again = resumed(table, known, file)
+    assert again.live.known.change == learned.live.known.change != ""
+    assert again.current.uncertainty == wide
 
 
 def test_pattern_that_no_table_follows_leaves_the_state(
-    hidden: Hidden, known: PlateEstimate, table: LocalizationTable, monkeypatch: pytest.MonkeyPatch
+    hidden: Hidden,
+    known: PlateEstimate,
+    table: LocalizationTable,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     """State, answers and time are those before a refused pattern, and the next one is taken."""
-    learned = LearnedTable(table, known)
+    learned = LearnedTable(table, known, file=tmp_path / "learned.npz")
     first, second, third = settled_patterns(hidden, hidden.mounted, count=3)
     learned.take(first)
     state, current = learned.live.known, learned.current
@@ -111,7 +121,7 @@ def test_pattern_that_no_table_follows_leaves_the_state(
         raise InputError("thickness must be within 10 %, got 20 %")
 
     with monkeypatch.context() as patch:
-        patch.setattr(learned_plate, "table_following", refused)
+        patch.setattr(following, "table_following", refused)
         with pytest.raises(InputError, match="thickness"):
             learned.take(second)
     assert learned.live.known is state
@@ -124,17 +134,17 @@ def test_what_was_learned_is_resumed_for_its_table_only(
 ) -> None:
     """The same state and answers come back; another rig's table and a damaged file are refused."""
     file = tmp_path / "learned.npz"
-    learned = LearnedTable.resumed(table, known, file=file)
+    learned = resumed(table, known, file)
     played(learned.take, hidden, hidden.mounted, count=3)
     learned.live.known = replace(learned.live.known, change="a crack")
     learned.save()
-    cautious = LearnedTable.resumed(table, known, file=file)
-    assert cautious.change == "a crack"
+    cautious = resumed(table, known, file)
+    assert cautious.live.known.change == "a crack"
     assert cautious.current.uncertainty.thickness == Uncertainty().thickness
     learned.live.known = replace(learned.live.known, change="")
     learned.save()
-    again = LearnedTable.resumed(table, known, file=file)
-    assert not again.change
+    again = resumed(table, known, file)
+    assert not again.live.known.change
     np.testing.assert_array_equal(
         again.live.known.state.covariance, learned.live.known.state.covariance
     )
@@ -142,16 +152,14 @@ def test_what_was_learned_is_resumed_for_its_table_only(
         again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)
     )
     with pytest.raises(InputError, match="this table"):
-        LearnedTable.resumed(replace(table, masses=()), known, file=file)
+        resumed(replace(table, masses=()), known, file)
     with pytest.raises(InputError, match="this rig"):
-        LearnedTable.resumed(
-            table, PlateEstimate.of_rig(known.before, known.model.sensors[:2]), file=file
-        )
+        resumed(table, PlateEstimate.of_rig(known.before, known.model.sensors[:2]), file)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(bytes(content))
     with pytest.raises(InputError, match="remove the file"):
-        LearnedTable.resumed(table, known, file=file)
+        resumed(table, known, file)
 
 
 NE = 2  # number of that ERA
@@ -179,7 +187,7 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
     known: PlateEstimate,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
-    live = LivePlate(replace(known, time=0.0))
+    live = LivePlate(replace(known, state=replace(known.state, time=0.0)))
     space = live.known.model.space
 
     def known(kind: str, hours: float) -> float:
@@ -220,7 +228,7 @@ def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: Plat
     live = LivePlate(replace(known, is_explained=False))
     before = live.known.state
     played(live.take, hidden, hidden.mounted, count=2)
-    assert live.known.state is before
+    assert live.known.state.x is before.x
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,48 +404,66 @@ def test_update_within_bounds_explains_a_pattern(
     A hundred parameters are free for eight numbers: at the most likely state these are explained to
     their errors, by no more changes than eight directions of the prior are likely to make.
     """
-    model = PatternModel.of(drawn.model, pattern, 0.5)
-    found = update(drawn.state, [model], evaluations=20)
-    predicted, _ = model.predicted(found.state.x, found.fingers)
-    residuals = (predicted - pattern.numbers) / model.std
-    assert residuals @ residuals < found.count
-    assert found.cost < 3 * found.count
-    space = drawn.model.space
-    assert (found.state.x >= space.lower).all()
-    assert (found.state.x <= space.upper).all()
+    found = update(drawn.model, drawn.state, [pattern])
+    count = len(found.innovation)
+    assert count == 2 * len(pattern.values)
+    assert found.misfit < count
+    assert 2 * found.fit.cost < 3 * count
+    space = found.fit.space
+    assert (found.fit.x >= space.lower).all()
+    assert (found.fit.x <= space.upper).all()
+    # What the fit predicts is what the plate does under the fingers that it found.
+    rows, own = found.fit.plate.responses[0], found.fit.x[: drawn.model.space.size]
+    np.testing.assert_array_equal(found.state.x, own)
+    np.testing.assert_allclose(found.fit.predicted[0, :, 0], rows @ pattern.bases)
+
+
+def test_patterns_together_are_those_alone(drawn: PlateEstimate) -> None:
+    """A finger loads the plate during its own pattern only: the model of several is that of each.
+
+    The second has a state twice as certain as one of them alone leaves, at least.
+    """
+    hidden = draw("form", 1)
+    several = [*settled_patterns(hidden, hidden.mounted, count=3, start=0)]
+    whole = update(drawn.model, drawn.state, several, evaluations=1)
+    for number, each in enumerate(several):
+        (alone,) = update(drawn.model, drawn.state, [each], evaluations=1).fit.predicted
+        np.testing.assert_allclose(whole.fit.predicted[number], alone, rtol=1e-9)
+    certain = np.diag(whole.state.covariance)
+    for each in several:
+        after = update(drawn.model, drawn.state, [each], evaluations=1).state
+        assert (certain <= np.diag(after.covariance) + 1e-9).all()
 
 
 def test_numbers_change_as_their_derivatives_say(
     drawn: PlateEstimate, pattern: SettledPattern
 ) -> None:
-    """Central differences of the numbers without a phase; none lies along a common turn."""
+    """Central differences of the residuals of one without a phase; none lies along its turn."""
     without = turned(pattern, 1.0, has_phase=False)
-    model = PatternModel.of(drawn.model, without, 0.5)
-    x, fingers = np.zeros(drawn.model.space.size), np.zeros(4 * len(pattern.fingers))
-    _, J = model.predicted(x, fingers)
-    step = 1e-5
+    size, step = drawn.model.space.size, 1e-5
+
+    def fitted(x: FloatArray) -> Fit:
+        exact = replace(drawn.state, covariance=np.eye(size))
+        return update(drawn.model, exact, [without], evaluations=1, start=x).fit
+
+    centre = np.full(size, 0.2)
+    _, J = fitted(centre).of_values
     for number in drawn.model.space.indices("stiffness"):
-        moved = x.copy()
+        moved = np.zeros(size)
         moved[number] = step
-        ahead, _ = model.predicted(moved, fingers)
-        behind, _ = model.predicted(-moved, fingers)
-        slopes = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(slopes, J[:, number], rtol=1e-3, atol=1e-7)
-    turn = np.concatenate([(1j * without.values).real, (1j * without.values).imag])
-    assert np.abs(turn @ J).max() < 1e-9 * np.linalg.norm(turn) * np.linalg.norm(J)
+        ahead, behind = (fitted(centre + way * moved).of_values[0] for way in (1, -1))
+        np.testing.assert_allclose(
+            (ahead - behind) / (2 * step), J[:, number], rtol=1e-3, atol=1e-6
+        )
+    turn = 1j * without.values / without.std
+    turn = np.concatenate([turn.real, turn.imag])
+    assert np.abs(turn @ J).max() < 1e-6 * np.linalg.norm(turn) * np.linalg.norm(J)
 
 
 def taken(*, nis: float = 2.0, slope: float = 0.0, masses: int = 0) -> Observation:
     """A pattern of eight numbers with one direction of unit curvature."""
     slopes, none = np.array([slope]), cast(Any, None)
-    return Observation(none, none, 0.0, nis, 8, slopes, np.ones(1), masses)
-
-
-def updated(misfit: float, freedom: float) -> StateUpdate:
-    """An update that leaves so many squared residuals of so many numbers."""
-    empty = np.zeros((0, 0))
-    state = State(np.zeros(0), empty)
-    return StateUpdate(state, 0.0, 8, 0.0, misfit, freedom, empty, empty, empty, empty)
+    return Observation(none, none, nis, 8, slopes, np.ones(1), masses)
 
 
 def test_change_along_one_direction_is_found_in_likely_patterns() -> None:
@@ -485,5 +511,5 @@ def test_noise_follows_what_is_left_within_its_bounds() -> None:
     for size, expected in ((0.5, 0.5), (0.01, 0.3), (3.0, 1.0)):
         noise = NoiseLevel()
         for _ in range(200):
-            noise.take(updated(4 * (size / noise.relative) ** 2, 4.0))
+            noise.take(4 * (size / noise.relative) ** 2, 4.0)
         assert noise.relative == pytest.approx(expected, rel=0.05)

@@ -1,0 +1,702 @@
+"""A plate that settled patterns follow while it is driven, and a table that follows it.
+
+The parameters of an identification drift. Each settled pattern updates them, together with the
+loads of its fingers, which are dropped afterwards: the one fit, with the state before as its prior.
+The noise of readings follows from what updates leave.
+
+An alarm means that some of the last innovations are unlikely together, or along one change: a
+spring, a gain, the thickness, or a mass in one of many places. The latter is a generalised
+likelihood ratio test, which finds what fingers and noise hide in the sum (M. Basseville, I. V.
+Nikiforov, Detection of Abrupt Changes, 1993, section 2.4.3). One pattern alone raises no alarm,
+since a finger may be unlike any other, but it does not update the state either.
+
+An update would smear a sudden change over all parameters. So after an alarm the state goes back to
+where the odd patterns began and is held, until the patterns since then are explained by one change:
+a hypothesis is a wide prior of the parameters that would have changed. The most likely one costs
+least in a fit of the held patterns, plus a cost for each changed parameter, and is followed. Where
+it still leaves residuals beyond chance, as for a crack or a hand that rests on the plate, the plate
+counts as changed until patterns fit it again as it was: its table is that of the plate as last
+known, with the errors of one that was not measured.
+"""
+
+import hashlib
+import json
+import time as clock
+import zipfile
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from scipy import linalg
+from scipy.special import chdtrc
+
+from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
+from model.errors import InputError
+from model.estimate.fit import Fit, best_gains, fit
+from model.estimate.forward import ForwardModel, RestingFinger, Sensor, by_mass_at
+from model.estimate.identify import solved_for
+from model.estimate.measurement import Measurement
+from model.estimate.space import FINGER_PARTS, MODE_SHIFTS, Values, rig_with, space_of
+from model.files.array_file import UNREADABLE, read_arrays, write_arrays
+from model.files.output_paths import begins_with
+from model.finger import Grid
+from model.rig.rig import Rig, Uncertainty
+from model.structure.modal_elasticity import lowest_elastic
+from model.table.table import LocalizationTable
+from model.table.table_file import table_following
+
+_NOISE, _FLOOR = 0.01, 0.1
+"""Largest noise of a reading relative to its size, and its floor relative to the sensors' rms."""
+
+_PART_SHARE = 0.5  # deviation of each part of a finger, in that of the whole
+_ONLY_PHASE = 1e-6  # deviation of a gain whose phase alone is free
+_INSIDE = 0.1  # standard deviations from a bound, of a start
+_NOISE_PATTERNS = 60  # of which the noise is estimated
+_FIRST_NOISE = 8.0  # numbers for which the first noise counts
+_MIN_NOISE = 0.3  # relative to the largest
+
+WINDOW: Final = 8
+_UNLIKELY_TOGETHER, _UNLIKELY_ALONE, _UNLIKELY_REST = 1e-7, 1e-6, 1e-2
+_ALONG_REST = 8.0  # without the pattern that deviates most
+_ALONG = 22.0  # squared standard deviations, of a hundred directions in some thousand patterns
+_REFERENCE = 0.4  # of nis / count: a change adds more, without one there is less most of the time
+PLACES: Final = Grid(9, 7)
+"""Cells in whose middles masses are looked for."""
+
+_KINDS = ("stiffness", "gain", "phase", "thickness")
+_SPRING, _THICKNESS, _GAIN, _PHASE = 0.3, 0.05, 0.3, 0.5  # of logarithms, and radians
+_MASS = 5e-3
+_COST_OF_CHANGE = 4.0
+_UNLIKELY = 1e-4
+_STARTS = 3
+_EVALUATIONS, _FIRST_EVALUATIONS, _LAST_EVALUATIONS = 20, 10, 40  # of an update, of hypotheses
+BY_MASS = "a mass"
+_WITHIN_REACH = 300.0  # of the least cost
+_FOLLOWED = 3  # of the least cost after the first evaluations
+
+_MIN_EXPLAINED, _MAX_EXPLAINED = 4, 6  # patterns that are explained together
+_AFTER_ALARM = 2  # patterns before a change counts as unexplained
+_CERTAIN = 12.0  # lead in cost of an explanation that is accepted early
+
+_NOT_STATED = (
+    "modulus",
+    "damping_each",
+    "loss_exponent",
+    "bolt_mass",
+    "place",
+    "mode_shifts",
+    "mode_losses",
+)
+"""Kinds whose uncertainty a rig does not state."""
+
+_VERSION = 2
+_TYPES = {"header": "|u1", "x": "<f8", "covariance": "<f8", "digest": "|u1"}
+_MAX_BYTES = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class SettledPattern:
+    """A tone that has settled, as it was played and measured."""
+
+    time: float
+    """Time of the measurement [s]."""
+    frequency: float
+    """Frequency of the tone [Hz]."""
+    bases: ComplexArray
+    """Amplitude of each ERA's base as commanded (n,) [m]."""
+    values: ComplexArray
+    """Acceleration at each sensor (s,) [m/s²], phases as exp(+i omega t)."""
+    fingers: tuple[RestingFinger, ...] = ()
+    """Fingers on the plate, as far as they are known."""
+    has_phase: bool = True
+    """Whether phases of values count from those of bases; otherwise one phase, common to all
+    sensors, is unknown, and no update depends on it."""
+    noise: float = 1.0
+    """Noise of the reading, relative to the largest."""
+
+    @property
+    def std(self) -> FloatArray:
+        """Error of the real and of the imaginary part of each value (s,)."""
+        squares = np.abs(self.values) ** 2
+        return np.asarray(self.noise * _NOISE * np.sqrt(squares + _FLOOR**2 * squares.mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Parameters of a plate as known at a time."""
+
+    x: FloatArray
+    """Parameters (p,)."""
+    covariance: FloatArray
+    """Covariance (p, p) of x."""
+    time: float | None = None
+    """When it was updated [s], since which it has drifted; None before the first pattern."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateUpdate:
+    """A state after some patterns, with the innovation in standard deviations."""
+
+    state: State
+    fit: Fit
+    """Fit of plate and fingers."""
+    innovation: FloatArray
+    """Innovation (m,) with the slopes where the update ended."""
+    precision: FloatArray
+    """Inverse covariance of the innovation, the theory's errors included (m, m)."""
+    freedom: float
+    """Number of residuals that plate and fingers do not take up."""
+
+    @property
+    def nis(self) -> float:
+        """Normalised innovation squared."""
+        return float(self.innovation @ self.precision @ self.innovation)
+
+    @property
+    def misfit(self) -> float:
+        """Squared residuals after the update."""
+        left, _ = self.fit.of_values
+        return float(left @ left)
+
+
+def update(
+    model: ForwardModel,
+    before: State,
+    patterns: Sequence[SettledPattern],
+    *,
+    evaluations: int = _EVALUATIONS,
+    start: FloatArray | None = None,
+    theory: FloatArray | None = None,
+) -> StateUpdate:
+    """Find the most likely state after patterns, within its bounds.
+
+    model: of the plate without fingers. evaluations: of the model, at most; start: of the plate
+    (p,), or of plate and fingers, by default the state before; theory (p,): variances of the
+    theory's errors, which count only in the likelihood of the innovation.
+    """
+    fingers = [replace(f, tone=n) for n, each in enumerate(patterns) for f in each.fingers]
+    parts, p = len(FINGER_PARTS), len(before.x)
+    names = [f"finger part {number}" for number in range(parts * len(fingers))]
+    whole = replace(
+        model,
+        frequencies=np.array([each.frequency for each in patterns]),
+        fingers=fingers,
+        space=model.space.and_further("fingers", names),
+        last_places={},
+    )
+    measurement = Measurement(
+        tuple(model.sensors),
+        np.arange(len(patterns), dtype=float),
+        np.array([each.values for each in patterns])[..., None],
+        np.array([each.std for each in patterns])[..., None],
+        free_gains=not patterns[0].has_phase,
+        gain_std=_ONLY_PHASE,
+        bases=np.array([each.bases for each in patterns]),
+    )
+    # A finger loads a plate more or less as a whole, and each of its parts differs half as much
+    # beside that: with parts that varied on their own a heavy finger would be as unlikely as four.
+    of_finger = _PART_SHARE**2 * np.eye(parts) + np.ones((parts, parts))
+    P = linalg.block_diag(before.covariance, *[of_finger] * len(fingers))
+    mean = np.zeros(len(P))
+    mean[:p] = before.x
+    first = mean.copy()
+    if start is not None:
+        first[: len(start)] = start
+    found = fit(
+        whole,
+        measurement,
+        searched=np.diagonal(P) > 0,
+        start=first,
+        prior=(mean, P),
+        evaluations=evaluations,
+        inside=_INSIDE,
+    )
+    left, slopes = found.of_values
+    H = np.zeros((len(left), len(P)))
+    H[:, found.searched] = slopes
+    inverse = linalg.inv(H @ P @ H.T + np.eye(len(left)))
+    covariance = (P - P @ H.T @ inverse @ H @ P)[:p, :p]
+    wrong = np.zeros(len(P))
+    wrong[:p] = 0.0 if theory is None else theory
+    # In the slopes where it ended: those before are wrong for a finger of another load.
+    expected = H @ (P @ H.T + wrong[:, None] * H.T) + np.eye(len(left))
+    return StateUpdate(
+        State(found.x[:p], (covariance + covariance.T) / 2, patterns[-1].time),
+        found,
+        H @ (found.x - mean) - left,
+        linalg.inv(expected),
+        float(np.trace(inverse)),
+    )
+
+
+class NoiseLevel:
+    """Noise of readings relative to the largest that a `SettledPattern` states, 0.3 to 1.
+
+    An error that is taken too large hides a change until other parameters have taken it up. The
+    most likely variance is that of the residuals over the numbers that no parameter takes up
+    (D. J. C. MacKay, Bayesian interpolation, Neural Computation 4, 1992, 415-447, eq. 4.11).
+
+    It begins at the largest. Below 0.3 a plate is never known: what a finger's model leaves counts
+    as noise, too. Never above 1, or a change would make itself unremarkable.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_NOISE_PATTERNS)
+        self.relative = 1.0
+
+    def take(self, misfit: float, freedom: float) -> None:
+        """Take squared residuals that an update of this noise has left, and of how many numbers."""
+        self._recent.append((self.relative**2 * misfit, freedom))
+        total, numbers = np.array(self._recent).sum(axis=0) + _FIRST_NOISE
+        self.relative = float(np.clip(np.sqrt(total / numbers), _MIN_NOISE, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A pattern with the state before it and its innovation, along d directions of change."""
+
+    pattern: SettledPattern
+    before: State
+    nis: float
+    count: int
+    """Number of real numbers in the innovation."""
+    slopes: FloatArray
+    """Slope of half the squared innovation by each direction (d,)."""
+    curvatures: FloatArray
+    """Curvature of the same (d,)."""
+    masses: int
+    """Number of the last directions, masses, which can only grow."""
+
+    @classmethod
+    def of(cls, pattern: SettledPattern, before: State, found: StateUpdate) -> Self:
+        """Make it of a pattern and its update."""
+        best = found.fit
+        driven = best.measurement.driven
+        points = PLACES.centres(best.model.rig.plate)
+        by_mass = driven(by_mass_at(best.plate, points))
+        _, _, _, masses = best_gains(driven(best.plate.responses), by_mass, best.measurement)
+        kinds = best.space.of(*_KINDS)[best.searched]
+        columns = np.hstack([best.of_values[1][:, kinds], np.vstack([masses.real, masses.imag])])
+        weighted = found.precision @ columns
+        slopes, curvatures = weighted.T @ found.innovation, (columns * weighted).sum(axis=0)
+        count = len(found.innovation)
+        return cls(pattern, before, found.nis, count, slopes, curvatures, len(points))
+
+
+class Alarm:
+    """The last patterns of a plate, tested for being those of the plate as known.
+
+    chi² is computed with `scipy.special`: `scipy.stats` takes a second to load.
+    """
+
+    def __init__(self) -> None:
+        self._recent: deque[Observation] = deque(maxlen=WINDOW)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a whole window of patterns has come without an alarm."""
+        return len(self._recent) == WINDOW
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether the last pattern is unlikely on its own, as under a finger unlike any other."""
+        last = self._recent[-1]
+        along = _squares(last.slopes, last.curvatures, last.masses).max()
+        return bool(chdtrc(last.count, last.nis) < _UNLIKELY_ALONE or along > _ALONG)
+
+    def take(self, observation: Observation) -> list[Observation] | None:
+        """Take a pattern; return the last patterns since the plate changed, None if it did not."""
+        self._recent.append(observation)
+        last = list(self._recent)[::-1]
+        masses, along, confirmed = last[0].masses, np.zeros(len(last)), np.zeros(len(last))
+        for number in range(len(last)):
+            slopes = np.array([each.slopes for each in last[: number + 1]])
+            weights = np.array([each.curvatures for each in last[: number + 1]])
+            total, weight = slopes.sum(axis=0), weights.sum(axis=0)
+            squares = _squares(total, weight, masses)
+            along[number] = squares.max()
+            # Directions along which the others deviate without any one pattern.
+            rest = _squares(total - slopes, weight - weights, masses).min(axis=0)
+            confirmed[number] = np.where(rest > _ALONG_REST, squares, 0.0).max()
+        if confirmed.max() > _ALONG:
+            return last[: best_of(along) + 1][::-1]
+        squares = np.cumsum([each.nis for each in last])
+        numbers = np.cumsum([each.count for each in last])
+        rest = squares - np.maximum.accumulate([each.nis for each in last])
+        unlikely = chdtrc(numbers, squares) < _UNLIKELY_TOGETHER
+        if np.any(
+            unlikely & (chdtrc(np.maximum(numbers - last[0].count, 1), rest) < _UNLIKELY_REST)
+        ):
+            return last[: best_of(squares - _REFERENCE * numbers) + 1][::-1]
+        return None
+
+
+def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatArray:
+    """Squared deviations along directions (..., d), of which the last can only be upwards."""
+    up = slopes.copy()
+    first = slopes.shape[-1] - masses
+    up[..., first:] = np.maximum(up[..., first:], 0.0)
+    return np.divide(up**2, curvatures, out=np.zeros_like(up), where=curvatures > 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class PlateChange:
+    """Explanation of some patterns by one change of the plate."""
+
+    name: str
+    """Name of the change, "" if none explains them."""
+    change: float
+    """Size of the change: of a mass in kg, of others the logarithm of a factor."""
+    lead: float
+    """Further cost of the next best explanation."""
+    state: State
+    """State of the plate after the change."""
+    resembles: str = ""
+    """Name of the change that explains most, though not enough."""
+
+    def __str__(self) -> str:
+        if self.name == BY_MASS:
+            return f"{self.name} by {1000 * self.change:+.3g} g"
+        if self.name:
+            return f"{self.name} by {100 * np.expm1(self.change):+.2g} %"
+        return f"the plate has changed, most as if {self.resembles} had"
+
+
+@dataclass(frozen=True, eq=False)
+class Supposition:
+    """A change that may have happened, with a fit of the patterns that supposes it."""
+
+    name: str
+    changed: dict[int, float]
+    """Deviation by which each changed parameter may have changed, in its unit."""
+    after: StateUpdate
+
+    @property
+    def likelihood(self) -> float:
+        """Less the cost of residuals and changes, and of supposing a change."""
+        return -(2 * self.after.fit.cost + _COST_OF_CHANGE * len(self.changed))
+
+
+def explain(model: ForwardModel, before: State, patterns: Sequence[SettledPattern]) -> PlateChange:
+    """Find the one change that explains patterns, from the state before it."""
+    space = model.space
+
+    def supposed(
+        name: str, changed: dict[int, float], start: FloatArray | None, evaluations: int
+    ) -> Supposition:
+        covariance = before.covariance.copy()
+        for number, std in changed.items():
+            covariance[number, number] += (std / space.std[number]) ** 2
+        prior = replace(before, covariance=covariance)
+        after = update(model, prior, patterns, evaluations=evaluations, start=start)
+        return Supposition(name, changed, after)
+
+    tried = [supposed(*each, _FIRST_EVALUATIONS) for each in _hypotheses(model, before, patterns)]
+    tried = ranked_by(tried, lambda each: each.likelihood)
+    followed = {*list(dict.fromkeys(each.name for each in tried))[:_FOLLOWED]}
+    least = tried[0].likelihood - _WITHIN_REACH
+    for number, each in enumerate(tried):
+        if each.name in followed and each.likelihood >= least:
+            followed.remove(each.name)
+            x = each.after.fit.x
+            tried[number] = supposed(each.name, each.changed, x, _LAST_EVALUATIONS)
+    best, *others = ranked_by(tried, lambda each: each.likelihood)
+    if chdtrc(len(best.after.innovation), -best.likelihood) < _UNLIKELY:
+        return PlateChange("", 0.0, 0.0, before, resembles=best.name)
+    index, state = next(iter(best.changed)), best.after.state
+    change = float(space.std[index] * (state.x[index] - before.x[index]))
+    rival = max(each.likelihood for each in others if each.name != best.name)
+    return PlateChange(best.name, change, best.likelihood - rival, state)
+
+
+def _hypotheses(
+    model: ForwardModel, before: State, patterns: Sequence[SettledPattern]
+) -> Iterator[tuple[str, dict[int, float], FloatArray | None]]:
+    """All that may have changed, by name: with what, how far, and where a fit starts.
+
+    A mass starts where it would explain most. A new kind of change is one more of them.
+    """
+    space, plate = model.space, model.rig.plate
+    kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
+    for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
+        kinds.append((space.names[gain], {gain: _GAIN, phase: _PHASE}))
+    kinds.append(("thickness", {space.groups["thickness"].start: _THICKNESS}))
+    for name, changed in kinds:
+        if all(space.std[n] > 0 for n in changed):
+            yield name, changed, None
+    points, mass = PLACES.centres(plate), space.groups["masses"].stop - 3
+    own, sides = slice(mass, mass + 3), np.array([plate.length, plate.width])
+    unchanged = update(model, before, patterns, evaluations=1).fit
+    for number, size in unchanged.loads(points, std=_MASS)[:_STARTS]:
+        start = before.x.copy()
+        start[own] = [size, *(points[number] - sides / 2)] / space.std[own]
+        yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start
+
+
+@dataclass(frozen=True, eq=False)
+class PatternReport:
+    """Result of one settled pattern."""
+
+    nis: float = np.nan
+    """Squared innovation in its covariance."""
+    count: int = 0
+    """Number of real numbers in the innovation."""
+    alarm: bool = False
+    """Whether it began an alarm; not while the plate counts as changed."""
+    is_held: bool = False
+    """Whether the state waits for an explanation."""
+    explanation: PlateChange | None = None
+    """The change that explains the held patterns, if it was found now."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlateEstimate:
+    """What is known of a plate in service."""
+
+    before: Rig
+    """The rig that parameters count from."""
+    model: ForwardModel
+    """Forward model with a spare mass."""
+    state: State
+    is_explained: bool = True
+    """Whether an identification explains the plate, so that patterns update it, not only alarm."""
+    change: str = ""
+    """How it has changed in a way that its parameters do not follow, "" where it has not."""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as it is known now."""
+        values = Values.of(self.before, self.model.space, self.state.x)
+        return rig_with(self.before, values, self.before.uncertainty)
+
+    @property
+    def cautious_rig(self) -> Rig:
+        """The rig as last known, with the errors of a plate that was not measured."""
+        return replace(self.rig, uncertainty=widest(self.before.uncertainty))
+
+    @classmethod
+    def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
+        """Start from a rig's `uncertainty`; gains of the sensors are not known.
+
+        What the rig does not state counts as known as well as its thickness, as by identification.
+        """
+        free = solved_for(rig, rig.limits.frequency_max)
+        # Counted in the deviations of a plate that was not measured, which steps are limited by.
+        count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
+        space, stated = (
+            space_of(rig, [each.name for each in sensors], known, masses=1, mode_count=count)
+            for known in (widest(rig.uncertainty), rig.uncertainty)
+        )
+        model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
+        std = np.divide(stated.std, space.std, out=np.zeros(space.size), where=space.uncertain)
+        std[space.of(*_NOT_STATED)] = std[space.index("thickness")]
+        std[space.groups["masses"]] = 0.0
+        return cls(rig, model, State(np.zeros(space.size), np.diag(std**2)))
+
+
+def widest(uncertainty: Uncertainty) -> Uncertainty:
+    """The larger of each standard deviation and that of a plate that was not measured."""
+    names, built = [each.name for each in fields(Uncertainty)], Uncertainty()
+    return Uncertainty(
+        **{name: max(getattr(uncertainty, name), getattr(built, name)) for name in names}
+    )
+
+
+class LivePlate:
+    """An identified plate in service, updated by settled patterns."""
+
+    def __init__(self, known: PlateEstimate) -> None:
+        self.known = known
+        """What is known of the plate now."""
+        self._alarm = Alarm()
+        self._noise = NoiseLevel()
+        self._held: list[SettledPattern] = []
+        self._suspects = 0
+
+    def take(self, pattern: SettledPattern) -> PatternReport:
+        """Take a settled pattern: update the state, or hold it and explain what happened."""
+        pattern, known = replace(pattern, noise=self._noise.relative), self.known
+        if known.state.time is None:
+            known = self.known = replace(known, state=replace(known.state, time=pattern.time))
+        if self._held:
+            self._held.append(pattern)
+            return self._explained(pattern.time)
+        space = known.model.space
+        theory = (space.of_kinds(lambda kind: kind.theory) / space.scale) ** 2
+        after = update(known.model, self._drifted(pattern.time), [pattern], theory=theory)
+        suspect = self._alarm.take(Observation.of(pattern, known.state, after))
+        report = PatternReport(after.nis, len(after.innovation))
+        if suspect is not None:
+            self._alarm = Alarm()
+            if known.is_explained and not known.change:
+                self.known = replace(known, state=suspect[0].before)
+                self._held, self._suspects = [each.pattern for each in suspect], len(suspect)
+                report = self._explained(pattern.time)
+            return replace(report, alarm=not known.change)
+        if known.change and self._alarm.is_full:
+            known = self.known = replace(known, change="")
+        if known.is_explained and not known.change and not self._alarm.is_odd:
+            self.known = replace(known, state=after.state)
+            self._noise.take(after.misfit, after.freedom)
+        return report
+
+    def _explained(self, time: float) -> PatternReport:
+        """Explain the held patterns, early if the explanation is certain."""
+        count, model, before = len(self._held), self.known.model, self._drifted(time)
+        is_full = count >= max(_MAX_EXPLAINED, self._suspects + _AFTER_ALARM)
+        found = explain(model, before, self._held) if count >= _MIN_EXPLAINED else None
+        if is_full and found and not found.name:
+            # The first of them may be from before the change.
+            later = explain(model, before, self._held[-_MIN_EXPLAINED:])
+            found = later if later.name else found
+        if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
+            return PatternReport(is_held=True)
+        self._held = []
+        if found.name:
+            self.known = replace(self.known, state=found.state)
+        else:
+            self.known = replace(self.known, change=str(found))
+        return PatternReport(explanation=found)
+
+    def _drifted(self, time: float) -> State:
+        """The state at a time [s], less certain by the drift since its last update."""
+        state, space = self.known.state, self.known.model.space
+        hours = 0.0 if state.time is None else max(time - state.time, 0.0) / 3600
+        drift, most = (
+            (space.of_kinds(of) / space.scale) ** 2
+            for of in (lambda kind: kind.drift, lambda kind: kind.widest)
+        )
+        room = np.maximum(most - np.diag(state.covariance), 0.0)
+        further = np.diag(np.minimum(drift * hours, room))
+        return replace(state, covariance=state.covariance + further)
+
+
+class OtherPlate(InputError):
+    """The file is of another table, or of other parameters."""
+
+
+class LearnedTable:
+    """A table in service, corrected by the settled patterns of its plate.
+
+    table: that of the rig as known when service began, which is never changed; file: keeps what was
+    learned.
+    """
+
+    def __init__(self, table: LocalizationTable, known: PlateEstimate, *, file: Path) -> None:
+        self._table, self._file = table, file
+        self.live = LivePlate(known)
+        self.current = table
+        """The table as corrected so far."""
+
+    def resume(self, now: float) -> None:
+        """Resume with what the file holds, if it exists.
+
+        now: time [s] on the clock of the patterns; the plate has drifted since the file was
+        written. Raises InputError for another kind of file, OtherPlate for one of another table or
+        of other parameters.
+        """
+        if not self._file.exists():
+            return
+        header, x, covariance = load_learned(self._file, table=self._table.fingerprint)
+        known = self.live.known
+        expected = known.model.space.names, known.before.fingerprint
+        if (tuple(header["names"]), header["base"]) != expected:
+            raise OtherPlate(
+                f"{self._file}: parameters must be those of this rig and its sensors; remove the "
+                "file to learn anew"
+            )
+        age = max(clock.time() - self._file.stat().st_mtime, 0.0)
+        state = State(x, covariance, now - age)
+        self.live = LivePlate(replace(known, state=state, change=header["change"]))
+        self.current = self._followed()
+
+    def take(self, pattern: SettledPattern) -> tuple[PatternReport, LocalizationTable | None]:
+        """Take a settled pattern, and correct the table by it; None where that stays the same.
+
+        Raises InputError or another ValueError for a pattern that leads to a plate that no table
+        can follow; the state before it is restored, suspect patterns are discarded.
+        """
+        if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
+            raise InputError("readings must be finite and not all 0, got others")
+        before = self.live.known
+        try:
+            report, known = self.live.take(pattern), self.live.known
+            if (
+                not np.isfinite(known.state.x).all()
+                or not np.isfinite(known.state.covariance).all()
+            ):
+                raise InputError("parameters must be finite after a pattern, got others")
+            if known.state.x is before.state.x and bool(known.change) == bool(before.change):
+                return report, None
+            self.current = self._followed()
+        except Exception:
+            self.live = LivePlate(before)
+            raise
+        return report, self.current
+
+    def _followed(self) -> LocalizationTable:
+        """The table for the plate as it is known now."""
+        known = self.live.known
+        return table_following(self._table, known.cautious_rig if known.change else known.rig)
+
+    def save(self) -> None:
+        """Write what was learned, atomically; raises OSError."""
+        known, state = self.live.known, self.live.known.state
+        header = {
+            "version": _VERSION,
+            "table": self._table.fingerprint,
+            "base": known.before.fingerprint,
+            "names": known.model.space.names,
+            "change": known.change,
+        }
+        text = json.dumps(header).encode()
+        arrays = {"x": state.x, "covariance": state.covariance}
+        written = {"header": text, "digest": _digest(text, *arrays.values())}
+        texts = {name: np.frombuffer(each, dtype=np.uint8) for name, each in written.items()}
+        write_arrays(self._file, arrays | texts)
+
+
+def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray, FloatArray]:
+    """Read what was learned for a table by its fingerprint: header, parameters, covariance.
+
+    Raises InputError for a damaged file or another version, OtherPlate for another table.
+    """
+    try:
+        arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
+        text, x, covariance = arrays["header"].tobytes(), arrays["x"], arrays["covariance"]
+        if arrays["digest"].tobytes() != _digest(text, x, covariance):
+            raise ValueError("digest must be that of the content")
+        header = json.loads(text)
+        version, p = header["version"], len(header["names"])
+        of, _, _ = header["table"], header["base"], header["change"]
+    except (*UNREADABLE, KeyError, TypeError) as error:
+        why = (isinstance(error, OSError) and error.strerror) or error
+        raise InputError(
+            f"{file}: must be a learned plate: {why}; remove the file to learn anew"
+        ) from error
+    if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
+        raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
+    if of != table:
+        raise OtherPlate(
+            f"{file}: must be learned for this table, got one of another rig; remove the file to "
+            "learn anew"
+        )
+    return header, x, covariance
+
+
+def was_learned(file: Path) -> bool:
+    """Whether a file is a learned plate of any version, or may have been before it was damaged."""
+    if not begins_with(file, b"PK"):
+        return False
+    try:
+        with zipfile.ZipFile(file) as members:
+            return "covariance.npy" in members.namelist()
+    except zipfile.BadZipFile:
+        return True
+
+
+def _digest(text: bytes, x: FloatArray, covariance: FloatArray) -> bytes:
+    return hashlib.sha256(text + x.tobytes() + covariance.tobytes()).digest()

@@ -565,11 +565,11 @@ class LivePlate:
         """The state at a time [s], less certain by the drift since its last update."""
         state, space = self.known.state, self.known.model.space
         hours = 0.0 if state.time is None else max(time - state.time, 0.0) / 3600
-        drift, most = (
+        drift, limits = (
             (space.of_kinds(of) / space.scale) ** 2
             for of in (lambda kind: kind.drift, lambda kind: kind.widest)
         )
-        room = np.maximum(most - np.diag(state.covariance), 0.0)
+        room = np.maximum(limits - np.diag(state.covariance), 0.0)
         further = np.diag(np.minimum(drift * hours, room))
         return replace(state, covariance=state.covariance + further)
 

@@ -246,7 +246,7 @@ def diagnose(
         kept = tuple(each for each in verdict.findings if each.kind not in ("plate", "outliers"))
         return replace(verdict, findings=kept, plate_matches=False, changes=None)
     values = observation.values.swapaxes(1, 2)
-    shapes = match_shapes(plate, values)
+    shapes = match_shapes(plate, values) if dead.any() else of_live
     if refuses:
         _check_quantity(plate, shapes, values)
         _check_phases(plate, shapes, values)

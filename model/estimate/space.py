@@ -269,95 +269,88 @@ def space_of(
     lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic
     modes that may shift; form_of: number of sensors beside ERAs of a plate with form errors.
     """
-    plate, eras = rig.plate, [era.name for era in rig.eras]
-    none = np.zeros(0)
-    space = Space((), none, none, none, {})
-
-    def add(
-        kind: str,
-        names: Sequence[str],
-        std: Number | None = None,
-        *,
-        lower: ArrayLike = -np.inf,
-        upper: ArrayLike = np.inf,
-    ) -> None:
-        nonlocal space
-        space = space.and_further(kind, names, std, lower, upper)
-
-    add("thickness", ["thickness"], uncertainty.thickness)
-    modulus = max(KINDS["modulus"].std, uncertainty.modulus)
-    add("modulus", ["modulus"], modulus * (uncertainty.thickness > 0))
-    add("stiffness", [f"stiffness {name}" for name in eras], uncertainty.stiffness)
+    plate, eras, has_form = rig.plate, [era.name for era in rig.eras], form_of is not None
+    excites = np.array(["force_factor" in era.fields for era in rig.eras])
+    drives = eras if excites.any() else []
+    cells, modes = range(MASS_CELLS.cell_count), range(1, mode_count + 1)
+    names: dict[str, Sequence[str]] = {
+        "thickness": ["thickness"],
+        "modulus": ["modulus"],
+        "stiffness": [f"stiffness {name}" for name in eras],
+        "damping": ["damping"],
+        "damping_each": [f"damping {name}" for name in eras],
+        "damping_added": [f"further damping {name}" for name in eras],
+        "loss": ["loss factor"],
+        "loss_added": ["further loss factor"],
+        "loss_exponent": ["loss exponent"],
+        "gain": [f"gain {name}" for name in eras],
+        "phase": [f"phase {name}" for name in eras],
+        "inertia": [f"inertia of drive {name}" for name in eras],
+        "drag": [f"drag of drive {name}" for name in eras],
+        "delay": [f"delay of amplifier {name}" for name in amplifiers],
+        "sensor_gain": [f"gain of sensor {name}" for name in sensors],
+        "sensor_phase": [f"phase of sensor {name}" for name in sensors],
+        "bolt_mass": [f"bolt mass {name}" for name in eras],
+        "magnet_mass": [f"magnet mass {name}" for name in drives],
+        "force_factor": [f"force factor {name}" for name in drives],
+        "place": [f"{axis} of {name}" for name in eras for axis in "xy"],
+        "masses": [f"{of}mass {n}" for n in range(1, masses + 1) for of in ("", "x of ", "y of ")],
+        "mode_shifts": [f"stiffness of mode {number}" for number in modes],
+        "mode_losses": [f"loss of mode {number}" for number in modes],
+        "supports": [f"stiffness of foot {name}" for name in rig.foot_names],
+        "fingers": [],
+        "sensor_scale": [f"scale of sensor {name}" for name in sensors if has_form],
+        "sensor_place": [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"],
+        "foreign_mass": [f"mass {n}" for n in cells if has_form],
+        "side": ["length", "width"] if has_form else [],
+        "poisson": ["Poisson's ratio"] if has_form else [],
+        "loss_law": ["loss law"] if has_form else [],
+    }
     damping = math.log(uncertainty.damping)
-    damped = [float(damping > 0 and era.damping > 0) for era in rig.eras]
-    add("damping", ["damping"], damping * max(damped))
-    add(
-        "damping_each",
-        [f"damping {name}" for name in eras],
-        KINDS["damping_each"].std * np.array(damped),
-    )
-    add("damping_added", [f"further damping {name}" for name in eras])
+    damped = (damping > 0) * np.array([float(era.damping > 0) for era in rig.eras])
     lossy = float(damping > 0 and plate.loss_factor > 0)
-    add("loss", ["loss factor"], damping * lossy)
-    add("loss_added", ["further loss factor"])
-    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
-    exponent = KINDS["loss_exponent"].std
-    low, high = exponents / exponent
-    add("loss_exponent", ["loss exponent"], exponent * lossy, lower=low, upper=high)
-    add("gain", [f"gain {name}" for name in eras], uncertainty.gain)
-    add("phase", [f"phase {name}" for name in eras], math.radians(uncertainty.phase_deg))
     # A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
-    lagging = np.array(
-        [
-            float(drives_lag and not era.gains and "force_factor" not in era.fields)
-            for era in rig.eras
-        ]
-    )
-    for kind in ("inertia", "drag"):
-        std = KINDS[kind].std * lagging
-        add(kind, [f"{kind} of drive {name}" for name in eras], std, lower=0.0)
-    # Only differences count: those to the first.
-    delays = np.array([KINDS["delay"].std * (number > 0) for number in range(len(amplifiers))])
-    add("delay", [f"delay of amplifier {name}" for name in amplifiers], delays)
-    add("sensor_gain", [f"gain of sensor {name}" for name in sensors])
-    add("sensor_phase", [f"phase of sensor {name}" for name in sensors])
-    least = np.array([-getattr(era, era.fields["bolt_mass"]) for era in rig.eras])
-    least /= KINDS["bolt_mass"].std
-    add("bolt_mass", [f"bolt mass {name}" for name in eras], lower=least)
-    for kind in EXCITER_KINDS:
-        excites = np.array([float(kind in era.fields) for era in rig.eras])
-        names = [f"{kind.replace('_', ' ')} {name}" for name in eras if excites.any()]
-        add(kind, names, uncertainty.stiffness * excites[: len(names)])
+    lagging = drives_lag & ~excites & [not era.gains for era in rig.eras]
     sides = np.array([plate.length, plate.width])
     places = np.array([(era.x, era.y) for era in rig.eras])
-    add(
-        "place",
-        [f"{axis} of {name}" for name in eras for axis in "xy"],
-        lower=(-places / KINDS["place"].std).ravel(),
-        upper=((sides - places) / KINDS["place"].std).ravel(),
-    )
-    # About the middle of the plate.
-    add(
-        "masses",
-        [f"{of}mass {n}" for n in range(1, masses + 1) for of in ("", "x of ", "y of ")],
-        np.tile([KINDS["masses"].std, *sides / 3], masses),
-        lower=np.tile([0.0, -1.5, -1.5], masses),
-        upper=np.tile([np.inf, 1.5, 1.5], masses),
-    )
-    modes = range(1, mode_count + 1)
-    add("mode_shifts", [f"stiffness of mode {number}" for number in modes])
-    of_mode = KINDS["mode_losses"].std * lossy
-    add("mode_losses", [f"loss of mode {number}" for number in modes], of_mode)
-    feet = [f"stiffness of foot {name}" for name in rig.foot_names]
-    add("supports", feet, uncertainty.supports)
-    add("fingers", [])
-    has_form = form_of is not None
-    add("sensor_scale", [f"scale of sensor {name}" for name in sensors if has_form])
-    add("sensor_place", [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"])
-    add("foreign_mass", [f"mass {n}" for n in range(MASS_CELLS.cell_count) if has_form])
-    add("side", ["length", "width"] if has_form else [])
-    add("poisson", ["Poisson's ratio"] if has_form else [])
-    add("loss_law", ["loss law"] if has_form else [])
+    std: dict[str, Number] = {
+        "thickness": uncertainty.thickness,
+        "modulus": max(KINDS["modulus"].std, uncertainty.modulus) * (uncertainty.thickness > 0),
+        "stiffness": uncertainty.stiffness,
+        "damping": damping * damped.max(),
+        "damping_each": KINDS["damping_each"].std * damped,
+        "loss": damping * lossy,
+        "loss_exponent": KINDS["loss_exponent"].std * lossy,
+        "gain": uncertainty.gain,
+        "phase": math.radians(uncertainty.phase_deg),
+        "inertia": np.where(lagging, KINDS["inertia"].std, 0.0),
+        "drag": np.where(lagging, KINDS["drag"].std, 0.0),
+        # Only differences count: those to the first.
+        "delay": np.where(np.arange(len(amplifiers)) > 0, KINDS["delay"].std, 0.0),
+        "magnet_mass": uncertainty.stiffness * excites[: len(drives)],
+        "force_factor": uncertainty.stiffness * excites[: len(drives)],
+        # About the middle of the plate.
+        "masses": np.tile([KINDS["masses"].std, *sides / 3], masses),
+        "mode_losses": KINDS["mode_losses"].std * lossy,
+        "supports": uncertainty.supports,
+    }
+    least = np.array([-getattr(era, era.fields["bolt_mass"]) for era in rig.eras])
+    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
+    bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
+        "loss_exponent": tuple(exponents / KINDS["loss_exponent"].std),
+        "inertia": (0.0, np.inf),
+        "drag": (0.0, np.inf),
+        "bolt_mass": (least / KINDS["bolt_mass"].std, np.inf),
+        "place": (
+            (-places / KINDS["place"].std).ravel(),
+            ((sides - places) / KINDS["place"].std).ravel(),
+        ),
+        "masses": (np.tile([0.0, -1.5, -1.5], masses), np.tile([np.inf, 1.5, 1.5], masses)),
+    }
+    space = Space((), np.zeros(0), np.zeros(0), np.zeros(0), {})
+    for kind, own in names.items():
+        limits = bounds.get(kind, (-np.inf, np.inf))
+        space = space.and_further(kind, own, std.get(kind), *limits)
     return space
 
 

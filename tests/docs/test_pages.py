@@ -674,6 +674,7 @@ def test_every_page_can_be_found() -> None:
     assert names - listed == {"index"}
 
 
+@pytest.mark.long
 def test_the_search_finds_pages_and_no_decision(tmp_path: Path) -> None:
     """A word of a page is in the index of the built pages, one of a decision is not."""
     pytest.importorskip("sphinx", reason="`make docs` installs what builds the pages")

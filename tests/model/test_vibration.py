@@ -126,7 +126,8 @@ def test_places_and_feet_count_more_than_the_mesh(study):
     assert (study.by_place > 5 * study.errors[-1].response).all()
 
 
-@pytest.mark.parametrize(("count", "free"), [pytest.param(1, 2, marks=pytest.mark.long), (2, 1)])
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "free"), [(1, 2), (2, 1)])
 def test_unsupported_motion_is_not_compared(count, free):
     """On one ERA the plate can tilt both ways, on two about their line: 0 Hz has no error."""
     rig = make_paper_rig(12, 9)

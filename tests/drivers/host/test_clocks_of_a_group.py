@@ -551,7 +551,8 @@ def test_clocks_are_held_when_a_group_is_armed(
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed", "bound"), [("usb-full-speed", 2, 17e-6), ("ftdi", 0, 105e-6)]
+    ("kind", "seed", "bound"),
+    [pytest.param("usb-full-speed", 2, 17e-6, marks=pytest.mark.long), ("ftdi", 0, 105e-6)],
 )
 def test_frames_of_full_speed_are_read_at_all_phases(kind: str, seed: int, bound: float) -> None:
     """In step with frames of 1 ms readings would show one phase of them: 290 us rms on each line.

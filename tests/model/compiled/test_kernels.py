@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import model.compiled
-from long_form import shortly
 from model.compiled import kernels as library_cache
 from model.compiled.kernels import (
     Version,
@@ -29,7 +28,8 @@ RUNNABLE = [each for each in versions() if each.features.keys() <= processor_fea
 SANITIZERS = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
-@pytest.mark.parametrize("version", shortly(RUNNABLE, RUNNABLE[:1]), ids=lambda each: each.name)
+@pytest.mark.long
+@pytest.mark.parametrize("version", RUNNABLE, ids=lambda each: each.name)
 def test_knots_are_within_the_stroke_and_their_memory(version: Version, tmp_path: Path) -> None:
     """Of 28 random tones, huge, silent and undefined ones too, and without memory for one.
 

@@ -386,7 +386,12 @@ def test_percentile_is_that_of_numpy():
     ("known", "percent", "expected"),
     [
         (Uncertainty(), 10, (16.1, 12.5, 9.5)),
-        (replace(Uncertainty.none(), gain=0.01, phase_deg=1.0), 50, (33.0, 18.0, 14.5)),
+        pytest.param(
+            replace(Uncertainty.none(), gain=0.01, phase_deg=1.0),
+            50,
+            (33.0, 18.0, 14.5),
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_answers_reach_what_an_independent_optimum_does(known, percent, expected):

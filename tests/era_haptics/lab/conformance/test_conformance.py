@@ -343,7 +343,7 @@ SLOW = {
 }
 
 
-@pytest.mark.parametrize("kind", SLOW)
+@pytest.mark.parametrize("kind", shortly(SLOW, ["tcp"]))
 def test_slow_line_has_its_verdicts(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """At 40 ms each way and back: times are long against it, and what comes late is heard."""
     monkeypatch.setattr("virtual_lines.DELAY", 0.02)
@@ -402,7 +402,7 @@ TIMED = ["obeys_in_time", "watchdog", "valid_for", "after", "ramps", "onsets", "
 
 
 @pytest.mark.parametrize("names", shortly([[], TIMED], [TIMED]))
-@pytest.mark.parametrize("kind", ["serial", "tcp"])
+@pytest.mark.parametrize("kind", shortly(["serial", "tcp"], ["tcp"]))
 def test_amplifier_that_replies_just_in_time_passes(
     kind: str, names: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -485,7 +485,8 @@ class _Unsteered(SimulatedAmplifier):
         return super().handle(name, {**values, "rate": 0} if name == "Ping" else values, now)
 
 
-@pytest.mark.parametrize("kind", shortly(["can", "rtu"], ["rtu"]))
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["can", "rtu"])
 def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -498,7 +499,10 @@ def test_rate_of_a_clock_is_tried_on_a_slow_wire(
     assert [each.result for (each,) in found] == ["passed", "failed"], found
 
 
-@pytest.mark.parametrize(("name", "count"), [("doubled_frames", 22), ("events", 15)])
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("doubled_frames", 22), pytest.param("events", 15, marks=pytest.mark.long)],
+)
 def test_message_that_is_held_is_no_violation(
     name: str, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -790,7 +794,7 @@ def garbled(kind: str, rng: random.Random, data: bytes) -> bytes:
     return rng.randbytes(rng.randrange(300))
 
 
-@pytest.mark.parametrize("kind", JUDGED_LINE_KINDS)
+@pytest.mark.parametrize("kind", shortly(JUDGED_LINE_KINDS, ["serial", "can"]))
 @pytest.mark.parametrize("share", shortly([0.003, 0.03, 0.3, 1.0], [0.3]))
 def test_garbage_has_a_verdict(kind: str, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """In place of a share of all replies: every check has a result, and the whole has failed."""

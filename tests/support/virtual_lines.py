@@ -789,7 +789,10 @@ def varied(channels: int = 4) -> SimulatedAmplifier:
     return far
 
 
-_OF_EVERY_WIRE = {"lengths", "parts_of_sets", "doubled_frames", "achieved"}
+_OF_EVERY_WIRE = {
+    *("achieved", "addresses", "broadcasts", "damaged_frames", "doubled_frames", "identity"),
+    *("lengths", "max_set", "parts_of_sets", "parts_that_are_dropped", "sessions"),
+}
 
 
 def short_checks(kind: str) -> list[str]:

@@ -148,7 +148,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
         number
         for number, era in enumerate(calibration.rig.eras)
         if era.name not in calibration.dead_eras
-        and np.isfinite(calibration.measured[:, number]).any()
+        and np.isfinite(calibration.measured[:, :, number]).any()
     ][:4]
     sensors = np.linspace(0, len(calibration.sensors) - 1, _ROWS).round().astype(int)
     figure = Figure(figsize=(3.2 * len(eras), 2.6 * _ROWS + 0.6), layout="constrained")
@@ -162,7 +162,7 @@ def calibration_figure(calibration: Calibration) -> Figure:
                 ("calibrated", calibration.after, {"color": "C0", "linewidth": 1.4}),
                 ("measured", calibration.measured, {"color": "C3", "marker": ".", "ls": "none"}),
             ):
-                magnitude = size * np.abs(values[:, era, sensor])
+                magnitude = size * np.abs(values[:, sensor, era])
                 axis.semilogy(calibration.frequencies, magnitude, label=label, **style)
             axis.set_title(
                 f"{calibration.rig.eras[era].name} to {calibration.sensors[sensor]}", fontsize=9

@@ -1,38 +1,39 @@
 """Calibration of a rig: fit it to measured responses, check it at held-out sensors, and report it.
 
+    d_fsn = g_fn a_fsn(x) + noise
+
+d are measured values at frequency f of sensor s and ERA n, a those of the model as sensors of some
+scales read them, g a complex gain of every frequency and ERA. x has the values of the rig and the
+plate's form errors, in standard deviations of what data sheets and tolerances leave.
+
 Dead channels and outliers are left out. The rig of a fit has what a rig file can express, and
 states how well it is then known.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.arrays import ComplexArray, FloatArray, best_of
+from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
-from model.estimate.calibration_fit import (
-    CalibrationFit,
-    CalibrationProblem,
-    Parameter,
-    clear,
-    project_gains,
-    responses_of,
-    row_rms,
-    sensed_plate,
-    solve,
-    start_at,
-    without_form,
-)
-from model.estimate.fit import relative_rms
+from model.estimate.calibration_fit import Parameter, SensedPlate, sensed_plate
+from model.estimate.fit import Fit, best_gains, fit, fit_to_noise, noise_of, row_rms
+from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
-from model.estimate.measurement import LEAST_SENSORS, Responses, Screening, check_enough_sensors
-from model.estimate.space import KINDS, MASS_CELLS
+from model.estimate.measurement import (
+    LEAST_SENSORS,
+    Measurement,
+    Responses,
+    Screening,
+    check_enough_sensors,
+)
+from model.estimate.space import FORM, KINDS, MASS_CELLS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
@@ -54,8 +55,13 @@ _LEAST = 1e-4  # of an uncertainty; no fit is exact
 _MODEL_ERROR, _LOSS_ERROR = 2e-3, 4e-3
 _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # of the plate's
 
+_UNKNOWN = 100.0  # standard deviations of what no prior holds
+_AT_BOUND = 1e-6  # standard deviations
+_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
+_ROUNDS = 8  # in which outliers are found
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
+_CLEAR = 3.0  # standard errors of a clear deviation
 _MAX_GAIN = 5.0  # of a drive at a frequency relative to its median, either way
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
 
@@ -80,28 +86,6 @@ class FittedParameter:
 
 
 @dataclass(frozen=True)
-class SensorScale:
-    """Scale of a sensor relative to the others' median, and its standard error."""
-
-    name: str
-    scale: float
-    standard_error: float
-
-
-@dataclass(frozen=True)
-class MovedEra:
-    """An ERA that is clearly not at the rig's place."""
-
-    name: str
-    before: tuple[float, float]
-    """Place in the rig x, y [m]."""
-    after: tuple[float, float]
-    """Fitted place x, y [m]."""
-    standard_error: tuple[float, float]
-    """Standard errors of x and y [m]."""
-
-
-@dataclass(frozen=True)
 class HeldOutSensors:
     """Prediction at sensors held out of the fit.
 
@@ -122,36 +106,18 @@ class HeldOutSensors:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibrated rig with all findings about the measurement."""
+    """A rig that was fitted to a measurement, and what is found about both."""
 
-    rig: Rig
-    parameters: tuple[FittedParameter, ...]
-    moved: tuple[MovedEra, ...]
-    """ERAs that are clearly at other places than in the rig before."""
-    gains_error: FloatArray
-    """Standard errors of the rig's gains (f, eras), NaN where not measured."""
+    plate: SensedPlate
+    """The plate of the rig as it was, at the sensors of the fit."""
+    fit: Fit
+    """The fit with form errors to the sensors with a signal."""
+    prior: tuple[FloatArray, FloatArray]
+    """What is known of the parameters beforehand: mean (p,) and covariance (p, p)."""
     dead_sensors: tuple[str, ...]
     """Sensors left out of the fit, without a signal."""
     dead_eras: tuple[str, ...]
     """ERAs left out of the fit, which do not move the plate."""
-    scales: tuple[SensorScale, ...]
-    """Scales of the sensors where they are wrong, or of all sensors if requested."""
-    outlier_count: int
-    value_count: int
-    error: float
-    """Error of the fit with its form errors, relative as in `HeldOutSensors`."""
-    chi2: float
-    """chi² of that fit, about 1."""
-    held_out: HeldOutSensors | None
-    """Check at held-out sensors, None with too few of them."""
-    sensors: tuple[str, ...]
-    frequencies: FloatArray
-    measured: ComplexArray
-    """Measured responses (f, eras, s) [1/s²] of the live sensors, divided by their scales."""
-    before: ComplexArray
-    """Responses of the rig before."""
-    after: ComplexArray
-    """Responses of the fitted rig."""
 
     def to_frame(self) -> Any:
         """Parameters before and after, their units and errors, as a pandas DataFrame.
@@ -173,6 +139,397 @@ class Calibration:
         """Whether the fit predicts held-out sensors; False where there are none."""
         return self.held_out is not None and self.held_out.after <= MAX_FIT_ERROR
 
+    @cached_property
+    def rig(self) -> Rig:
+        """The calibrated rig: without form errors, with its gains and its uncertainty."""
+        rig = self._fitted
+        eras = tuple(
+            replace(era, gains=_stated_gains(gains, self.frequencies) or era.gains)
+            for era, gains in zip(rig.eras, self._gains.T, strict=True)
+        )
+        return replace(rig, eras=eras, uncertainty=self._uncertainty)
+
+    @cached_property
+    def parameters(self) -> tuple[FittedParameter, ...]:
+        """The fitted values, with the errors of the fit, of the model and of the whole mass.
+
+        All that is fitted but losses scales with the whole mass, which no response tells.
+        """
+        plate, x, space = self.plate, self.fit.x, self.plate.model.space
+        sides = KINDS["side"].std / np.array([plate.rig.plate.length, plate.rig.plate.width])
+        of_mass = math.hypot(_FOREIGN_MASS, *sides)
+        distance = np.abs(np.array([space.lower, space.upper]) - x).min(axis=0)
+        found = []
+        for number, row, value, error in zip(
+            plate.numbers,
+            plate.rows,
+            plate.values(x),
+            plate.errors(x, self.fit.errors),
+            strict=True,
+        ):
+            is_loss = row.kind == "loss_factor"
+            share = self._loss_error if is_loss else math.hypot(_MODEL_ERROR, of_mass)
+            whole = math.hypot(float(error), share * float(value))
+            is_free = bool(self.fit.searched[number])
+            found.append(
+                FittedParameter(
+                    row,
+                    row.of(plate.rig),
+                    float(value),
+                    whole if is_free else None,
+                    is_free and bool(distance[number] < _AT_BOUND),
+                )
+            )
+        return tuple(found)
+
+    @property
+    def moved(self) -> dict[str, tuple[Point, Point]]:
+        """Places x, y [m] of the ERAs that clearly are not at the rig's, and standard errors."""
+        errors = self.plate.model.space.values(self.fit.errors, "place").reshape(-1, 2)
+        return {
+            era.name: ((era.x, era.y), (float(error[0]), float(error[1])))
+            for era, before, error in zip(
+                self._fitted.eras, self.plate.rig.eras, errors, strict=True
+            )
+            if (era.x, era.y) != (before.x, before.y)
+        }
+
+    @cached_property
+    def gains_error(self) -> FloatArray:
+        """Standard errors of the rig's gains (f, eras), NaN where not measured."""
+        slopes, of_noise = self._gain_changes
+        variance = _variances(slopes.real, self._covariance(self.fit.searched))
+        size = np.abs(self.gains_of_fit)
+        own = size * np.sqrt(of_noise + variance)
+        return np.asarray(np.hypot(own, np.abs(self._gains) - size))
+
+    @property
+    def scales(self) -> dict[str, tuple[float, float]]:
+        """Scale and standard error of sensors where it is wrong, or of all if requested.
+
+        Relative to the median of the others.
+        """
+        errors = self.plate.model.space.values(self.fit.errors, "sensor_scale").tolist()
+        rows = zip(self.sensors, self.sensor_scales.tolist(), errors, self.is_rescaled, strict=True)
+        return {name: (scale, error) for name, scale, error, is_free in rows if is_free}
+
+    @property
+    def outlier_count(self) -> int:
+        """Number of measured values left out of the fit."""
+        return self.value_count - int(self.fit.measurement.known.sum())
+
+    @property
+    def value_count(self) -> int:
+        """Number of measured values."""
+        return int(np.isfinite(self.fit.measurement.values).sum())
+
+    @property
+    def error(self) -> float:
+        """Error of the fit with its form errors, relative as in `HeldOutSensors`."""
+        return self._relative_error(self.fit.predicted, self.fit.measurement.known)
+
+    @property
+    def chi2(self) -> float:
+        """chi² of the fit by degree of freedom, about 1."""
+        return self.fit.chi2
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors with a signal (s,)."""
+        return tuple(sensor.name for sensor in self.fit.measurement.sensors)
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Frequencies of the measurement (f,) [Hz]."""
+        return self.plate.model.frequencies
+
+    @property
+    def measured(self) -> ComplexArray:
+        """Measured responses (f, s, eras) [1/s²], divided by the scales of the sensors."""
+        return np.asarray(self.fit.measurement.values / self.sensor_scales[:, None])
+
+    @property
+    def before(self) -> ComplexArray:
+        """Responses of the rig as it was (f, s, eras) [1/s²]."""
+        gains = np.array([era.gain(self.frequencies) for era in self.plate.rig.eras]).T
+        return np.asarray(gains[:, None] * self.plate.at_sensors())
+
+    @property
+    def after(self) -> ComplexArray:
+        """Responses of the calibrated rig (f, s, eras) [1/s²]."""
+        return np.asarray(self._gains[:, None] * self._fields)
+
+    @cached_property
+    def held_out(self) -> HeldOutSensors | None:
+        """Fit without some of the sensors of known scale, and predict their responses.
+
+        The prediction is that of the rig as its file has it, without other form errors. None where
+        too few sensors are left to fit.
+        """
+        count, space = len(self.sensors), self.plate.model.space
+        candidates = np.flatnonzero(~self.is_rescaled | self.is_rescaled.all())
+        wanted = max(round(count / HELD_OUT_FOLDS), 1)
+        if count - wanted < LEAST_SENSORS or len(candidates) <= wanted:
+            return None
+        evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
+        unseen = np.zeros(count, dtype=bool)
+        unseen[candidates[evenly_spaced]] = True
+        searched = self.fit.searched.copy()
+        searched[space.groups["sensor_scale"]] &= ~unseen
+        searched[space.groups["sensor_place"]] &= np.repeat(~unseen, 2)
+        seen = self.fit.measurement.part(~unseen[:, None])
+        part = replace(self, fit=replace(self.fit, measurement=seen))
+        part = part.fitted_again(searched, self.fit.x)
+        scales, which = self.sensor_scales[:, None], self.fit.measurement.known & unseen[:, None]
+        measured, predicted = self.fit.measurement.values, part.after * scales
+        size = row_rms(measured)
+        error = np.abs(predicted - measured) / size
+        own = space.of("sensor_scale", "sensor_place")
+        read = jacobian(self.plate.model.at(self.fit.x), own)[..., own]
+        variance = (np.abs(part._gains[:, None, :, None] * read) ** 2).sum(axis=-1)
+        variance = variance + 2 * self.fit.measurement.std**2
+        left = np.median(error[which] ** 2) - np.median((variance / size**2)[which])
+        return HeldOutSensors(
+            tuple(compress(self.sensors, unseen)),
+            self._relative_error(self.before * scales, np.isfinite(measured) & unseen[:, None]),
+            self._relative_error(predicted, which),
+            float(np.median(error[which])),
+            math.sqrt(max(left, 0.0) / math.log(2)),  # the median of |z|² is log 2 of its mean
+        )
+
+    @property
+    def sensor_scales(self) -> FloatArray:
+        """Scales of all sensors (s,), of unknown ones relative to their median."""
+        scales = 1 + self.plate.model.space.values(self.fit.x, "sensor_scale")
+        return scales / self._common_scale
+
+    @property
+    def is_rescaled(self) -> NDArray[np.bool_]:
+        """Mask of the sensors whose scale no tolerance holds (s,)."""
+        own = self.plate.model.space.groups["sensor_scale"]
+        return np.asarray(self.prior[1].diagonal()[own] > 1)
+
+    @property
+    def gains_of_fit(self) -> ComplexArray:
+        """Gains of the fit with form errors (f, eras), NaN where not measured."""
+        return self.fit.gains * self._common_scale
+
+    def fitted_again(self, searched: NDArray[np.bool_], start: FloatArray) -> "Calibration":
+        """Fit the parameters of a mask (p,) from a start (p,) of all of them."""
+        model, measurement = self.plate.model, self.fit.measurement
+        found = fit_to_noise(model, measurement, searched=searched, start=start, prior=self.prior)
+        return replace(self, fit=found)
+
+    @property
+    def _common_scale(self) -> float:
+        """Median of the scales where all are unknown: responses do not tell it from the gains."""
+        scales = 1 + self.plate.model.space.values(self.fit.x, "sensor_scale")
+        return float(np.median(scales)) if self.is_rescaled.all() else 1.0
+
+    def _relative_error(self, predicted: ComplexArray, which: NDArray[np.bool_]) -> float:
+        """Rms error at the values of a mask, relative to rows' rms; infinite for an empty mask."""
+        values = self.fit.measurement.values
+        error = np.abs(predicted - values) / row_rms(values)
+        return _rms(error[which]) if which.any() else math.inf
+
+    @cached_property
+    def is_clear(self) -> NDArray[np.bool_]:
+        """Mask of the parameters that deviate by several standard errors (p,)."""
+        return np.asarray(np.abs(self.fit.x) > _CLEAR * self.fit.errors)
+
+    @cached_property
+    def _plain(self) -> Fit:
+        """The fit of the plate without form errors, which a rig file does not have.
+
+        Form errors count as noise; their likeness to another modulus or loss factor returns to
+        these, as that of a longer side. ERAs stay where they clearly are.
+        """
+        space, x = self.plate.model.space, self.fit.x.copy()
+        mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
+        form = space.of(*FORM, "mode_shifts") & ~mine
+        x[form | (space.of("place") & ~self.is_clear)] = 0.0
+        searched, measurement = self.fit.searched & mine, self.fit.measurement
+        return fit(self.plate.model, measurement, searched=searched, start=x, prior=self.prior)
+
+    @cached_property
+    def _fitted(self) -> Rig:
+        """The rig without form errors, its ERAs where they clearly are, with the gains before."""
+        rig, space = self.plate.rig_at(self._plain.x), self.plate.model.space
+        off = space.values(np.where(self.is_clear, self.fit.x, 0.0), "place").reshape(-1, 2)
+        sides = [rig.plate.length, rig.plate.width]
+        places = np.clip(np.array([(era.x, era.y) for era in rig.eras]) + off, 0, sides)
+        eras = zip(rig.eras, places.tolist(), strict=True)
+        return replace(rig, eras=tuple(replace(era, x=x, y=y) for era, (x, y) in eras))
+
+    @cached_property
+    def _fields(self) -> ComplexArray:
+        """Responses of the rig without form errors and gains (f, s, eras) [1/s²]."""
+        before = self.plate.model
+        model = replace(before, form=None, law=None, last_places={})
+        return replace(self.plate, model=model).of(self._fitted).at_sensors()
+
+    @cached_property
+    def _gains(self) -> ComplexArray:
+        """Gains of these responses that fit best (f, eras), NaN where not measured."""
+        return _gains_of(self._fields * self.sensor_scales[:, None], self.fit.measurement)
+
+    def _covariance(self, which: NDArray[np.bool_]) -> FloatArray:
+        """Covariance of the parameters of a mask (p,)."""
+        return np.asarray(self.fit.covariance[np.ix_(which, which)])
+
+    @cached_property
+    def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
+        """Relative changes of the gains by what is searched (f, eras, q); variances by noise."""
+        fit, space = self.fit, self.plate.model.space
+        power = (np.abs(self.fit.measurement.weight * fit.predicted) ** 2).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = fit.gain_slopes / fit.gains[..., None]
+            of_noise = np.where(power > 0, max(fit.chi2, 1.0) / power, np.nan)
+        # A force factor is found with the gain: their product is what moves the plate.
+        numbers = np.flatnonzero(fit.searched)
+        for era, factor in enumerate(space.indices("force_factor")):
+            slopes[:, era, numbers == factor] += space.std[factor]
+        return slopes, of_noise
+
+    @cached_property
+    def _readings_errors(self) -> tuple[FloatArray, FloatArray, float]:
+        """Errors of fields as sensors read them: relative magnitudes and phases [rad] (f, eras).
+
+        The third is the error that the magnitudes of all fields have in common. What else is
+        searched changes gain and field the opposite ways: sensors read their product.
+        """
+        slopes, of_noise = self._gain_changes
+        reads = self.plate.model.space.of("sensor_scale", "sensor_place") & self.fit.searched
+        covariance, slopes = self._covariance(reads), slopes[..., reads[self.fit.searched]]
+        common = np.nanmean(slopes, axis=(0, 1))
+        beside = slopes - common
+        magnitude, phase = (
+            np.sqrt(of_noise + _variances(part, covariance)) for part in (beside.real, beside.imag)
+        )
+        return magnitude, phase, math.sqrt(common.real @ covariance @ common.real)
+
+    @cached_property
+    def _loss_error(self) -> float:
+        """Relative error of the loss factor by the model: its own, and by that of all dampers."""
+        plate, kinds = self.plate, np.array([row.kind for row in self.plate.rows])
+        values = plate.values(self.fit.x) / plate.model.space.scale[plate.numbers]
+        size = np.where(values > 0, values, np.inf)
+        covariance = self.fit.covariance[np.ix_(plate.numbers, plate.numbers)]
+        relative = covariance / np.outer(size, size)
+        dampers = (kinds == "damping") & self.fit.searched[plate.numbers]
+        by_dampers = relative[dampers][:, kinds == "loss_factor"].sum(axis=1)
+        slopes = np.linalg.lstsq(relative[np.ix_(dampers, dampers)], by_dampers)[0]
+        return math.hypot(_LOSS_ERROR, _MODEL_ERROR * float(slopes.sum()))
+
+    @cached_property
+    def _uncertainty(self) -> Uncertainty:
+        """Uncertainty of the calibrated rig, for its file.
+
+        It excludes the error of the whole mass, with which all values scale and no pattern changes.
+        Thickness stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness
+        does. What is not identified keeps the value of the rig before.
+        """
+        before, x = self.plate.rig.uncertainty, self.fit.x
+        # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
+        coils = [row for row in self.plate.of_exciters if row.kind == "damping"]
+        errors = self.plate.errors(x, self.fit.errors).tolist()
+
+        def relative(kind: str, theory: float = _MODEL_ERROR) -> float | None:
+            """Rms error of the values of a kind, None where one is not identified."""
+            of_kind = [
+                (one, error)
+                for one, error in zip(self.parameters, errors, strict=True)
+                if one.parameter.kind == kind and one.parameter not in coils
+            ]
+            if not all(one.is_identified for one, _ in of_kind):
+                return None
+            shares = [math.hypot(e / one.value, theory) for one, e in of_kind if one.value > 0]
+            return _rms(shares or [0.0])
+
+        fitted = {"place": self._place_error} | self._field_errors
+        if (stiffness := relative("stiffness")) is not None:
+            fitted["stiffness"] = stiffness
+        losses = relative("loss_factor", self._loss_error), relative("damping")
+        if losses[0] is not None and losses[1] is not None:
+            fitted["damping"] = math.expm1(max(losses[0], losses[1]))
+        feet = [
+            error / one.value if one.is_identified else before.supports
+            for one, error in zip(self.parameters, errors, strict=True)
+            if one.parameter.foot
+        ]
+        if feet:
+            fitted["supports"] = math.hypot(_rms(feet), _MODEL_ERROR)
+        # An error is hardly known better than to two digits.
+        fitted = {key: float(f"{value:.2g}") for key, value in fitted.items()}
+        if "damping" in fitted:
+            fitted["damping"] += 1
+        if self.parameters[0].is_identified:
+            # The rig's modulus is that of frequencies with form errors, whatever part is theirs.
+            plain, value = self._plain, self.plate.values(self._plain.x)[0]
+            of_plain = self.plate.errors(plain.x, plain.errors)[0]
+            of_modulus = math.hypot(of_plain / value, _MODEL_ERROR)
+            fitted |= Uncertainty.of_frequency(float(f"{of_modulus / 2:.2g}"))
+        return Uncertainty.clipped(**asdict(before) | fitted)
+
+    @property
+    def _field_errors(self) -> dict[str, float]:
+        """Errors of gains and fields by keys of an uncertainty, none where an ERA has no gain.
+
+        Field is the part of the fit's fields that the rig lacks, since it cannot express form
+        errors, and at least what held-out sensors leave unexplained. Gain and phase are those of
+        the best gains for such fields, as the sensors read them: other errors move gains and fields
+        in opposite directions.
+        """
+        magnitude, phase, common = self._readings_errors
+        lacking = self._lacking
+        known = np.isfinite(magnitude) & np.isfinite(lacking)
+        if not known.any(axis=0).all():
+            return {}
+        left = self.held_out.unexplained if self.held_out else 0.0
+        field = max(_rms(lacking[known]), left)
+        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
+        # and stiffness that are off change a field in phase with it.
+        off = field / np.sqrt(self.fit.measurement.known.sum(axis=1)[known])
+        gain = _rms(np.hypot(off, magnitude[known]))
+        turned = _rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
+        return {
+            "gain": max(gain, _LEAST),
+            "phase_deg": math.degrees(max(turned, _LEAST)),
+            "field": field,
+            "common_gain": common,
+        }
+
+    @property
+    def _lacking(self) -> FloatArray:
+        """Part of the fit's responses that its rig lacks, relative (f, eras).
+
+        ERAs stay at the places of the fit, since a rig states the errors of places.
+        """
+        at_places = np.where(self.plate.model.space.of("place"), self.fit.x, self._plain.x)
+        model, known = self.plate.at_sensors(at_places), self.fit.measurement.known
+        lacks = _gains_of(model, self.fit.measurement)[:, None] * model - self.fit.predicted
+        squares, all_squares = (
+            np.where(known, np.abs(each) ** 2, 0.0).sum(axis=1)
+            for each in (lacks, self.fit.predicted)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.sqrt(squares / all_squares))
+
+    @property
+    def _place_error(self) -> float:
+        """Root mean square error of the places of ERAs in the rig, along a side [m].
+
+        Where the fit does not clearly have another place, the error of the kept one counts; the
+        error of the rig before counts where the data determine a place less than its prior does.
+        """
+        space, kind = self.plate.model.space, KINDS["place"]
+        kept = space.values(np.where(self.is_clear, 0.0, self.fit.x), "place")
+        error = space.values(self.fit.errors, "place")
+        by_data = error < math.sqrt(0.5) * kind.std
+        before = self.plate.rig.uncertainty.place
+        of_each = np.where(by_data, np.hypot(np.hypot(kept, error), kind.theory), before)
+        return _rms(of_each)
+
 
 def calibrate(
     rig: Rig,
@@ -188,105 +545,149 @@ def calibrate(
     the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
     of another size, for gains that no drive has, and for suspensions or feet at a bound.
     """
-    dead, dead_eras = screened.dead_sensors.copy(), screened.dead_eras
-    while True:
-        check_enough_sensors(~dead, responses)
-        live = responses.without(dead)
-        values = live.values.copy()
-        values[:, dead_eras] = np.nan
-        plate = sensed_plate(rig, live.points, live.frequencies, masses=live.masses, has_form=True)
-        part, z = CalibrationProblem.of(plate, values), np.zeros(plate.model.space.size)
-        z[plate.numbers] = screened.start
-        z, noise, used = start_at(part, z)
-        heard = used.sum(axis=(0, 1)) > np.isfinite(values).sum(axis=(0, 1)) / 2
-        if heard.all():
-            break
-        dead[~dead] = ~heard  # elsewhere, or loose
-
-    # All scales are free at first, so that a wrong one does not bias the fit.
-    fit = _with_median_scale_one(part, solve(part, z, noise, used))
+    # All scales are unknown at first, so that a wrong one does not bias the fit.
+    found = _fitted_with_scales(rig, responses, screened)
     progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
-    free_scales = part.free_scales
+    scales, space = found.sensor_scales, found.plate.model.space
+    is_unknown = np.ones(len(scales), dtype=bool)
     if not all_scales:
-        scales, error = part.scales(fit.z), part.scale_errors(fit)
-        free_scales = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
-        fit = replace(fit, z=part.at_scales(fit.z, np.where(free_scales, scales, 1.0)))
-    problem, found = _identified(replace(part, free_scales=free_scales), fit)
-    if all_scales:
-        found = _with_median_scale_one(problem, found)
+        error = space.values(found.fit.errors, "sensor_scale")
+        is_unknown = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
+    start, own = found.fit.x.copy(), space.groups["sensor_scale"]
+    start[own] = (np.where(is_unknown, scales, 1.0) - 1) / space.std[own]
+    found = replace(found, prior=_prior(found.plate, start, is_unknown))
+    found = _identified(found.fitted_again(found.fit.searched, start))
     progress(2, 3)
-    _check_sides(problem, found)
-    _check_gains(problem, found)
-    _check_suspensions(problem, found)
-    _check_outliers(problem, found)
-    report = _report(
-        problem,
-        found,
-        live,
-        dead_sensors=tuple(compress(responses.sensors, dead)),
-        dead_eras=tuple(compress((era.name for era in rig.eras), dead_eras)),
-    )
-    progress(3, 3)
-    return report
-
-
-def _identified(
-    problem: CalibrationProblem, start: CalibrationFit
-) -> tuple[CalibrationProblem, CalibrationFit]:
-    """Fix parameters that the data determine less than their prior does, and fit again."""
-    fit = solve(problem, start.z, start.noise, start.used)
-    while True:
-        numbers = problem.plate.numbers
-        excess = np.where(problem.free, fit.error[numbers] / problem.plate.largest_errors, 0)
-        # Values of a plate that does not fit are meaningless.
-        if not excess.max() > 1 or _fit_error(problem, fit) > MAX_FIT_ERROR:
-            return problem, fit
-        searched, z = problem.searched.copy(), fit.z.copy()
-        least = numbers[best_of(excess)]
-        searched[least], z[least] = False, 0.0
-        problem = replace(problem, searched=searched)
-        fit = solve(problem, z, fit.noise, fit.used)
-
-
-def _with_median_scale_one(problem: CalibrationProblem, fit: CalibrationFit) -> CalibrationFit:
-    """Attribute the common scale of sensors to the gains; responses do not separate both."""
-    scales = problem.scales(fit.z)
-    middle = float(np.median(scales))
-    common = KINDS["sensor_scale"].std * math.sqrt(math.pi / (2 * len(scales)))  # of a median
-    error = fit.error.copy()
-    error[problem.plate.model.space.groups["sensor_scale"]] /= abs(middle)
-    return replace(
-        fit,
-        z=problem.at_scales(fit.z, scales / middle),
-        error=error,
-        gains=fit.gains * middle,
-        gains_error=np.hypot(fit.gains_error, common * np.abs(fit.gains)) * abs(middle),
-        common_error=math.hypot(fit.common_error, common),
-    )
-
-
-def _fit_error(problem: CalibrationProblem, fit: CalibrationFit) -> float:
-    size = row_rms(problem.values, fit.used)
-    return relative_error(problem.values, fit.predicted, size, fit.used)
-
-
-def _check_outliers(problem: CalibrationProblem, fit: CalibrationFit) -> None:
-    count = int(np.isfinite(problem.values).sum())
-    out = count - int(fit.used.sum())
-    if out > MAX_OUTLIERS * count:
+    _check_sides(found)
+    _check_gains(found)
+    _check_suspensions(found)
+    if found.outlier_count > MAX_OUTLIERS * found.value_count:
+        out, count = found.outlier_count, found.value_count
         raise InputError(
             f"outliers must be at most {100 * MAX_OUTLIERS:g} % of the values, got {out} of "
             f"{count} ({100 * out / count:.0f} %); check that it is this plate, names and places "
             "of sensors and ERAs, and loose contacts"
         )
+    for stated in ("held_out", "rig"):
+        getattr(found, stated)  # further fits, which progress counts
+    progress(3, 3)
+    return found
 
 
-def _check_sides(problem: CalibrationProblem, fit: CalibrationFit) -> None:
+def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> Calibration:
+    """Fit with unknown scales of all sensors; leave out those of which most values are outliers."""
+    dead = screened.dead_sensors.copy()
+    while True:
+        check_enough_sensors(~dead, responses)
+        live = responses.without(dead)
+        live.values[:, screened.dead_eras] = np.nan
+        plate = sensed_plate(rig, live.points, live.frequencies, masses=live.masses, has_form=True)
+        space = plate.model.space
+        start = np.zeros(space.size)
+        start[plate.numbers] = screened.start
+        measurement = replace(live.as_measurement(), free_gains=True)
+        measurement, scales = without_outliers(measurement, plate.at_sensors(start))
+        measured = np.isfinite(measurement.values)
+        heard = measurement.known.sum(axis=(0, 2)) > measured.sum(axis=(0, 2)) / 2
+        if heard.all():
+            break
+        dead[~dead] = ~heard  # elsewhere, or loose
+    start[space.groups["sensor_scale"]] = (scales - 1) / KINDS["sensor_scale"].std
+    prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
+    searched = space.uncertain & ~space.of("gain")
+    for _ in range(2):  # the effect of viscous losses changes little with the parameters
+        law = viscous_difference(replace(plate.model, law=None), start)
+        plate = replace(plate, model=replace(plate.model, law=law))
+        found = fit_to_noise(plate.model, measurement, searched=searched, start=start, prior=prior)
+        measurement, start = found.measurement, found.x
+    return Calibration(
+        plate,
+        found,
+        prior,
+        tuple(compress(responses.sensors, dead)),
+        tuple(compress((era.name for era in rig.eras), screened.dead_eras)),
+    )
+
+
+def without_outliers(
+    measurement: Measurement, model: ComplexArray
+) -> tuple[Measurement, FloatArray]:
+    """Leave out outliers by a plate's responses (f, s, n), up to a gain of each row.
+
+    The worst of a row goes first, since each pulls the gain of its row. Returns the measurement
+    with errors as the rest shows them, infinite of outliers, and the scales of the sensors (s,).
+    """
+    values, scales = measurement.values, np.ones(model.shape[1])
+    used = np.isfinite(values)
+    for _ in range(_ROUNDS):
+        part, heard = np.where(used, values, np.nan), used.any(axis=(0, 2))
+        size = np.where(used, row_rms(part), np.inf)
+        gains = _gains_of(scales[:, None] * model, replace(measurement, std=size))
+        predicted = np.nan_to_num(gains)[:, None] * model
+        share = np.divide(part, predicted, out=np.full_like(part, np.nan), where=used)
+        scales[heard] = np.nanmedian(share.real[:, heard], axis=(0, 2))
+        scales = scales / np.median(scales)
+        raw = np.abs(values - scales[:, None] * predicted)
+        count = used.sum(axis=1, keepdims=True)
+        # A gain takes one of the row's values with it.
+        left = np.broadcast_to(1 - 1 / np.maximum(count, 2), values.shape)
+        std = np.where(used, noise_of(part, raw, left), np.inf)
+        deviation = np.where(used, raw / std / math.sqrt(2), 0.0)
+        worst = deviation.max(axis=1, keepdims=True)
+        kept = used & ~((deviation == worst) & (worst > _MAX_DEVIATION) & (count > 2))
+        if (kept == used).all():
+            break
+        used = kept
+    return replace(measurement, std=std), scales
+
+
+def _gains_of(model: ComplexArray, measurement: Measurement) -> ComplexArray:
+    """Gains (f, n) of responses (f, s, n) that fit a measurement best, NaN where it has none."""
+    return best_gains(model, np.zeros((*model.shape, 0)), measurement)[0]
+
+
+def _prior(
+    plate: SensedPlate, start: FloatArray, is_unknown: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (p,) and covariance (p, p) of the parameters beforehand.
+
+    Nothing holds the rig's values but some (`SensedPlate.held`), nor the scales of a mask (s,)
+    of sensors beside those of a start (p,). Where all scales are unknown, responses do not tell
+    what they have in common from the gains: the median of good sensors is known beforehand.
+    """
+    space = plate.model.space
+    own = np.arange(space.size)[space.groups["sensor_scale"]]
+    mean, deviations = np.zeros(space.size), np.ones(space.size)
+    deviations[plate.numbers[~plate.held]] = _UNKNOWN
+    deviations[own[is_unknown]] = _UNKNOWN
+    mean[own[is_unknown]] = start[own[is_unknown]]
+    covariance = np.diag(deviations**2)
+    if is_unknown.all():
+        count = len(own)
+        covariance[np.ix_(own, own)] += (math.pi / 2 - _UNKNOWN**2) / count
+    return mean, covariance
+
+
+def _identified(found: Calibration) -> Calibration:
+    """Fix parameters that the data determine less than their prior does, and fit again."""
+    while True:
+        plate, searched = found.plate, found.fit.searched.copy()
+        errors = found.fit.errors[plate.numbers] / plate.largest_errors
+        excess = np.where(searched[plate.numbers], errors, 0)
+        # Values of a plate that does not fit are meaningless.
+        if not excess.max() > 1 or found.error > MAX_FIT_ERROR:
+            return found
+        least, x = plate.numbers[best_of(excess)], found.fit.x.copy()
+        searched[least], x[least] = False, 0.0
+        found = found.fitted_again(searched, x)
+
+
+def _check_sides(found: Calibration) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
-    if _fit_error(problem, fit) > MAX_FIT_ERROR:
+    if found.error > MAX_FIT_ERROR:
         return
-    plate, space = problem.plate.rig.plate, problem.plate.model.space
-    offs = space.values(fit.z, "side").tolist()
+    plate, space = found.plate.rig.plate, found.plate.model.space
+    offs = space.values(found.fit.x, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
         if abs(off) > _MAX_SIDE * KINDS["side"].std:
             raise wrong_size(f"plate.{key}", side, side + off)
@@ -301,13 +702,16 @@ def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     )
 
 
-def _check_gains(problem: CalibrationProblem, fit: CalibrationFit) -> None:
+def _check_gains(found: Calibration) -> None:
     """Raise InputError for gains that no drive has: they would hide another plate."""
-    for number, era in enumerate(problem.plate.rig.eras):
-        measured = np.isfinite(fit.gains_error[:, number])
-        sizes, errors = (x[measured, number] for x in (np.abs(fit.gains), fit.gains_error))
-        relative = sizes / np.median(sizes) if len(sizes) else sizes
-        clear = np.abs(np.log(relative)) - _SIGNIFICANCE * errors / sizes
+    sizes, errors = np.abs(found.gains_of_fit), found.gains_error
+    for number, era in enumerate(found.plate.rig.eras):
+        measured = np.isfinite(errors[:, number])
+        if not measured.any():
+            continue
+        size = sizes[measured, number]
+        relative = size / np.median(size)
+        clear = np.abs(np.log(relative)) - _SIGNIFICANCE * errors[measured, number] / size
         if (clear > math.log(_MAX_GAIN)).any():
             raise InputError(
                 f"gains of ERA {era.name} must be within a factor of {_MAX_GAIN:g} of their median "
@@ -317,157 +721,36 @@ def _check_gains(problem: CalibrationProblem, fit: CalibrationFit) -> None:
             )
 
 
-def _check_suspensions(problem: CalibrationProblem, fit: CalibrationFit) -> None:
+def _check_suspensions(found: Calibration) -> None:
     """Raise InputError for exciters and feet with a stiffness at its bound, of another kind."""
-    plate = problem.plate
-    factors: dict[str, float] = {}
-    feet: dict[str, float] = {}
-    for row, value, is_at_bound in zip(
-        plate.rows, plate.values(fit.z), _at_bounds(problem, fit), strict=True
-    ):
-        if is_at_bound and row.kind == "stiffness" and row in plate.of_exciters:
-            factors[row.era] = value / row.of(plate.rig)
-        elif is_at_bound and row.foot:
-            feet[row.foot] = value / row.of(plate.rig)
-    if factors:
+    exciters, feet = {}, {}
+    for one in found.parameters:
+        row, factor = one.parameter, f"{one.value / one.before:.2g}" if one.at_bound else ""
+        if one.at_bound and row.kind == "stiffness" and row in found.plate.of_exciters:
+            exciters[row.era] = factor
+        elif one.at_bound and row.foot:
+            feet[row.foot] = factor
+    if exciters:
         raise InputError(
-            f"stiffness of {', '.join(factors)} must be about that of the rig, got "
-            f"{', '.join(f'{each:.2g}' for each in factors.values())} times it, the bound of what "
-            "is searched; check resonance and resonance_is of these: whether free or mounted "
-            "(era plate show prints where the glued magnets resonate), and by era rig check that "
-            "they are glued"
+            f"stiffness of {', '.join(exciters)} must be about that of the rig, got "
+            f"{', '.join(exciters.values())} times it, the bound of what is searched; check "
+            "resonance and resonance_is of these: whether free or mounted (era plate show prints "
+            "where the glued magnets resonate), and by era rig check that they are glued"
         )
     if feet:
         raise InputError(
             f"stiffness of feet {', '.join(feet)} must be about that of the rig, got "
-            f"{', '.join(f'{each:.2g}' for each in feet.values())} times it, the bound of what is "
-            "searched; check their kind, their places and that all of them touch"
+            f"{', '.join(feet.values())} times it, the bound of what is searched; check their "
+            "kind, their places and that all of them touch"
         )
 
 
-def _at_bounds(problem: CalibrationProblem, fit: CalibrationFit) -> NDArray[np.bool_]:
-    """Mask (n,) of the fitted values that are free and at a bound."""
-    space = problem.plate.model.space
-    distance = np.abs(np.array([space.lower, space.upper]) - fit.z).min(axis=0)
-    return np.asarray(problem.free & (distance < 1e-6)[problem.plate.numbers])
+def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Variances (f, n) of linear functions of parameters, by slopes (f, n, q) and covariance."""
+    return np.asarray(((slopes @ covariance) * slopes).sum(axis=-1))
 
 
-def _report(
-    problem: CalibrationProblem,
-    fit: CalibrationFit,
-    live: Responses,
-    *,
-    dead_sensors: tuple[str, ...],
-    dead_eras: tuple[str, ...],
-) -> Calibration:
-    fitted, scales, before = problem.plate, problem.scales(fit.z), problem.plate.rig
-    plain = without_form(problem, fit)
-    rig = rig_of_fit(problem, fit, plain[0])
-    responses, gains = predicted_by(rig, problem, live.points, fit)
-    eras = tuple(
-        replace(era, gains=stated_gains(gains[:, number], live.frequencies) or era.gains)
-        for number, era in enumerate(rig.eras)
-    )
-    parameters = tuple(
-        FittedParameter(
-            row,
-            row.of(before),
-            float(value),
-            standard_error(before, row, float(value), float(error), fit.dampers) if free else None,
-            bool(bound),
-        )
-        for row, value, error, free, bound in zip(
-            fitted.rows,
-            fitted.values(fit.z),
-            fitted.errors(fit.z, fit.error),
-            problem.free,
-            _at_bounds(problem, fit),
-            strict=True,
-        )
-    )
-    held_out = hold_out(problem, fit, live)
-    uncertainty = uncertainty_of(before.uncertainty, problem, fit, plain, parameters, held_out)
-    measured_count = int(np.isfinite(problem.values).sum())
-    return Calibration(
-        rig=replace(rig, eras=eras, uncertainty=uncertainty),
-        parameters=parameters,
-        moved=moved_eras(problem, fit),
-        gains_error=np.hypot(fit.gains_error, np.abs(gains) - np.abs(fit.gains)),
-        dead_sensors=dead_sensors,
-        dead_eras=dead_eras,
-        scales=tuple(
-            SensorScale(name, float(scale), float(error))
-            for name, scale, error, free in zip(
-                live.sensors, scales, problem.scale_errors(fit), problem.free_scales, strict=True
-            )
-            if free
-        ),
-        outlier_count=measured_count - int(fit.used.sum()),
-        value_count=measured_count,
-        error=_fit_error(problem, fit),
-        chi2=fit.chi2,
-        held_out=held_out,
-        sensors=live.sensors,
-        frequencies=live.frequencies,
-        measured=problem.values / scales,
-        before=initial_responses(problem),
-        after=gains[:, :, None] * responses,
-    )
-
-
-def rig_of_fit(problem: CalibrationProblem, fit: CalibrationFit, z: FloatArray) -> Rig:
-    """Rig of the fit z (p,) without form errors; ERAs move where they clearly are elsewhere.
-
-    Its gains are those of the rig before.
-    """
-    rig = problem.plate.rig_at(z)
-    moves = {moved.name: moved.after for moved in moved_eras(problem, fit)}
-    eras = tuple(
-        replace(era, x=moves[era.name][0], y=moves[era.name][1]) if era.name in moves else era
-        for era in rig.eras
-    )
-    return replace(rig, eras=eras)
-
-
-def moved_eras(problem: CalibrationProblem, fit: CalibrationFit) -> tuple[MovedEra, ...]:
-    """List the ERAs that are off their places by several standard errors."""
-    rig, space, found = problem.plate.rig, problem.plate.model.space, []
-    sides = np.array([rig.plate.length, rig.plate.width])
-    off = np.where(clear(fit), fit.z, 0.0)
-    places, errors = (space.values(x, "place").reshape(-1, 2) for x in (off, fit.error))
-    for era, place, error in zip(rig.eras, places, errors, strict=True):
-        at = np.clip(np.array([era.x, era.y]) + place, 0, sides)
-        if np.abs(at - [era.x, era.y]).max() > 0:
-            found.append(
-                MovedEra(
-                    era.name,
-                    (era.x, era.y),
-                    (float(at[0]), float(at[1])),
-                    (float(error[0]), float(error[1])),
-                )
-            )
-    return tuple(found)
-
-
-def predicted_by(
-    rig: Rig, problem: CalibrationProblem, points: FloatArray, fit: CalibrationFit
-) -> tuple[ComplexArray, ComplexArray]:
-    """Responses (f, e, s) of a rig at points (s, 2) [m], and its gains (f, e) that fit best."""
-    known = problem.plate
-    model = sensed_plate(rig, points, known.model.frequencies, masses=known.masses).responses()
-    weight = fit.used / fit.noise[:, :, None]
-    gains, _ = project_gains(model * problem.scales(fit.z), problem.values, weight)
-    return model, gains
-
-
-def initial_responses(problem: CalibrationProblem) -> ComplexArray:
-    """Responses (f, e, s) of the rig before the fit, with its gains."""
-    plate = problem.plate
-    gains = np.column_stack([era.gain(plate.model.frequencies) for era in plate.rig.eras])
-    return np.asarray(gains[:, :, None] * plate.responses())
-
-
-def stated_gains(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
+def _stated_gains(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
     """Gains of an ERA for a rig, of those among gains (f,) that are known."""
     known = np.isfinite(gains) & (gains != 0)
     return tuple(
@@ -476,197 +759,9 @@ def stated_gains(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ..
     )
 
 
-def standard_error(
-    rig: Rig, parameter: Parameter, value: float, error: float, dampers: float
-) -> float:
-    """Standard error of a value: that of the fit, of the model, and of the mass it scales with.
-
-    dampers: their effect on the responses relative to that of the plate's own losses, by which an
-    error of the model in the former looks like one of the latter.
-    """
-    share = math.hypot(_MODEL_ERROR, _mass_scale_error(rig))
-    if parameter.kind == "loss_factor":
-        share = math.hypot(_LOSS_ERROR, _MODEL_ERROR * dampers)
-    return math.hypot(error, share * value)
-
-
-def _mass_scale_error(rig: Rig) -> float:
-    """Standard error of the whole mass, relative: all that is fitted but losses scales with it."""
-    sides = KINDS["side"].std / np.array([rig.plate.length, rig.plate.width])
-    return float(np.hypot(_FOREIGN_MASS, np.linalg.norm(sides)))
-
-
-def hold_out(
-    problem: CalibrationProblem, fit: CalibrationFit, live: Responses
-) -> HeldOutSensors | None:
-    """Fit without some of the live sensors of known scale, and predict their responses.
-
-    The prediction is that of the rig as its file has it, without other form errors. Returns None
-    where too few sensors are left to fit.
-    """
-    count = len(live.sensors)
-    candidates = np.flatnonzero(~problem.free_scales | problem.free_scales.all())
-    wanted = max(round(count / HELD_OUT_FOLDS), 1)
-    if count - wanted < LEAST_SENSORS or len(candidates) <= wanted:
-        return None
-    evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
-    unseen = np.zeros(count, dtype=bool)
-    unseen[candidates[evenly_spaced]] = True
-    part = problem.without(unseen)
-    seen = solve(part, fit.z, fit.noise, fit.used)
-    rig = rig_of_fit(part, seen, without_form(part, seen)[0])
-    scales = problem.scales(fit.z)
-    responses, gains = predicted_by(
-        rig, problem, live.points, replace(fit, used=fit.used & ~unseen)
-    )
-    predicted = gains[:, :, None] * responses * scales
-    size = row_rms(problem.values)
-    which = fit.used & unseen
-    error = np.abs(predicted - problem.values) / size[:, :, None]
-    own = problem.plate.model.space.of("sensor_scale", "sensor_place")
-    _, read = responses_of(problem.plate.model, fit.z, own)
-    variance = (np.abs(gains[:, :, None] * read) ** 2).sum(axis=0) + 2 * fit.noise[:, :, None] ** 2
-    left = np.median(error[which] ** 2) - np.median((variance / size[:, :, None] ** 2)[which])
-    return HeldOutSensors(
-        tuple(compress(live.sensors, unseen)),
-        relative_error(
-            problem.values, initial_responses(problem) * scales, size, unseen[None, None]
-        ),
-        relative_error(problem.values, predicted, size, which),
-        float(np.median(error[which])),
-        math.sqrt(max(left, 0.0) / math.log(2)),  # the median of |z|² is log 2 of its mean
-    )
-
-
-def relative_error(
-    values: ComplexArray, predicted: ComplexArray, size: FloatArray, which: NDArray[np.bool_]
-) -> float:
-    """Rms error of the values of a mask (f, e, s), each relative to its row's size.
-
-    Infinite for an empty mask.
-    """
-    squares = np.where(which, np.abs(predicted - values) ** 2, np.nan)
-    return relative_rms(squares, size[:, :, None] ** 2)
-
-
-def uncertainty_of(
-    before: Uncertainty,
-    problem: CalibrationProblem,
-    fit: CalibrationFit,
-    plain: tuple[FloatArray, FloatArray],
-    parameters: Sequence[FittedParameter],
-    held_out: HeldOutSensors | None,
-) -> Uncertainty:
-    """Uncertainty of a calibrated rig, for its file.
-
-    It excludes the error of the whole mass, with which all values scale and no pattern changes.
-    Thickness stands for the plate's rigidity: 1 % of modulus shifts modes as 0.5 % of thickness
-    does. Field is the part of the fit's fields that the rig lacks, since it cannot express form
-    errors, and at least what held-out sensors leave unexplained. Gain and phase are those of the
-    best gains for such fields, as the sensors read them: other errors move gains and fields in
-    opposite directions. What is not identified keeps the value of the rig before.
-    """
-    errors = problem.plate.errors(fit.z, fit.error)
-    # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
-    by_coils = [each for each in problem.plate.of_exciters if each.kind == "damping"]
-    stated = [one for one in parameters if one.parameter not in by_coils]
-    relative = {
-        kind: [
-            math.hypot(
-                float(error) / one.value,
-                math.hypot(_LOSS_ERROR, _MODEL_ERROR * fit.dampers)
-                if kind == "loss_factor"
-                else _MODEL_ERROR,
-            )
-            for one, error in zip(parameters, errors, strict=True)
-            if one in stated and one.parameter.kind == kind and one.is_identified and one.value > 0
-        ]
-        for kind in ("modulus", "loss_factor", "stiffness", "damping")
-    }
-    known = {
-        kind: len(values) == sum(one.parameter.kind == kind for one in stated)
-        for kind, values in relative.items()
-    }
-
-    def rms(kind: str) -> float:
-        return _rms(relative[kind] or [0.0])
-
-    gains = {}
-    lacking = lacking_of(problem, fit, plain[0])
-    known_gains = np.isfinite(fit.readings_error[0]) & np.isfinite(lacking)
-    if known_gains.any(axis=0).all():
-        field = max(_rms(lacking[known_gains]), held_out.unexplained if held_out else 0.0)
-        # The best gain of a field that is off by so much at n sensors: but at resonances, masses
-        # and stiffness that are off change a field in phase with it.
-        off = field / np.sqrt(fit.used.sum(axis=2)[known_gains])
-        gain, phase = (
-            max(_rms(np.hypot(share * off, error[known_gains])), _LEAST)
-            for share, error in zip((1, math.sqrt(0.5)), fit.readings_error, strict=True)
-        )
-        gains = {"gain": _rounded(gain), "phase_deg": _rounded(math.degrees(phase))}
-        gains |= {"field": _rounded(field), "common_gain": _rounded(fit.common_error)}
-    losses = (
-        max(rms("loss_factor"), rms("damping"))
-        if known["loss_factor"] and known["damping"]
-        else math.log(before.damping)
-    )
-    fitted = {
-        "stiffness": _rounded(rms("stiffness")) if known["stiffness"] else before.stiffness,
-        "damping": 1 + _rounded(math.exp(losses) - 1),
-    }
-    fitted["place"] = _rounded(place_error(problem, fit, before.place))
-    feet = [
-        float(error) / one.value if one.is_identified else before.supports
-        for one, error in zip(parameters, errors, strict=True)
-        if one.parameter.foot
-    ]
-    if feet:
-        fitted["supports"] = _rounded(math.hypot(_rms(feet), _MODEL_ERROR))
-    if known["modulus"]:
-        # The rig's modulus is that of frequencies with form errors, whatever part is theirs.
-        of_plain, value = problem.plate.errors(*plain)[0], problem.plate.values(plain[0])[0]
-        of_modulus = math.hypot(of_plain / value, _MODEL_ERROR)
-        fitted |= Uncertainty.of_frequency(_rounded(of_modulus / 2))
-    return Uncertainty.clipped(**asdict(before) | fitted | gains)
-
-
-def lacking_of(problem: CalibrationProblem, fit: CalibrationFit, z: FloatArray) -> FloatArray:
-    """Part of a fit's responses that its rig without form errors, z (p,), lacks, relative (f, e).
-
-    ERAs stay at the places of the fit, since a rig states the errors of places.
-    """
-    at_places = np.where(problem.plate.model.space.of("place"), fit.z, z)
-    model = problem.plate.responses(at_places)
-    gains, _ = project_gains(model, problem.values, fit.used / fit.noise[:, :, None])
-    predicted = gains[:, :, None] * model
-    squares = np.where(fit.used, np.abs(predicted - fit.predicted) ** 2, np.nan)
-    size = row_rms(fit.predicted, fit.used)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.nansum(squares, axis=2) / fit.used.sum(axis=2)
-    return np.asarray(np.sqrt(shares) / size)
-
-
-def place_error(problem: CalibrationProblem, fit: CalibrationFit, before: float) -> float:
-    """Root mean square error of the places of ERAs in the rig of a fit, along a side [m].
-
-    Where the fit does not clearly have another place, the error of the kept one counts; before:
-    error of places that the data determine less than their prior does.
-    """
-    space = problem.plate.model.space
-    kept, error = (space.values(x, "place") for x in (np.where(clear(fit), 0.0, fit.z), fit.error))
-    by_data = error < math.sqrt(0.5) * KINDS["place"].std
-    of_each = np.where(by_data, np.hypot(np.hypot(kept, error), KINDS["place"].theory), before)
-    return _rms(of_each)
-
-
 def _rms(values: ArrayLike) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _rounded(value: float) -> float:
-    """To two digits: an error is hardly known better."""
-    return float(f"{value:.2g}")
 
 
 def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
@@ -693,13 +788,14 @@ def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
 
 def change_rows(calibration: Calibration) -> list[str]:
     """Table of all parameters, and of ERAs that are not at the rig's places."""
+    places = {era.name: (era.x, era.y) for era in calibration.plate.rig.eras}
     moved = [
         (
-            f"{each.name} place",
-            _millimetres(each.before),
-            f"{_millimetres(each.after)} ± {_millimetres(each.standard_error)} mm",
+            f"{name} place",
+            _millimetres(places[name]),
+            f"{_millimetres(place)} ± {_millimetres(error)} mm",
         )
-        for each in calibration.moved
+        for name, (place, error) in calibration.moved.items()
     ]
     return value_rows([*map(_change, calibration.parameters), *moved])
 
@@ -727,8 +823,8 @@ def finding_rows(calibration: Calibration) -> list[str]:
     rows = [f"sensor {name}: no signal, left out" for name in calibration.dead_sensors]
     rows += [f"ERA {name}: no motion; gains unchanged" for name in calibration.dead_eras]
     rows += [
-        f"sensor {scale.name}: scale {with_error(scale.scale, scale.standard_error)} of the others"
-        for scale in calibration.scales
+        f"sensor {name}: scale {with_error(scale, error)} of the others"
+        for name, (scale, error) in calibration.scales.items()
     ]
     if calibration.outlier_count:
         rows.append(
@@ -788,20 +884,20 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
         },
         "moved_eras": [
             {
-                "era": moved.name,
-                "before_m": list(moved.before),
-                "after_m": list(moved.after),
-                "standard_error_m": list(moved.standard_error),
+                "era": name,
+                "before_m": [before.era(name).x, before.era(name).y],
+                "after_m": list(place),
+                "standard_error_m": list(error),
             }
-            for moved in calibration.moved
+            for name, (place, error) in calibration.moved.items()
         ],
         "uncertainty": asdict(calibration.rig.uncertainty),
         "not_identified": [p.parameter.name for p in calibration.parameters if not p.is_identified],
         "dead_sensors": list(calibration.dead_sensors),
         "dead_eras": list(calibration.dead_eras),
         "sensor_scales": {
-            scale.name: {"scale": scale.scale, "standard_error": scale.standard_error}
-            for scale in calibration.scales
+            name: {"scale": scale, "standard_error": error}
+            for name, (scale, error) in calibration.scales.items()
         },
         "sensors": list(calibration.sensors),
         "drive_frequencies_hz": frequencies.tolist(),
@@ -823,7 +919,7 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
     }
 
 
-def _millimetres(place: tuple[float, float]) -> str:
+def _millimetres(place: Point) -> str:
     return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
 
 

@@ -24,18 +24,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.estimate.forward import ForwardModel, Sensor, jacobian, viscous_difference
+from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.estimate.least_squares import Minimum, search
 from model.estimate.measurement import Responses
 from model.estimate.space import (
-    FORM,
     KINDS,
     MAX_GUESSED,
     VALUE_UNITS,
@@ -59,10 +57,7 @@ _ADDED_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
 _ROUNDS = 8
-_SETTLED = 0.1  # of the noise between two rounds
 _MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
-_CLEAR = 3.0  # standard errors of a clear deviation
-_MEAN_WEIGHT = 1e3  # of the row that holds the mean of scales
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
 
@@ -197,6 +192,10 @@ class SensedPlate:
         z = np.zeros(self.model.space.size) if z is None else z
         return np.swapaxes(self.model.at(z).responses, 1, 2)
 
+    def at_sensors(self, z: FloatArray | None = None) -> ComplexArray:
+        """Responses to a drive without gain at z (p,), by default at the rig's values (f, s, n)."""
+        return self.model.at(np.zeros(self.model.space.size) if z is None else z).responses
+
     def rig_at(self, z: FloatArray) -> Rig:
         """The rig with the fitted values of z."""
         own = np.zeros(len(z))
@@ -288,110 +287,6 @@ def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> Sen
     )
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationProblem:
-    """The plate of a rig with its form errors, and the measured values."""
-
-    plate: SensedPlate
-    values: ComplexArray
-    """Measured values (f, e, s) [1/s²], NaN where not measured."""
-    searched: NDArray[np.bool_]
-    """Mask (p,) of the parameters to be fitted."""
-    free_scales: NDArray[np.bool_]
-    """Mask (s,) of the scales of sensors without a tolerance."""
-
-    @classmethod
-    def of(cls, plate: SensedPlate, values: ComplexArray) -> Self:
-        """Search everything but the gains of channels, with scales that no tolerance holds."""
-        space = plate.model.space
-        searched = space.uncertain & ~space.of("gain")
-        return cls(plate, values, searched, np.ones(values.shape[2], dtype=bool))
-
-    def without(self, sensors: NDArray[np.bool_]) -> Self:
-        """Leave out the values of some sensors (s,), whose parameters then stay as they start."""
-        groups, searched = self.plate.model.space.groups, self.searched.copy()
-        searched[groups["sensor_scale"]] &= ~sensors
-        searched[groups["sensor_place"]] &= np.repeat(~sensors, 2)
-        values = np.where(sensors, np.nan, self.values)
-        return replace(self, values=values, searched=searched)
-
-    def with_law_at(self, z: FloatArray) -> Self:
-        """Allow viscous losses, whose effect is that at z (p,): it changes little with z."""
-        model = self.plate.model
-        model = replace(model, law=viscous_difference(replace(model, law=None), z))
-        return replace(self, plate=replace(self.plate, model=model))
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Mask of the rig's values that are searched (n,)."""
-        return self.searched[self.plate.numbers]
-
-    def scales(self, z: FloatArray) -> FloatArray:
-        """Scales of sensors (s,) of parameters z (p,)."""
-        return 1 + self.plate.model.space.values(z, "sensor_scale")
-
-    def scale_errors(self, fit: "CalibrationFit") -> FloatArray:
-        """Standard errors of the scales that no tolerance holds (s,), 0 of others."""
-        return self.free_scales * self.plate.model.space.values(fit.error, "sensor_scale")
-
-    def at_scales(self, z: FloatArray, scales: FloatArray) -> FloatArray:
-        """Parameters z (p,) with other scales of sensors (s,)."""
-        space, found = self.plate.model.space, z.copy()
-        own = space.groups["sensor_scale"]
-        found[own] = (scales - 1) / space.std[own]
-        return found
-
-    def tolerances(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, n) and targets (m,) that hold searched scales and form errors."""
-        space, held = self.plate.model.space, self.searched.copy()
-        held[self.plate.numbers] = self.free & self.plate.held
-        held[space.groups["sensor_scale"]] &= ~self.free_scales
-        rows, targets = np.eye(space.size)[held], np.zeros(held.sum())
-        if self.free_scales.all():
-            # Gains determine a common scale; the mean is held.
-            mean = np.zeros((1, space.size))
-            own = space.groups["sensor_scale"]
-            mean[0, own] = _MEAN_WEIGHT * (space.std * self.searched)[own] / len(self.free_scales)
-            rows, targets = np.vstack([rows, mean]), np.append(targets, mean @ start)
-        return rows[:, self.searched], targets
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationFit:
-    """Result of a fit."""
-
-    z: FloatArray
-    """Parameters (p,)."""
-    noise: FloatArray
-    """Standard deviation of the real or imaginary part of a value (f, e)."""
-    used: NDArray[np.bool_]
-    """Mask (f, e, s) of values without outliers."""
-    error: FloatArray
-    """Standard errors of the parameters (p,)."""
-    gains: ComplexArray
-    """Gains (f, e), NaN where not measured."""
-    gains_error: FloatArray
-    """Standard errors of the magnitudes of the gains (f, e)."""
-    readings_error: FloatArray
-    """Errors of fields by their readings: relative magnitudes and phases [rad] (2, f, e)."""
-    common_error: float
-    """Error that the magnitudes of all fields have in common, relative."""
-    predicted: ComplexArray
-    """Predicted values (f, e, s), with gains and scales."""
-    chi2: float
-    """Sum of squares per degree of freedom."""
-    dampers: float
-    """Effect of all ERAs' dampers on the responses, relative to that of the plate's own losses."""
-
-
-def start_at(
-    problem: CalibrationProblem, z: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Start of a fit by the plate at z (p,): z with scales of sensors, noise and mask of values."""
-    scales, noise, used = without_outliers(problem.values, problem.plate.responses(z))
-    return problem.at_scales(z, scales), noise, used
-
-
 def without_outliers(
     values: ComplexArray, model: ComplexArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -425,62 +320,6 @@ def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np
     kept = used.copy()
     kept[f, e, worst[f, e]] = False
     return kept
-
-
-def solve(
-    problem: CalibrationProblem, z: FloatArray, noise: FloatArray, used: NDArray[np.bool_]
-) -> CalibrationFit:
-    """Fit parameters, scales and form errors from z (p,), noise (f, e) and a mask (f, e, s)."""
-    finite = np.isfinite(problem.values)
-    used = used & finite
-    for _ in range(_ROUNDS):
-        problem = problem.with_law_at(z)
-        weight, before = used / noise[:, :, None], noise
-        found = _search(problem, z, weight)
-        z = found.x
-        model = problem.plate.responses(z)
-        gains, _ = project_gains(model, problem.values, weight)
-        raw = np.abs(problem.values - np.nan_to_num(gains)[:, :, None] * model)
-        noise = _noise_of(problem.values, raw, used, _noise_left(model, found, weight))
-        # What form errors explain comes back.
-        kept = finite & ~(raw > _MAX_DEVIATION * np.sqrt(2) * noise[:, :, None])
-        is_settled = bool((kept == used).all() and (np.abs(noise / before - 1) < _SETTLED).all())
-        used = kept
-        if is_settled:
-            break
-    return _result(problem, _search(problem, z, used / noise[:, :, None]), noise, used)
-
-
-def clear(fit: CalibrationFit) -> NDArray[np.bool_]:
-    """Mask (p,) of parameters that deviate by several standard errors."""
-    return np.asarray(np.abs(fit.z) > _CLEAR * fit.error)
-
-
-def without_form(problem: CalibrationProblem, fit: CalibrationFit) -> tuple[FloatArray, FloatArray]:
-    """Fit the plate without form errors: parameters z (p,), and their standard errors (p,).
-
-    Form errors count as noise, since a rig file does not have them; their likeness to another
-    modulus or loss factor returns to these, as that of a longer side. ERAs stay where they clearly
-    are.
-    """
-    space, z = problem.plate.model.space, fit.z.copy()
-    mine = space.of("modulus", "loss_added", "sensor_scale", "sensor_place")
-    form = space.of(*FORM, "mode_shifts") & ~mine
-    z[form | (space.of("place") & ~clear(fit))] = 0.0
-    part = replace(problem, searched=problem.searched & mine)
-    found = _search(part, z, fit.used / fit.noise[:, :, None])
-    return found.x, _errors(part, found, fit.used)[0]
-
-
-def _search(problem: CalibrationProblem, start: FloatArray, weight: FloatArray) -> Minimum:
-    return fit_with_gains(
-        problem.plate.model,
-        problem.values,
-        weight,
-        start,
-        problem.searched,
-        prior=problem.tolerances(start),
-    )
 
 
 def _noise_of(
@@ -518,100 +357,6 @@ def _noise_of(
     weight = np.linalg.norm(matrix, axis=0)
     a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
     return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
-
-
-def _noise_left(model: ComplexArray, found: Minimum, weight: FloatArray) -> FloatArray:
-    """Share (f, e, s) of each value's noise that is left in its residual: 1 - its leverage.
-
-    The leverage is that of its row's gain and of all searched parameters.
-    """
-    inside = weight > 0
-    by_gain = np.abs(weight * model) ** 2
-    total = by_gain.sum(axis=2, keepdims=True)
-    left = 1 - by_gain / np.where(total > 0, total, 1)
-    leverage = (_directions(found)[0] ** 2).sum(axis=1)
-    left[inside] -= leverage[: 2 * inside.sum()].reshape(2, -1).mean(axis=0)
-    return np.asarray(left)
-
-
-def _result(
-    problem: CalibrationProblem, found: Minimum, noise: FloatArray, used: NDArray[np.bool_]
-) -> CalibrationFit:
-    z, searched, weight = found.x, problem.searched, used / noise[:, :, None]
-    error, root, chi2 = _errors(problem, found, used)
-    model, by_z = responses_of(problem.plate.model, z, searched)
-    gains, _ = project_gains(model, problem.values, weight)
-    by_gain, _ = projection_slopes(model, by_z, problem.values, weight)
-    power = (np.abs(weight * model) ** 2).sum(axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = by_gain / gains
-        of_noise = np.where(power > 0, max(chi2, 1.0) / (power * np.abs(gains) ** 2), np.nan)
-    # A force factor is found with the gain: their product is what moves the plate.
-    space, numbers = problem.plate.model.space, np.flatnonzero(searched)
-    for era, factor in enumerate(space.indices("force_factor")):
-        relative[numbers == factor, :, era] += space.std[factor]
-    # What else is searched changes gain and field the opposite ways: sensors hear their product.
-    reads = space.of("sensor_scale", "sensor_place")[searched]
-    by_reading = np.tensordot(root[reads].T, relative[reads], axes=1)
-    common = np.nanmean(by_reading, axis=(1, 2), keepdims=True)
-    beside = by_reading - common
-    return CalibrationFit(
-        z,
-        noise,
-        used,
-        error,
-        gains,
-        np.abs(gains)
-        * np.sqrt(of_noise + (np.tensordot(root.T, relative.real, axes=1) ** 2).sum(axis=0)),
-        np.sqrt(of_noise + (np.array([beside.real, beside.imag]) ** 2).sum(axis=1)),
-        float(np.linalg.norm(common.real)),
-        gains[:, :, None] * model,
-        chi2,
-        _dampers(problem, found.x, root),
-    )
-
-
-def _errors(
-    problem: CalibrationProblem, found: Minimum, used: NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray, float]:
-    """Standard errors (p,), one of them along each direction (n, k), and chi²."""
-    searched, rows = problem.searched, int(used.any(axis=2).sum())
-    freedom = max(len(found.residuals) - 2 * rows - int(searched.sum()), 1)
-    chi2 = float((found.residuals**2).sum()) / freedom
-    _, root, blind = _directions(found)
-    root = root * math.sqrt(max(chi2, 1.0))
-    error = np.zeros(len(found.x))
-    error[searched] = np.where(blind, np.inf, np.linalg.norm(root, axis=1))
-    return error, root, chi2
-
-
-def _directions(found: Minimum) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Singular vectors (m, k) of the derivatives, and their standard errors in x (n, k).
-
-    The third is a mask (n,) of parameters that none of them determines.
-    """
-    size = np.linalg.norm(found.jacobian, axis=0)
-    size[size == 0] = 1e-300
-    rows, strength, columns = np.linalg.svd(found.jacobian / size, full_matrices=False)
-    seen = strength > 1e-9 * strength[0]
-    blind = (np.abs(columns[~seen]) > 1e-6).any(axis=0)
-    return rows[:, seen], columns[seen].T / strength[seen] / size[:, None], blind
-
-
-def _dampers(problem: CalibrationProblem, z: FloatArray, root: FloatArray) -> float:
-    """Relative error of the loss factor by a relative error of 1 of all dampers.
-
-    root (n, k): searched parameters by one standard error along each direction.
-    """
-    plate, moved = problem.plate, np.zeros((len(z), root.shape[1]))
-    moved[problem.searched] = root
-    kinds = np.array([each.kind for each in plate.rows])
-    values = plate.values(z) / plate.model.space.scale[plate.numbers]
-    relative = moved[plate.numbers] / np.where(values > 0, values, np.inf)[:, None]
-    dampers = relative[(kinds == "damping") & problem.free]
-    losses = relative[kinds == "loss_factor"][0]
-    slopes = np.linalg.lstsq(dampers @ dampers.T, dampers @ losses)[0]
-    return abs(float(slopes.sum()))
 
 
 def fit_with_gains(

@@ -198,8 +198,8 @@ def test_calibrate_finds_dead_and_wrongly_scaled_sensors(fitted):
     """The dead sensor is left out, the wrong scale found, and no other one suspected."""
     assert fitted.dead_sensors == ("P8",)
     assert fitted.dead_eras == ()
-    assert [scale.name for scale in fitted.scales] == ["P3"]
-    assert fitted.scales[0].scale == pytest.approx(1.25, rel=0.005)
+    assert list(fitted.scales) == ["P3"]
+    assert fitted.scales["P3"][0] == pytest.approx(1.25, rel=0.005)
 
 
 def test_calibrate_predicts_held_out_sensors_to_the_noise(fitted):
@@ -228,7 +228,7 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     values[:, 2] *= 1e-4
     found = calibrated(rig, replace(clean, values=values))
     assert 0.9 * wild.sum() <= found.outlier_count <= 1.1 * wild.sum()
-    assert found.scales == ()
+    assert found.scales == {}
     assert found.dead_eras == ("NE",)
     assert found.dead_sensors == ("P4",)
     assert found.rig.era("NE").gains == ()
@@ -290,7 +290,7 @@ def test_calibrate_refuses_gains_that_no_drive_has(rig, truth):
 def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     """Every sensor's scale relative to their median, also of one mounted upside down."""
     found = calibrated(rig, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)
-    scales = {scale.name: scale.scale for scale in found.scales}
+    scales = {name: scale for name, (scale, _) in found.scales.items()}
     assert list(scales) == list(NAMES)
     assert scales["P2"] == pytest.approx(-1.0, abs=0.005)
     assert scales["P5"] == pytest.approx(1.01, abs=0.005)

@@ -368,7 +368,7 @@ def test_intervals_hold_the_truth_on_plates_with_form_errors(
         )
         found = calibrate(rig, responses, check_consistency(rig, responses))
         assert found.outlier_count == 0
-        assert found.scales == ()
+        assert found.scales == {}
         fields.append(field_deviations(found.rig, fields_of(hidden)))
         for one, true in zip(found.parameters, true_values(hidden.rig), strict=True):
             if one.standard_error is not None:

@@ -22,7 +22,9 @@ import numpy as np
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.calibration_fit import project_gains, row_rms, sensed_plate
+from model.estimate.calibration_fit import sensed_plate
+from model.estimate.fit import gains_of as best_gains
+from model.estimate.fit import row_rms
 from model.estimate.measurement import Responses, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
@@ -197,14 +199,16 @@ def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
     """
     points = FIELD_POINTS * [rig.plate.length, rig.plate.width]
     frequencies = np.array([row[0] for row in rig.eras[0].gains])
-    fields = gains_of(rig)[:, :, None] * sensed_plate(rig, points, frequencies).responses()
-    gains, left = project_gains(fields, true, np.ones(fields.shape))
+    true = true.swapaxes(1, 2)
+    fields = gains_of(rig)[:, None] * sensed_plate(rig, points, frequencies).at_sensors()
+    gains = best_gains(fields, true)
+    left = true - gains[:, None] * fields
     off, known = np.log(gains), rig.uncertainty
     return np.abs(
         [
             off.real / np.hypot(known.gain, known.common_gain),
             off.imag / np.radians(known.phase_deg),
-            row_rms(left) / row_rms(true) / known.field,
+            (row_rms(left) / row_rms(true))[:, 0] / known.field,
         ]
     )
 

@@ -23,12 +23,11 @@ from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.calibration_fit import Parameter, SensedPlate, sensed_plate
-from model.estimate.fit import Fit, best_gains, fit, fit_to_noise, noise_of, row_rms
+from model.estimate.fit import Fit, fit, fit_to_noise, gains_of, row_rms, without_outliers
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
 from model.estimate.measurement import (
     LEAST_SENSORS,
-    Measurement,
     Responses,
     Screening,
     check_enough_sensors,
@@ -57,8 +56,6 @@ _FOREIGN_MASS = KINDS["foreign_mass"].std * math.sqrt(MASS_CELLS.cell_count)  # 
 
 _UNKNOWN = 100.0  # standard deviations of what no prior holds
 _AT_BOUND = 1e-6  # standard deviations
-_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_ROUNDS = 8  # in which outliers are found
 _WRONG_SCALE = 0.02  # common tolerance of sensors
 _SIGNIFICANCE = 4.0  # standard errors
 _CLEAR = 3.0  # standard errors of a clear deviation
@@ -371,7 +368,11 @@ class Calibration:
     @cached_property
     def _gains(self) -> ComplexArray:
         """Gains of these responses that fit best (f, eras), NaN where not measured."""
-        return _gains_of(self._fields * self.sensor_scales[:, None], self.fit.measurement)
+        return self._gains_for(self._fields * self.sensor_scales[:, None])
+
+    def _gains_for(self, model: ComplexArray) -> ComplexArray:
+        """Gains (f, eras) of responses (f, s, eras) that fit best, NaN where not measured."""
+        return gains_of(model, self.fit.measurement.values, self.fit.measurement.weight)
 
     def _covariance(self, which: NDArray[np.bool_]) -> FloatArray:
         """Covariance of the parameters of a mask (p,)."""
@@ -507,7 +508,7 @@ class Calibration:
         """
         at_places = np.where(self.plate.model.space.of("place"), self.fit.x, self._plain.x)
         model, known = self.plate.at_sensors(at_places), self.fit.measurement.known
-        lacks = _gains_of(model, self.fit.measurement)[:, None] * model - self.fit.predicted
+        lacks = self._gains_for(model)[:, None] * model - self.fit.predicted
         squares, all_squares = (
             np.where(known, np.abs(each) ** 2, 0.0).sum(axis=1)
             for each in (lacks, self.fit.predicted)
@@ -586,12 +587,13 @@ def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> 
         start = np.zeros(space.size)
         start[plate.numbers] = screened.start
         measurement = replace(live.as_measurement(), free_gains=True)
-        measurement, scales = without_outliers(measurement, plate.at_sensors(start))
+        std, scales = without_outliers(measurement.values, plate.at_sensors(start))
         measured = np.isfinite(measurement.values)
-        heard = measurement.known.sum(axis=(0, 2)) > measured.sum(axis=(0, 2)) / 2
+        heard = np.isfinite(std).sum(axis=(0, 2)) > measured.sum(axis=(0, 2)) / 2
         if heard.all():
             break
         dead[~dead] = ~heard  # elsewhere, or loose
+    measurement = replace(measurement, std=std)
     start[space.groups["sensor_scale"]] = (scales - 1) / KINDS["sensor_scale"].std
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
     searched = space.uncertain & ~space.of("gain")
@@ -607,43 +609,6 @@ def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> 
         tuple(compress(responses.sensors, dead)),
         tuple(compress((era.name for era in rig.eras), screened.dead_eras)),
     )
-
-
-def without_outliers(
-    measurement: Measurement, model: ComplexArray
-) -> tuple[Measurement, FloatArray]:
-    """Leave out outliers by a plate's responses (f, s, n), up to a gain of each row.
-
-    The worst of a row goes first, since each pulls the gain of its row. Returns the measurement
-    with errors as the rest shows them, infinite of outliers, and the scales of the sensors (s,).
-    """
-    values, scales = measurement.values, np.ones(model.shape[1])
-    used = np.isfinite(values)
-    for _ in range(_ROUNDS):
-        part, heard = np.where(used, values, np.nan), used.any(axis=(0, 2))
-        size = np.where(used, row_rms(part), np.inf)
-        gains = _gains_of(scales[:, None] * model, replace(measurement, std=size))
-        predicted = np.nan_to_num(gains)[:, None] * model
-        share = np.divide(part, predicted, out=np.full_like(part, np.nan), where=used)
-        scales[heard] = np.nanmedian(share.real[:, heard], axis=(0, 2))
-        scales = scales / np.median(scales)
-        raw = np.abs(values - scales[:, None] * predicted)
-        count = used.sum(axis=1, keepdims=True)
-        # A gain takes one of the row's values with it.
-        left = np.broadcast_to(1 - 1 / np.maximum(count, 2), values.shape)
-        std = np.where(used, noise_of(part, raw, left), np.inf)
-        deviation = np.where(used, raw / std / math.sqrt(2), 0.0)
-        worst = deviation.max(axis=1, keepdims=True)
-        kept = used & ~((deviation == worst) & (worst > _MAX_DEVIATION) & (count > 2))
-        if (kept == used).all():
-            break
-        used = kept
-    return replace(measurement, std=std), scales
-
-
-def _gains_of(model: ComplexArray, measurement: Measurement) -> ComplexArray:
-    """Gains (f, n) of responses (f, s, n) that fit a measurement best, NaN where it has none."""
-    return best_gains(model, np.zeros((*model.shape, 0)), measurement)[0]
 
 
 def _prior(

@@ -1,37 +1,14 @@
-"""Maximum a posteriori fit of a rig's parameters and of its plate's form errors to responses.
-
-    d_fes = g_fe a_fes(z) + noise
-
-d are measured values at frequency f, ERA e and sensor s, a those of the model as sensors of some
-scales read them, g a complex gain of every frequency and ERA. Gains enter linearly: the best ones
-follow from any model, so that only z is searched, with the derivatives of gains and residual by it
-(variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973). z has the rig's values,
-without a prior, and what tolerances hold: scales of sensors, form errors, and what data sheets know
-better. The free plate is solved once (`model.estimate.forward`).
-
-Noise has a constant part and a part in proportion to the response, both estimated from residuals.
-Outliers are found at the plate of the preceding check, the worst of a row first, since each pulls
-the gain of its row. Standard errors contain what tolerances leave undetermined: C = (J^T J)^-1 with
-the tolerances as rows of J, times chi² per degree of freedom where that is above 1. With gains
-projected out of J this is the Schur complement, so that of a gain
-
-    var g_fe = sigma_fe² + (dg_fe/dz) C (dg_fe/dz)^T
-
-with sigma of the noise, in which scales that all sensors have in common are included.
-"""
+"""The plate of a rig of data sheets at its sensors, and the values that are fitted of it."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.estimate.forward import ForwardModel, Sensor, jacobian
-from model.estimate.least_squares import Minimum, search
+from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.measurement import Responses
 from model.estimate.space import (
     KINDS,
@@ -46,19 +23,8 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 
 _LOWEST, _HIGHEST = 0.1, 1.2  # of modes that shift: of the lowest frequency, of the highest tone
-STARTS = [
-    (modulus, stiffness)
-    for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
-    for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]).tolist()
-]
-"""Logarithms of factors on modulus and stiffnesses from which to search."""
 
 _ADDED_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
-
-_MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_ROUNDS = 8
-_MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
-_SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 
 
 @dataclass(frozen=True)
@@ -285,208 +251,3 @@ def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> Sen
         masses=observation.masses,
         has_form=has_form,
     )
-
-
-def without_outliers(
-    values: ComplexArray, model: ComplexArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Scales of sensors (s,), noise (f, e) and the mask (f, e, s) of values without outliers.
-
-    values, model (f, e, s): measured, and by a plate, up to a gain of each frequency and ERA.
-    """
-    used, scales = np.isfinite(values), np.ones(values.shape[2])
-    heard = used.any(axis=(0, 1))
-    for _ in range(_ROUNDS):
-        weight = used / row_rms(values, used)[:, :, None]
-        gains, _ = project_gains(scales * model, values, weight)
-        predicted = np.nan_to_num(gains)[:, :, None] * model
-        share = np.divide(values, predicted, out=np.full_like(values, np.nan), where=used)
-        scales[heard] = np.nanmedian(share.real[:, :, heard], axis=(0, 1))
-        scales = scales / np.median(scales)
-        raw = np.abs(values - scales * predicted)
-        noise = _noise_of(values, raw, used)
-        kept = _without_worst(raw / noise[:, :, None], used)
-        if (kept == used).all():
-            break
-        used, heard = kept, kept.any(axis=(0, 1))
-    return scales, noise, used
-
-
-def _without_worst(deviation: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Drop the worst value of each row that has one beyond bounds and more than two values."""
-    deviation = np.where(used, deviation / np.sqrt(2), 0)
-    worst = deviation.argmax(axis=2)
-    f, e = np.nonzero((deviation.max(axis=2) > _MAX_DEVIATION) & (used.sum(axis=2) > 2))
-    kept = used.copy()
-    kept[f, e, worst[f, e]] = False
-    return kept
-
-
-def _noise_of(
-    values: ComplexArray,
-    raw: FloatArray,
-    used: NDArray[np.bool_],
-    left: FloatArray | None = None,
-) -> FloatArray:
-    """Standard deviation (f, e) of a value's real or imaginary part: sqrt(a² + b² size²).
-
-    From the medians of residuals raw (f, e, s), over rows from weak to strong. left (f, e, s):
-    share of noise power that a fit leaves in them; by default all but what a gain takes of its row.
-    """
-    size = row_rms(values, used)
-    sensors = used.sum(axis=2)
-    rows = np.flatnonzero((sensors >= 2).ravel())
-    floor = _SMALLEST_NOISE * size
-    if len(rows) < 4:
-        return floor
-    if left is None:
-        # A gain takes one of the row's values with it.
-        left = np.broadcast_to((1 - 1 / np.maximum(sensors, 2))[:, :, None], raw.shape)
-    telling = used & (left > _MIN_NOISE_LEFT)
-    power = np.full(raw.shape, np.nan)
-    power[telling] = raw[telling] ** 2 / left[telling] / 2
-    power = power.reshape(-1, used.shape[2])[rows]
-    order = np.argsort(size.ravel()[rows], kind="stable")
-    found, at = [], []
-    for group in np.array_split(order, min(12, len(rows) // 2)):
-        # The median of |z|² of complex noise with variance 2 is 2 log 2.
-        found.append(np.nanmedian(power[group]) / np.log(2))
-        at.append(np.median(size.ravel()[rows][group] ** 2))
-    scale = np.maximum(found, 1e-12 * np.array(at))
-    matrix = np.column_stack([1 / scale, np.array(at) / scale])
-    weight = np.linalg.norm(matrix, axis=0)
-    a2, b2 = nnls(matrix / weight, np.ones(len(scale)))[0] / weight
-    return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
-
-
-def fit_with_gains(
-    model: ForwardModel,
-    values: ComplexArray,
-    weight: FloatArray,
-    start: FloatArray,
-    searched: NDArray[np.bool_],
-    *,
-    prior: tuple[FloatArray, FloatArray] | None = None,
-    robust: float | None = None,
-    drives: Sequence[int] | None = None,
-    tolerance: float | None = None,
-) -> Minimum:
-    """Fit some parameters (p,) of a model to values (f, e, s), every gain g beside them.
-
-    weight (f, e, s): zero where nothing was measured; start (p,), of which searched are changed;
-    prior, robust: see `search`; drives (e,): number of the ERA that each channel drives, its own by
-    default; tolerance: relative standard deviation of |g| from 1, none by default.
-    """
-    inside = weight > 0
-    rows, of_eras = inside.any(axis=2), slice(None) if drives is None else list(drives)
-
-    def linearised(z: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        found, by_z = responses_of(model, z, searched)
-        found, by_z = found[:, of_eras], by_z[:, :, of_eras]
-        gains, left = project_gains(found, values, weight, tolerance=tolerance)
-        by_gain, slopes = projection_slopes(found, by_z, values, weight, tolerance=tolerance)
-        if tolerance is None:
-            return left[inside], slopes[:, inside].T
-        size = np.abs(gains)
-        wander = ((size - 1) / tolerance)[rows]
-        by_wander = ((gains.conj() * by_gain).real / size / tolerance)[:, rows]
-        return (
-            np.concatenate([left[inside], wander]),
-            np.hstack([slopes[:, inside], by_wander]).T,
-        )
-
-    bounds = np.array([model.space.lower, model.space.upper])
-    return search(linearised, start, bounds, searched, prior=prior, robust=robust)
-
-
-def responses_of(
-    model: ForwardModel, z: FloatArray, searched: NDArray[np.bool_]
-) -> tuple[ComplexArray, ComplexArray]:
-    """Responses (f, e, s) as sensors read them, and derivatives (n, f, e, s) by n searched."""
-    plate = model.at(z)
-    by_z = jacobian(plate, searched)[..., searched].transpose(3, 0, 2, 1)
-    return np.swapaxes(plate.responses, 1, 2), by_z
-
-
-def project_gains(
-    model: ComplexArray,
-    values: ComplexArray,
-    weight: FloatArray,
-    *,
-    tolerance: float | None = None,
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return gains (f, e) that minimize sum |weight (values - gain model)|², and that residual.
-
-    model, values, weight (f, e, s), weight zero where nothing was measured; the gain of a row
-    without values is NaN. tolerance: relative standard deviation of |gain| from 1, which adds
-    ((|gain| - 1) / tolerance)² to each row.
-    """
-    values = np.where(weight > 0, values, 0)
-    inner, power = _inner_and_power(model, values, weight)
-    if tolerance is None:
-        gains = np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
-    else:
-        size, precision = np.abs(inner), tolerance**-2
-        magnitude = (size + precision) / (power + precision)
-        gains = magnitude * np.where(size > 0, inner / np.where(size > 0, size, 1), 1)
-    residual = weight * (values - np.nan_to_num(gains)[..., None] * model)
-    return gains, residual
-
-
-def projection_slopes(
-    model: ComplexArray,
-    slopes: ComplexArray,
-    values: ComplexArray,
-    weight: FloatArray,
-    *,
-    tolerance: float | None = None,
-) -> tuple[ComplexArray, ComplexArray]:
-    """Derivatives (n, f, e) of the gains of `project_gains`, and (n, f, e, s) of the residual.
-
-    slopes (n, f, e, s): derivatives of the model.
-    """
-    values = np.where(weight > 0, values, 0)
-    inner, power = _inner_and_power(model, values, weight)
-    gains = np.nan_to_num(project_gains(model, values, weight, tolerance=tolerance)[0])
-    by_inner = np.einsum("nfes,fes->nfe", slopes.conj(), weight**2 * values)
-    by_power = 2 * np.einsum("nfes,fes->nfe", slopes, weight**2 * model.conj()).real
-    if tolerance is None:
-        by_gain = (by_inner - gains * by_power) / np.where(power > 0, power, 1)
-    else:
-        size = np.where(np.abs(inner) > 0, np.abs(inner), 1)
-        phase_factor = np.where(np.abs(inner) > 0, inner / size, 1)
-        turned = phase_factor.conj() * by_inner
-        by_magnitude = (turned.real - np.abs(gains) * by_power) / (power + tolerance**-2)
-        by_gain = phase_factor * (by_magnitude + 1j * np.abs(gains) / size * turned.imag)
-    return by_gain, -weight * (by_gain[..., None] * model + gains[..., None] * slopes)
-
-
-def _inner_and_power(
-    model: ComplexArray, values: ComplexArray, weight: FloatArray
-) -> tuple[ComplexArray, FloatArray]:
-    """Weighted inner products of model and values, and squares of the model, (f, e)."""
-    squares = weight**2
-    inner = np.einsum("fes,fes->fe", model.conj(), squares * values)
-    power = np.einsum("fes,fes->fe", model.real**2 + model.imag**2, squares)
-    return np.asarray(inner), np.asarray(power)
-
-
-def row_rms(values: ComplexArray, used: NDArray[np.bool_] | None = None) -> FloatArray:
-    """Root mean square of each row of values (f, e, s) over its sensors; 1 for an empty row."""
-    used = np.isfinite(values) if used is None else used
-    power = np.where(used, np.abs(np.where(used, values, 0)) ** 2, 0).sum(axis=2)
-    rms = np.sqrt(power / np.maximum(used.sum(axis=2), 1))
-    return np.where(rms > 0, rms, 1.0)
-
-
-def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
-    """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
-
-    1 for the same shape with any gain, about 1/s for noise. Values that are not finite are ignored.
-    """
-    measured = np.isfinite(values)
-    values = np.where(measured, values, 0)
-    model = np.where(measured, model, 0)
-    inner = np.abs((model.conj() * values).sum(axis=-1)) ** 2
-    power = (np.abs(values) ** 2).sum(axis=-1) * (np.abs(model) ** 2).sum(axis=-1)
-    return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)

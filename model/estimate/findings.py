@@ -36,14 +36,11 @@ from scipy.special import chdtrc, ndtr, stdtr
 from model.arrays import ComplexArray, FloatArray, best_by, best_of, ranked_by
 from model.errors import InputError
 from model.estimate.calibration_fit import (
-    STARTS,
     SensedPlate,
-    modal_assurance,
     plate_of,
     sensed_plate,
-    without_outliers,
 )
-from model.estimate.fit import Fit, best_gains, fit, row_rms
+from model.estimate.fit import Fit, best_gains, fit, gains_of, row_rms, without_outliers
 from model.estimate.identify import solved_for, value_rows
 from model.estimate.measurement import Measurement, Responses, typical
 from model.finger import Grid
@@ -53,6 +50,13 @@ from model.rig.rig_summary import exciters_of, sections_of
 from model.spectral.modes import stretched
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad
 from model.structure.exciter import Actuator
+
+STARTS = [
+    (modulus, stiffness)
+    for modulus in np.log(np.linspace(0.6, 1.6, 11)).tolist()
+    for stiffness in np.log([0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.5]).tolist()
+]
+"""Logarithms of factors on modulus and stiffnesses from which to search."""
 
 FALSE_ALARM = 0.01
 """Share of plates as written that a test of values, form or thickness calls wrong."""
@@ -331,8 +335,7 @@ def _outliers(values: ComplexArray, predicted: ComplexArray) -> NDArray[np.bool_
     not accidental, but show that the plate, its wiring or the sensor's place is another one.
     """
     known = np.isfinite(values)
-    used = without_outliers(values.swapaxes(1, 2), predicted.swapaxes(1, 2))[-1].swapaxes(1, 2)
-    found = known & ~used
+    found = known & ~np.isfinite(without_outliers(values, predicted)[0])
     found[:, found.sum(axis=(0, 2)) > known.sum(axis=(0, 2)) / 2] = False
     return found & bool(found.sum() <= _MAX_OUTLIERS * known.sum())
 
@@ -343,12 +346,17 @@ def at_start(plate: SensedPlate, drives: Sequence[int] | None = None) -> Complex
     return found if drives is None else found[..., list(drives)]
 
 
-def gains_of(model: ComplexArray, values: ComplexArray) -> ComplexArray:
-    """Gains (f, n) of a model (f, s, n) that explain values most, NaN where none is known."""
-    known = np.isfinite(values)
-    inner = np.where(known, model.conj() * np.where(known, values, 0), 0).sum(axis=1)
-    power = np.where(known, np.abs(model) ** 2, 0).sum(axis=1)
-    return np.asarray(np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan))
+def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
+    """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
+
+    1 for the same shape with any gain, about 1/s for noise. Values that are not finite are ignored.
+    """
+    measured = np.isfinite(values)
+    values = np.where(measured, values, 0)
+    model = np.where(measured, model, 0)
+    inner = np.abs((model.conj() * values).sum(axis=-1)) ** 2
+    power = (np.abs(values) ** 2).sum(axis=-1) * (np.abs(model) ** 2).sum(axis=-1)
+    return np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan)
 
 
 @dataclass(frozen=True, eq=False)

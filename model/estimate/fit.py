@@ -319,6 +319,43 @@ def fit_to_noise(
     return found
 
 
+def without_outliers(values: ComplexArray, model: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Find the outliers of values by a plate's responses, up to a gain of each row, (f, s, n).
+
+    The worst of a row goes first, since each pulls the gain of its row. Returns the errors of each
+    part as the rest shows them, infinite of outliers (f, s, n), and the scales of the sensors (s,).
+    """
+    used, scales = np.isfinite(values), np.ones(values.shape[1])
+    for _ in range(_ROUNDS):
+        part, heard = np.where(used, values, np.nan), used.any(axis=(0, 2))
+        predicted = np.nan_to_num(gains_of(scales[:, None] * model, part))[:, None] * model
+        share = np.divide(part, predicted, out=np.full_like(part, np.nan), where=used)
+        scales[heard] = np.nanmedian(share.real[:, heard], axis=(0, 2))
+        scales = scales / np.median(scales)
+        raw = np.abs(values - scales[:, None] * predicted)
+        count = used.sum(axis=1, keepdims=True)
+        # A gain takes one of the row's values with it.
+        left = np.broadcast_to(1 - 1 / np.maximum(count, 2), values.shape)
+        std = np.where(used, noise_of(part, raw, left), np.inf)
+        deviation = np.where(used, raw / std / np.sqrt(2), 0.0)
+        worst = deviation.max(axis=1, keepdims=True)
+        kept = used & ~((deviation == worst) & (worst > _MAX_DEVIATION) & (count > 2))
+        if (kept == used).all():
+            break
+        used = kept
+    return np.where(used, std, np.inf), scales
+
+
+def gains_of(
+    model: ComplexArray, values: ComplexArray, weight: FloatArray | float = 1.0
+) -> ComplexArray:
+    """Gains (f, n) of a model (f, s, n) that explain values best, NaN where none is known."""
+    squares = np.where(np.isfinite(values), weight, 0.0) ** 2
+    inner = (squares * model.conj() * np.where(squares > 0, values, 0)).sum(axis=1)
+    power = (squares * np.abs(model) ** 2).sum(axis=1)
+    return np.asarray(np.where(power > 0, inner / np.where(power > 0, power, 1), np.nan))
+
+
 def row_rms(values: ComplexArray) -> FloatArray:
     """Root mean square of values (f, s, n) over the sensors (f, 1, n), 1 without any."""
     known = np.isfinite(values)

@@ -36,7 +36,6 @@ from model.estimate.findings import (
     best_wiring,
     compared,
     exchanged_sensors,
-    gains_of,
     match_plate,
     match_responses,
     match_shapes,
@@ -45,7 +44,7 @@ from model.estimate.findings import (
     plate_finding,
     reversed_axes,
 )
-from model.estimate.fit import row_rms
+from model.estimate.fit import gains_of, row_rms
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Responses,

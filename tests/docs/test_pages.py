@@ -360,11 +360,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ["plate", "map", RIG, "--mesh", "12x9", "--drive", "SW=110"],
         ["plate", "show", RIG],
         ["plate", "materials"],
-        ["plate", "template", RIG, "-o", "template.svg"],
+        pytest.param(["plate", "template", RIG, "-o", "template.svg"], marks=pytest.mark.long),
         ["table", "build", RIG, "-o", "another.npz", *COARSE],
         ["table", "show", "table.npz"],
         ["table", "query", "table.npz", "--target", "0.06,0.05", "--quiet", "0.2,0.1"],
-        ["table", "export", "table.npz", "--format", "csv", "-o", "table.csv"],
+        pytest.param(
+            ["table", "export", "table.npz", "--format", "csv", "-o", "table.csv"],
+            marks=pytest.mark.long,
+        ),
     ],
     ids=lambda arguments: " ".join(arguments[:2]),
 )

@@ -177,6 +177,7 @@ def test_a_course_that_stays_faint_is_answered_as_a_strong_one(quiet: tuple[Poin
         assert abs(0.02 * other.phasor / tone.phasor - 1) < 1e-3
 
 
+@pytest.mark.long
 def test_promise_over_a_course_is_kept() -> None:
     """By nine of ten of 120 plates in time, beside a quiet finger and beside a steady content."""
     table, rig, stimulus = smooth_table(), smooth_rig(), Stimulus(20.0, course=strokes())

@@ -522,7 +522,7 @@ def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> Compl
 def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:
     """Derivatives of the responses by a mass [kg] at points (p, 2) [m], (f, s, n, p)."""
     reach = reach_to(plate, points)
-    return _outer(plate, reach, reach, _per_frequency(plate, len(points)))
+    return _outer(plate, reach, reach, plate.model.omega[:, None] ** 2)
 
 
 def reach_to(plate: PlateAt, points: FloatArray) -> ComplexArray:
@@ -589,7 +589,7 @@ def _by_form(plate: PlateAt) -> Columns:
         return {}
     reach = plate.reach @ model.form.cells.T
     share = model.rig.plate.mass * functions.thickness
-    by_mass = _outer(plate, reach, reach, share * _per_frequency(plate, reach.shape[-1]))
+    by_mass = _outer(plate, reach, reach, share * plate.model.omega[:, None] ** 2)
     seen, driven = plate.reach[:, model.observed], plate.reach[:, _pushed(plate)].swapaxes(1, 2)
     factor = -(functions.q * functions.thickness)[:, None, None]
     stretched = [
@@ -616,14 +616,13 @@ def _by_places(plate: PlateAt) -> Columns:
     rows = located.shape_slopes @ plate.moved
     rows = rows + combined(functions.truncated(TERMS), located.truncated_slopes)
     reach, own = plate.left @ rows.swapaxes(1, 2), plate.left[:, :, moved]
-    ones = np.ones((len(model.omega), len(moved)))
-    by_place = _outer(plate, own, reach, ones)
-    by_place += _outer(plate, reach, own, ones)
+    ones = np.ones((len(model.omega), 1))
+    by_place = _outer(plate, own, reach, ones) + _outer(plate, reach, own, ones)
     places, of_masses, of_sensors = np.split(by_place, [2 * n, 2 * (n + model.mass_count)], axis=-1)
     masses = np.empty((*by_place.shape[:-1], model.mass_count, 3), dtype=complex)
     masses[..., 1:] = of_masses.reshape(masses[..., 1:].shape)
-    by_mass = _per_frequency(plate, model.mass_count)
-    masses[..., 0] = _held(plate, model.movable[n : n + model.mass_count], -by_mass)
+    at = model.movable[n : n + model.mass_count]
+    masses[..., 0] = _held(plate, at, -(model.omega[:, None] ** 2))
     return {
         "place": places,
         "sensor_place": of_sensors,
@@ -666,6 +665,9 @@ def _by_gains(plate: PlateAt) -> Columns:
     by_inertia, by_drag = f**2 * plate.lag, -1j * f * plate.lag
     count = len(plate.values.delays)
     lateness = plate.model.lateness if count else np.zeros((*Y.shape[1:], 0))
+    # A scale may be zero.
+    unscaled = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late * plate.seen
+    by_scale = np.eye(Y.shape[1], len(plate.values.sensor_scales))[:, None]
     return {
         "gain": by_drive,
         "phase": 1j * by_drive,
@@ -674,17 +676,8 @@ def _by_gains(plate: PlateAt) -> Columns:
         "delay": -1j * plate.model.omega[:, None, None, None] * Y[..., None] * lateness,
         "sensor_gain": by_sensor,
         "sensor_phase": 1j * by_sensor,
-        "sensor_scale": _by_scale(plate),
+        "sensor_scale": unscaled[..., None] * by_scale,
     }
-
-
-def _by_scale(plate: PlateAt) -> ComplexArray:
-    """Derivatives by the scale of each sensor, which may be zero."""
-    count = len(plate.values.sensor_scales)
-    plain = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late
-    return np.asarray(
-        (plain * plate.seen)[..., None] * np.eye(len(plate.model.observed), count)[:, None]
-    )
 
 
 _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
@@ -713,11 +706,6 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
         "sensor_scale",
     ),
 }
-
-
-def _per_frequency(plate: PlateAt, count: int) -> FloatArray:
-    """omega² for a number of masses, (f, count)."""
-    return np.repeat((plate.model.omega**2)[:, None], count, axis=1)
 
 
 def _held(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:

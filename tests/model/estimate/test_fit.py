@@ -23,7 +23,7 @@ from benchmarks.calibration.hidden_plates import (
     true_values,
 )
 from model.arrays import ComplexArray, FloatArray
-from model.estimate import findings, least_squares
+from model.estimate import findings
 from model.estimate.calibrate import calibrate
 from model.estimate.calibration_fit import SensedPlate, sensed_plate
 from model.estimate.fit import fit
@@ -104,22 +104,6 @@ def test_jacobians_of_searches_are_exact(
     monkeypatch.setattr(optimize, "least_squares", checking)
     searched()
     assert checked
-
-
-def test_residuals_found_are_without_the_robust_weights() -> None:
-    """A line through four points, one of them far off, whose weight in the sum is small."""
-    A, values = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([1.0, 2.0, 3.0, 40.0])
-    found = least_squares.search(
-        lambda x: (A @ x - values + 0j, A + 0j),
-        np.zeros(1),
-        np.array([[-9.0], [9.0]]),
-        np.array([True]),
-        prior=(np.zeros((0, 1)), np.zeros(0)),
-        robust=0.1,
-    )
-    assert found.x[0] < 2.0  # 7.1 by least squares
-    np.testing.assert_allclose(found.jacobian, np.vstack([A, 0 * A]))
-    np.testing.assert_allclose(found.residuals[:4], A @ found.x - values)
 
 
 FINGER = PointLoad(0.1, 0.08, stiffness=500.0, damping=2.0, mass=0.003)

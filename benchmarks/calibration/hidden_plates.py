@@ -200,7 +200,7 @@ def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
     points = FIELD_POINTS * [rig.plate.length, rig.plate.width]
     frequencies = np.array([row[0] for row in rig.eras[0].gains])
     true = true.swapaxes(1, 2)
-    fields = gains_of(rig)[:, None] * sensed_plate(rig, points, frequencies).at_sensors()
+    fields = gains_of(rig)[:, None] * sensed_plate(rig, points, frequencies).responses()
     gains = best_gains(fields, true)
     left = true - gains[:, None] * fields
     off, known = np.log(gains), rig.uncertainty

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
-from model.estimate.calibration_fit import Parameter, SensedPlate, sensed_plate
+from model.estimate.calibration_fit import Parameter, SensedPlate, plate_of
 from model.estimate.fit import Fit, fit, fit_to_noise, gains_of, row_rms, without_outliers
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
@@ -249,7 +249,7 @@ class Calibration:
     def before(self) -> ComplexArray:
         """Responses of the rig as it was (f, s, eras) [1/s²]."""
         gains = np.array([era.gain(self.frequencies) for era in self.plate.rig.eras]).T
-        return np.asarray(gains[:, None] * self.plate.at_sensors())
+        return np.asarray(gains[:, None] * self.plate.responses())
 
     @property
     def after(self) -> ComplexArray:
@@ -363,7 +363,7 @@ class Calibration:
         """Responses of the rig without form errors and gains (f, s, eras) [1/s²]."""
         before = self.plate.model
         model = replace(before, form=None, law=None, last_places={})
-        return replace(self.plate, model=model).of(self._fitted).at_sensors()
+        return replace(self.plate, model=model).of(self._fitted).responses()
 
     @cached_property
     def _gains(self) -> ComplexArray:
@@ -507,7 +507,7 @@ class Calibration:
         ERAs stay at the places of the fit, since a rig states the errors of places.
         """
         at_places = np.where(self.plate.model.space.of("place"), self.fit.x, self._plain.x)
-        model, known = self.plate.at_sensors(at_places), self.fit.measurement.known
+        model, known = self.plate.responses(at_places), self.fit.measurement.known
         lacks = self._gains_for(model)[:, None] * model - self.fit.predicted
         squares, all_squares = (
             np.where(known, np.abs(each) ** 2, 0.0).sum(axis=1)
@@ -582,12 +582,12 @@ def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> 
         check_enough_sensors(~dead, responses)
         live = responses.without(dead)
         live.values[:, screened.dead_eras] = np.nan
-        plate = sensed_plate(rig, live.points, live.frequencies, masses=live.masses, has_form=True)
+        plate = plate_of(rig, live, has_form=True)
         space = plate.model.space
         start = np.zeros(space.size)
         start[plate.numbers] = screened.start
         measurement = replace(live.as_measurement(), free_gains=True)
-        std, scales = without_outliers(measurement.values, plate.at_sensors(start))
+        std, scales = without_outliers(measurement.values, plate.responses(start))
         measured = np.isfinite(measurement.values)
         heard = np.isfinite(std).sum(axis=(0, 2)) > measured.sum(axis=(0, 2)) / 2
         if heard.all():
@@ -616,14 +616,14 @@ def _prior(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (p, p) of the parameters beforehand.
 
-    Nothing holds the rig's values but some (`SensedPlate.held`), nor the scales of a mask (s,)
+    Nothing holds the rig's values but those of sheets and feet, nor the scales of a mask (s,)
     of sensors beside those of a start (p,). Where all scales are unknown, responses do not tell
     what they have in common from the gains: the median of good sensors is known beforehand.
     """
     space = plate.model.space
     own = np.arange(space.size)[space.groups["sensor_scale"]]
     mean, deviations = np.zeros(space.size), np.ones(space.size)
-    deviations[plate.numbers[~plate.held]] = _UNKNOWN
+    deviations[plate.numbers[plate.largest_errors == 1]] = _UNKNOWN
     deviations[own[is_unknown]] = _UNKNOWN
     mean[own[is_unknown]] = start[own[is_unknown]]
     covariance = np.diag(deviations**2)

@@ -94,11 +94,6 @@ class SensedPlate:
         return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras, *feet)
 
     @cached_property
-    def held(self) -> NDArray[np.bool_]:
-        """Mask of the fitted values that a prior holds (n,)."""
-        return np.asarray(self.largest_errors != 1)
-
-    @cached_property
     def largest_errors(self) -> FloatArray:
         """Standard errors (n,), in deviations, beyond which a fitted value is not identified.
 
@@ -153,13 +148,8 @@ class SensedPlate:
     def responses(self, z: FloatArray | None = None) -> ComplexArray:
         """Acceleration per base displacement of each ERA at z (p,), by default the rig's values.
 
-        Shape (f, e, s) [1/s²].
+        Shape (f, s, eras) [1/s²].
         """
-        z = np.zeros(self.model.space.size) if z is None else z
-        return np.swapaxes(self.model.at(z).responses, 1, 2)
-
-    def at_sensors(self, z: FloatArray | None = None) -> ComplexArray:
-        """Responses to a drive without gain at z (p,), by default at the rig's values (f, s, n)."""
         return self.model.at(np.zeros(self.model.space.size) if z is None else z).responses
 
     def rig_at(self, z: FloatArray) -> Rig:

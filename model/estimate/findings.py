@@ -340,12 +340,6 @@ def _outliers(values: ComplexArray, predicted: ComplexArray) -> NDArray[np.bool_
     return found & bool(found.sum() <= _MAX_OUTLIERS * known.sum())
 
 
-def at_start(plate: SensedPlate, drives: Sequence[int] | None = None) -> ComplexArray:
-    """Responses of a plate with its rig's values (f, s, n), of all ERAs or of those driven."""
-    found = plate.model.at(np.zeros(plate.model.space.size)).responses
-    return found if drives is None else found[..., list(drives)]
-
-
 def modal_assurance(values: ComplexArray, model: ComplexArray) -> FloatArray:
     """Modal assurance criterion |a^H d|² / (|a|² |d|²) of shapes (..., s); NaN of empty ones.
 
@@ -712,7 +706,7 @@ def compared(
     for key, (_, factors) in of.items():
         for factor in factors:
             if other := solved(key, factor):
-                scores.append((_misfit(values, at_start(other, drives)), factor, key))
+                scores.append((_misfit(values, other.responses()[..., list(drives)]), factor, key))
     best = {key: (score, factor) for score, factor, key in ranked_by(scores, lambda each: each[0])}
     fits = []
     for key, (_, factor) in ranked_by([*best.items()], lambda each: -each[1][0])[:_FITTED]:

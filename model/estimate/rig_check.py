@@ -32,7 +32,6 @@ from model.estimate.findings import (
     Hypothesis,
     Match,
     ShapeMatch,
-    at_start,
     best_wiring,
     compared,
     exchanged_sensors,
@@ -318,7 +317,7 @@ def _dead_channels(
 
     shapes: if given, weak channels without the shape of an ERA, whose response is noise, count too.
     """
-    share = np.abs(values / at_start(plate))
+    share = np.abs(values / plate.responses())
     size = np.array([typical(share[..., number]) for number in range(share.shape[2])])
     dead = size < _DEAD
     if shapes is not None:

@@ -45,7 +45,7 @@ FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
 def measured(rig: Rig) -> ComplexArray:
     """Responses (f, e, s) of the rig with other gains, noise, and one value left out."""
     rng = np.random.default_rng(3)
-    values = sensed_plate(rig, POINTS, FREQUENCIES).responses()
+    values = sensed_plate(rig, POINTS, FREQUENCIES).responses().swapaxes(1, 2)
     values = values * rng.uniform(0.8, 1.2, (*values.shape[:2], 1))
     values = values * (1 + 0.1 * rng.standard_normal(values.shape))
     values[1, 2, 3] = np.nan
@@ -297,7 +297,7 @@ def test_form_errors_are_those_of_a_plate_solved_anew(
 
     space, z = sensed.model.space, np.zeros(sensed.model.space.size)
     z[space.groups[kind]] = values / space.std[space.groups[kind]]
-    found = np.swapaxes(sensed.model.at(z).responses, 1, 2)
+    found = sensed.responses(z)
     built = other(rig)
     points = points * [built.plate.length / plate.length, 1]
     if kind == "sensor_place":

@@ -147,7 +147,8 @@ def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: P
     for masses in (responses.masses, None):
         found = identify(lossy, replace(responses, masses=masses).as_measurement())
         gains = np.array([era.gain(FREQUENCIES) for era in found.rig.eras]).T
-        field = sensed_plate(found.rig, POINTS, FREQUENCIES).responses() * gains[:, :, None]
+        field = sensed_plate(found.rig, POINTS, FREQUENCIES).responses().swapaxes(1, 2)
+        field = field * gains[:, :, None]
         common = np.vdot(field, exact) / np.vdot(field, field)
         errors.append(np.linalg.norm(common * field - exact) / np.linalg.norm(exact))
     assert errors[0] < 0.03

@@ -22,9 +22,8 @@ import numpy as np
 from benchmarks.direct_plate import direct_acceleration
 from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.calibration_fit import sensed_plate
 from model.estimate.fit import gains_of as best_gains
-from model.estimate.fit import row_rms
+from model.estimate.fit import row_rms, sensed_plate
 from model.estimate.measurement import Responses, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
@@ -173,7 +172,7 @@ def measure(
 
 
 def true_values(rig: Rig) -> list[float]:
-    """The fitted values in the order of `model.estimate.calibration_fit.SensedPlate.rows`."""
+    """The fitted values in the order of `model.estimate.fit.SensedPlate.rows`."""
     values = [rig.plate.material.E, rig.plate.loss_factor]
     return values + [v for era in rig.eras for v in (era.stiffness, era.damping, era.in_time.mass)]
 

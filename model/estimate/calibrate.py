@@ -22,8 +22,17 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
-from model.estimate.calibration_fit import Parameter, SensedPlate, plate_of
-from model.estimate.fit import Fit, fit, fit_to_noise, gains_of, row_rms, without_outliers
+from model.estimate.fit import (
+    Fit,
+    Parameter,
+    SensedPlate,
+    fit,
+    fit_to_noise,
+    gains_of,
+    plate_of,
+    row_rms,
+    without_outliers,
+)
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
 from model.estimate.measurement import (

@@ -35,12 +35,17 @@ from scipy.special import chdtrc, ndtr, stdtr
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_of, ranked_by
 from model.errors import InputError
-from model.estimate.calibration_fit import (
+from model.estimate.fit import (
+    Fit,
     SensedPlate,
+    best_gains,
+    fit,
+    gains_of,
     plate_of,
+    row_rms,
     sensed_plate,
+    without_outliers,
 )
-from model.estimate.fit import Fit, best_gains, fit, gains_of, row_rms, without_outliers
 from model.estimate.identify import solved_for, value_rows
 from model.estimate.measurement import Measurement, Responses, typical
 from model.finger import Grid

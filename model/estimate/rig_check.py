@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
 from model.errors import InputError
 from model.estimate.calibrate import wrong_size
-from model.estimate.calibration_fit import SensedPlate, plate_of
 from model.estimate.findings import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
@@ -43,7 +42,7 @@ from model.estimate.findings import (
     plate_finding,
     reversed_axes,
 )
-from model.estimate.fit import gains_of, row_rms
+from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Responses,

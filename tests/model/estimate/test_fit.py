@@ -25,8 +25,7 @@ from benchmarks.calibration.hidden_plates import (
 from model.arrays import ComplexArray, FloatArray
 from model.estimate import findings
 from model.estimate.calibrate import calibrate
-from model.estimate.calibration_fit import SensedPlate, sensed_plate
-from model.estimate.fit import fit
+from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.measurement import Responses
 from model.estimate.rig_check import check_consistency
 from model.estimate.space import KINDS, MASS_CELLS, reduced_modes

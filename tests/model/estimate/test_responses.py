@@ -17,7 +17,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.calibration_fit import sensed_plate
+from model.estimate.fit import sensed_plate
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
     Responses,

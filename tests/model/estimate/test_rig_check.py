@@ -26,9 +26,8 @@ from long_form import shortly
 from model.errors import InputError
 from model.estimate import findings
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate
-from model.estimate.calibration_fit import sensed_plate
 from model.estimate.findings import MAX_FIT_ERROR, TEXTS, ShapeMatch, match_plate
-from model.estimate.fit import without_outliers
+from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
     MeasuredPlate,
     Responses,

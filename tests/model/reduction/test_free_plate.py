@@ -16,7 +16,7 @@ from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.config.document import ConfigError
 from model.errors import InputError
-from model.estimate.calibration_fit import sensed_plate
+from model.estimate.fit import sensed_plate
 from model.estimate.forward import ForwardModel, Sensor
 from model.estimate.space import space_of
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble

@@ -33,7 +33,7 @@ from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, So
 from gateway_bench import wait_for
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
-from model.estimate.calibration_fit import sensed_plate
+from model.estimate.fit import sensed_plate
 from model.estimate.identify import identify
 from model.estimate.measurement import (
     MeasuredPlate,

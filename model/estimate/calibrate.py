@@ -23,18 +23,21 @@ from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import (
+    HELD_OUT_FOLDS,
     Fit,
     Parameter,
     SensedPlate,
+    confusions,
+    estimate_table,
     fit,
     fit_to_noise,
     gains_of,
     plate_of,
+    quality_rows,
     row_rms,
     without_outliers,
 )
 from model.estimate.forward import jacobian, viscous_difference
-from model.estimate.identify import HELD_OUT_FOLDS, quality_rows, value_rows
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Responses,
@@ -762,16 +765,21 @@ def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
 
 def change_rows(calibration: Calibration) -> list[str]:
     """Table of all parameters, and of ERAs that are not at the rig's places."""
-    places = {era.name: (era.x, era.y) for era in calibration.plate.rig.eras}
+    fit, places = calibration.fit, {era.name: (era.x, era.y) for era in calibration.plate.rig.eras}
+    numbers = calibration.plate.numbers
+    own = fit.covariance[np.ix_(numbers, numbers)]
+    alike = confusions([each.parameter.name for each in calibration.parameters], own)
     moved = [
         (
             f"{name} place",
-            _millimetres(places[name]),
-            f"{_millimetres(place)} ± {_millimetres(error)} mm",
+            f"{_millimetres(place)} mm",
+            f"± {_millimetres(error)} mm",
+            f"{_millimetres(places[name])} mm",
+            "",
         )
         for name, (place, error) in calibration.moved.items()
     ]
-    return value_rows([*map(_change, calibration.parameters), *moved])
+    return estimate_table([*map(_estimate, calibration.parameters, alike), *moved])
 
 
 def gain_rows(calibration: Calibration) -> list[str]:
@@ -897,12 +905,20 @@ def _millimetres(place: Point) -> str:
     return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
 
 
-def _change(fitted: FittedParameter) -> tuple[str, str, str]:
+def _estimate(fitted: FittedParameter, alike: str) -> tuple[str, str, str, str, str]:
+    """Row of `estimate_table` of a value; alike: name of what it is hardly told apart from."""
     parameter = fitted.parameter
     before = in_display_unit(fitted.before, parameter.unit, digits=5)
     if fitted.standard_error is None:
-        return parameter.name, before, "not identified"
-    note = "  (at its bound)" if fitted.at_bound else ""
-    after = with_error(fitted.value, fitted.standard_error, parameter.unit)
-    share = f" ({100 * (fitted.value / fitted.before - 1):+.1f} %)" if fitted.before else ""
-    return parameter.name, before, f"{after}{share}{note}"
+        return parameter.name, "", "", before, "not identified"
+    value, _, error = with_error(fitted.value, fitted.standard_error, parameter.unit).partition(
+        " ± "
+    )
+    unit = error.partition(" ")[1:]
+    notes = [
+        f"{100 * (fitted.value / fitted.before - 1):+.1f} %" if fitted.before else "",
+        "at its bound" if fitted.at_bound else "",
+        f"hardly told apart from {alike}" if alike else "",
+    ]
+    shown = value + "".join(unit)
+    return parameter.name, shown, f"± {error}", before, ", ".join(filter(None, notes))

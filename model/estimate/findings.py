@@ -46,7 +46,7 @@ from model.estimate.fit import (
     sensed_plate,
     without_outliers,
 )
-from model.estimate.identify import solved_for, value_rows
+from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement, Responses, typical
 from model.finger import Grid
 from model.quantities import in_display_unit, percent
@@ -775,16 +775,13 @@ def plate_finding(match: Match, hypotheses: Sequence[Hypothesis]) -> Finding:
         name = match.plate.rows[at].name
         why = f"{name} would be off by {abs(match.z[at]):.1f} standard deviations"
     good = [each for each in hypotheses if each.explains and each.share >= _MIN_SHARE]
-    changes = [
-        (
-            each.key,
-            in_display_unit(each.expected, each.unit),
-            f"{in_display_unit(each.value, each.unit)} would explain it: "
-            f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}",
-        )
+    width = max((len(each.key) for each in good), default=0)
+    rows = [
+        f"  {each.key:{width}}  {in_display_unit(each.expected, each.unit)} -> "
+        f"{in_display_unit(each.value, each.unit)} would explain it: "
+        f"{percent(each.match.error)} unexplained, likelihood {percent(each.share)}"
         for each in good
     ]
-    rows = [f"  {row}" for row in value_rows(changes)]
     if good:
         rows.append(f"  correct {good[0].key} in the rig, or the plate; then check again")
     else:

@@ -36,8 +36,12 @@ from model.estimate.space import (
     rig_with,
     space_by_sheets,
 )
+from model.quantities import percent
 from model.reduction.free_plate import solve_free_plate
-from model.rig.rig import Rig
+from model.rig.rig import Rig, Uncertainty
+
+HELD_OUT_FOLDS = 5
+"""One path or sensor in so many is held out."""
 
 _CONVERGED = 1e-7  # of the cost and of x, relative
 _MIN_VARIANCE = 1e-14  # of a prior, relative to its largest
@@ -437,17 +441,17 @@ def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
     return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
 
 
-def confusions(space: Space, covariance: FloatArray) -> list[str]:
-    """Name what each parameter is hardly told apart from, "" where it is from all others.
+def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
+    """Name what each of some parameters is hardly told apart from, "" where it is from all others.
 
-    By the largest correlation of the errors of a covariance (p, p) of x.
+    By the largest correlation of the errors of a covariance (p, p).
     """
     std = np.sqrt(np.diagonal(covariance))
     std = np.where(std > 0, std, np.inf)
     alike = np.abs(covariance / np.outer(std, std)) * ~np.eye(len(std), dtype=bool)
     nearest = alike.argmax(axis=1)
     return [
-        space.names[other] if alike[own, other] > _ALIKE else ""
+        names[other] if alike[own, other] > _ALIKE else ""
         for own, other in enumerate(nearest.tolist())
     ]
 
@@ -457,6 +461,22 @@ def estimate_table(rows: Sequence[tuple[str, str, str, str, str]]) -> list[str]:
     cells = [("", "found", "standard error", "before", "note"), *rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]
+
+
+def quality_rows(
+    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
+) -> list[str]:
+    """Lines of the uncertainty that the new rig states, and of the held-out prediction.
+
+    held_out: what was held out; error: of its prediction, relative to the response, None where too
+    little was measured to hold any out; beside: a further note on the fit's errors.
+    """
+    found = (
+        f"{held_out} predicted within {percent(error)} of the response"
+        if error is not None
+        else "too few sensors to leave any out"
+    )
+    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
 
 
 def likeliest(found: Sequence[Fit]) -> Fit:

@@ -45,12 +45,14 @@ from model.config.document import KeyPath
 from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
 from model.estimate.fit import (
+    HELD_OUT_FOLDS,
     Fit,
     confusions,
     estimate_table,
     fit,
     likeliest,
     prediction_errors,
+    quality_rows,
     relative_rms,
 )
 from model.estimate.forward import ForwardModel, Sensor, jacobian
@@ -146,9 +148,6 @@ _THEORY = {
     "damping": KINDS["damping_each"].theory,
     "place": KINDS["place"].theory,
 }
-
-HELD_OUT_FOLDS = 5
-"""One path or sensor in so many is held out."""
 
 _MAX_PREDICTION_ERROR = 0.1  # of the rms at a tone; less certain predictions are no test
 _MIN_PREDICTED = 16  # values
@@ -824,9 +823,8 @@ def parameter_rows(found: Identification) -> list[str]:
     Those of the plate come first, then ERA by ERA. What was found is the difference from the rig.
     """
     places = {era.name: place for place, era in enumerate(found.rig.eras)}
-    confused = dict(
-        zip(found.fitted.space.names, confusions(found.fitted.space, found.covariance), strict=True)
-    )
+    names = found.fitted.space.names
+    confused = dict(zip(names, confusions(names, found.covariance), strict=True))
     rows = []
     for each in estimates(found):
         if each.kind in _ALWAYS_LISTED or abs(each.difference) > _LISTED_STDS * each.error:
@@ -868,28 +866,6 @@ def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
             f"dB; nine of ten plates {each.promised:.1f} dB"
         )
     return rows
-
-
-def value_rows(changes: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Table of values: name, before, and after with its standard error, as texts with units."""
-    width = max((len(name) for name, _, _ in changes), default=0)
-    return [f"{name:{width}}  {before} -> {after}" for name, before, after in changes]
-
-
-def quality_rows(
-    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
-) -> list[str]:
-    """Lines of the uncertainty that the new rig states, and of the held-out prediction.
-
-    held_out: what was held out; error: of its prediction, relative to the response, None where too
-    little was measured to hold any out; beside: a further note on the fit's errors.
-    """
-    found = (
-        f"{held_out} predicted within {percent(error)} of the response"
-        if error is not None
-        else "too few sensors to leave any out"
-    )
-    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
 
 
 def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict[str, Any]:

@@ -63,9 +63,9 @@ def test_report_has_the_feet_that_responses_tell_of_and_names_others() -> None:
     assert found.rig.uncertainty.supports == pytest.approx(0.3 / np.sqrt(2), rel=0.02)
     rows = [row for row in change_rows(found) if row.startswith("foot")]
     assert rows[0].startswith("foot 1 stiffness")
-    assert "30 kN/m ->" in rows[0]
-    assert "kN/m (+4" in rows[0]
-    assert rows[1].endswith("0.01 kN/m -> not identified")
+    assert "  30 kN/m  " in rows[0]
+    assert "  +4" in rows[0]
+    assert rows[1].endswith("  not identified")
     assert any(
         "rig's value kept" in row and "foot 2 stiffness" in row for row in finding_rows(found)
     )

@@ -77,7 +77,7 @@ _PAUSE = 10.0  # s; before the sensors are asked, or read, again after a failure
 _BETWEEN = 0.02  # s; between frequencies, which take a millisecond or two each
 
 _FAILED_REMEDY = "see the log above; era forget starts anew"
-_COUNTED = ("readings", "estimates", "discarded", "disturbed", "corrections", "restarts")
+_COUNTED = ("readings", "estimates", "corrections", "restarts")
 
 _logger = logging.getLogger(__name__)
 
@@ -88,23 +88,19 @@ class SettledReadings:
     The clocks of the controller's amplifiers must agree.
 
     take: receives each pattern with its reading, at the time [s] when the window ended.
-    disturbed: called for each reading that a change, an overload or the link has spoilt.
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        controller: Controller,
-        *,
-        take: Callable[[SettledPattern], None],
-        disturbed: Callable[[], None],
+        self, rig: Rig, controller: Controller, *, take: Callable[[SettledPattern], None]
     ) -> None:
         self.sensors: Sequence[PlateSensor] = ()
         """Sensors of the amplifiers, to be set before `run`."""
         self.settling = 0.0
         """Time [s] until the plate has settled, to be set before `run`."""
+        self.disturbed = 0
+        """Number of readings that a change, an overload or the link has spoilt."""
         self._rig, self._controller = rig, controller
-        self._take, self._disturbed = take, disturbed
+        self._take = take
         self._contacts: tuple[Contact, ...] = ()
         self._settled_contacts: tuple[Contact, ...] = ()
         self._playing: PlayReport | None = None
@@ -158,19 +154,16 @@ class SettledReadings:
                 _logger.info("reading given up: %s", error)
                 await asyncio.sleep(_PAUSE)
             if pattern is None:
-                self._disturbed()
+                self.disturbed += 1
             else:
                 self._take(pattern)
 
     async def _changes_by(self, moment: float) -> bool:
         """Wait for a change until a moment [s]; whether there was one."""
-        timeout = None if math.isinf(moment) else max(0.0, moment - threads.now())
-        try:
-            async with asyncio.timeout(timeout):
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(None if math.isinf(moment) else moment):
                 await self._change.wait()
-        except TimeoutError:
-            return False
-        return True
+        return self._change.is_set()
 
     async def _read(
         self, applied: PlayReport, contacts: tuple[Contact, ...]
@@ -197,11 +190,10 @@ class SettledReadings:
         if not np.isfinite(values).all() or not np.any(values):  # no phase to turn others to
             _logger.info("reading given up: all sensors read nothing")
             return None
-        bases = np.zeros(len(self._rig.eras), dtype=complex)
-        for number, era in enumerate(self._rig.eras):
-            if (tone := applied.drive.get(era.name)) is not None:
-                phase = math.radians(tone.phase)
-                bases[number] = cmath.rect(tone.level * era.full_level, phase)
+        bases = {
+            name: cmath.rect(tone.level * self._rig.era(name).full_level, math.radians(tone.phase))
+            for name, tone in applied.drive.items()
+        }
         tip = self._rig.fingertip
         fingers = (
             ()
@@ -209,7 +201,12 @@ class SettledReadings:
             else (RestingFinger(each.x, each.y, tip.scaled(each.load)) for each in contacts)
         )
         return SettledPattern(
-            ended_at, frequency, bases, np.array(values), tuple(fingers), has_phase=False
+            ended_at,
+            frequency,
+            np.array([bases.get(era.name, 0j) for era in self._rig.eras]),
+            np.array(values),
+            tuple(fingers),
+            has_phase=False,
         )
 
     async def _measure(self, frequency: float) -> tuple[Mapping[str, Reading], float]:
@@ -273,9 +270,7 @@ class Learning:
             alarms=0,
         )
         """Present state of the plate, and why."""
-        self.readings = SettledReadings(
-            rig, controller, take=self._hand, disturbed=lambda: self._count("disturbed")
-        )
+        self.readings = SettledReadings(rig, controller, take=self._hand)
         """Readings of the plate, which are to observe the control loop."""
         self.worker: Worker | None = None
         """Process of the estimator, if one runs."""
@@ -287,16 +282,21 @@ class Learning:
         self._counts = dict.fromkeys(_COUNTED, 0)
         self._estimated_at: float | None = None  # s
         self._is_shaped = True
+        self._in_hand = 0  # pattern that is being estimated
         self._waiting: asyncio.Queue[SettledPattern] = asyncio.Queue(MAX_WAITING)
         self._task: asyncio.Task[None] | None = None
         self._outage: asyncio.TimerHandle | None = None
 
     def summary(self, latency_ms: LatencySummary) -> LearningSummary:
         """What is learned; latency_ms: of what `estimated` was called with."""
-        at = self._estimated_at
+        at, counts = self._estimated_at, self._counts
+        waiting = self._waiting.qsize() + self._in_hand
         found = {
             **self.event.model_dump(),
             **self._counts,
+            "disturbed": self.readings.disturbed,
+            # Neither estimated nor waiting, nor with the estimator.
+            "discarded": counts["readings"] - counts["estimates"] - waiting,
             "last_estimate_s": None if at is None else max(0.0, threads.now() - at),
             "latency_ms": latency_ms,
         }
@@ -350,7 +350,6 @@ class Learning:
             self._say_failed(failure_text(error))
         finally:
             self._waiting = asyncio.Queue(MAX_WAITING)
-            self._discard()
 
     async def _has_sensors(self) -> bool:
         """Ask the amplifiers for their sensors until they tell; whether they have some of use."""
@@ -385,14 +384,13 @@ class Learning:
                 _logger.exception("plate: the estimator failed")
                 reason = failure_text(error)
             finally:
-                self.worker = None
-                self._discard()
+                self.worker, self._in_hand = None, 0
             failures = 1 if self._counts["estimates"] > estimates else failures + 1
             self._start_outage()
             if failures >= MAX_FAILURES:
                 self._say_failed(f"estimator: {reason}")
                 return
-            self._count("restarts")
+            self._counts["restarts"] += 1
             self._say_failed(f"estimator: {reason}; retrying")
             await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
@@ -424,7 +422,9 @@ class Learning:
                     await self._shape()
                     shape_at = threads.now() + _SHAPE_INTERVAL
                 if (pattern := await self._pattern_until(keep_at)) is not None:
+                    self._in_hand = 1
                     report = await worker.call(ESTIMATE_LIMIT, Estimator.take, pattern)
+                    self._in_hand = 0
                     self._follow(report, pattern)
                 else:
                     keep_at = threads.now() + _KEEP_INTERVAL
@@ -439,16 +439,14 @@ class Learning:
     async def _pattern_until(self, moment: float) -> SettledPattern | None:
         """The next pattern, None at a moment [s]."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(max(0.0, moment - threads.now())):
+            async with asyncio.timeout_at(moment):
                 return await self._waiting.get()
         return None
 
     def _hand(self, pattern: SettledPattern) -> None:
-        self._count("readings")
-        try:
+        self._counts["readings"] += 1
+        with contextlib.suppress(asyncio.QueueFull):
             self._waiting.put_nowait(pattern)
-        except asyncio.QueueFull:
-            self._count("discarded")
 
     def _follow(self, report: PlateReport, pattern: SettledPattern | None = None) -> None:
         """Follow what the estimator has found at its start, or in a pattern."""
@@ -458,10 +456,10 @@ class Learning:
             timing = self._timing.following(report.table)
             self._answer_by(report.table, timing, is_cautious=report.state == "changed")
             self._is_shaped = False
-            self._count("corrections")
+            self._counts["corrections"] += 1
         if pattern is not None:
             self._estimated_at = threads.now()
-            self._count("estimates")
+            self._counts["estimates"] += 1
             if report.table is not None:
                 self._estimated(threads.now() - pattern.time)
         self.event = self.event.model_copy(update={"alarms": self.event.alarms + report.is_alarm})
@@ -490,12 +488,6 @@ class Learning:
         self._controller.replace_answers(table, timing)
         self.event = self.event.model_copy(update={"cautious": is_cautious})
 
-    def _discard(self) -> None:
-        """Count readings that will not be estimated."""
-        counts = self._counts
-        others = counts["estimates"] + counts["discarded"] + self._waiting.qsize()
-        self._count("discarded", counts["readings"] - others)
-
     def _start_outage(self) -> None:
         """Answer cautiously after a while, unless the plate is watched again by then."""
         if self._outage is None:
@@ -512,7 +504,7 @@ class Learning:
         if self._cautious is not None and not self.event.cautious:
             timing = self._timing.following(self._cautious)
             self._answer_by(self._cautious, timing, is_cautious=True)
-            self._count("corrections")
+            self._counts["corrections"] += 1
             self._note(
                 f"not watched for {CAUTIOUS_AFTER:g} s, answers are those of a plate that is not "
                 "known"
@@ -532,9 +524,6 @@ class Learning:
 
     def _say_failed(self, cause: str) -> None:
         self._say("off", cause, _FAILED_REMEDY, is_bad=True)
-
-    def _count(self, name: str, more: int = 1) -> None:
-        self._counts[name] += more
 
     async def _read(self) -> None:
         """Read settled patterns; report failures and start again after them."""

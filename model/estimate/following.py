@@ -574,10 +574,6 @@ class LivePlate:
         return replace(state, covariance=state.covariance + further)
 
 
-class OtherPlate(InputError):
-    """The file is of another table, or of other parameters."""
-
-
 class LearnedTable:
     """A table in service, corrected by the settled patterns of its plate.
 
@@ -595,8 +591,8 @@ class LearnedTable:
         """Resume with what the file holds, if it exists.
 
         now: time [s] on the clock of the patterns; the plate has drifted since the file was
-        written. Raises InputError for another kind of file, OtherPlate for one of another table or
-        of other parameters.
+        written. Raises InputError for another kind of file, or one of another table or of other
+        parameters.
         """
         if not self._file.exists():
             return
@@ -604,7 +600,7 @@ class LearnedTable:
         known = self.live.known
         expected = known.model.space.names, known.before.fingerprint
         if (tuple(header["names"]), header["base"]) != expected:
-            raise OtherPlate(
+            raise InputError(
                 f"{self._file}: parameters must be those of this rig and its sensors; remove the "
                 "file to learn anew"
             )
@@ -662,7 +658,7 @@ class LearnedTable:
 def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray, FloatArray]:
     """Read what was learned for a table by its fingerprint: header, parameters, covariance.
 
-    Raises InputError for a damaged file or another version, OtherPlate for another table.
+    Raises InputError for a damaged file, another version, or another table.
     """
     try:
         arrays = read_arrays(file, _TYPES, max_bytes=_MAX_BYTES)
@@ -680,7 +676,7 @@ def load_learned(file: Path, *, table: str) -> tuple[dict[str, Any], FloatArray,
     if version != _VERSION or x.shape != (p,) or covariance.shape != (p, p):
         raise InputError(f"{file}: version must be {_VERSION}; remove the file to learn anew")
     if of != table:
-        raise OtherPlate(
+        raise InputError(
             f"{file}: must be learned for this table, got one of another rig; remove the file to "
             "learn anew"
         )

@@ -499,7 +499,7 @@ def exchanged_sensors(
     at_own, names, points = np.diag(coherence), observation.sensors, observation.points.copy()
     pairs = {}
     for sensor, place in zip(*linear_sum_assignment(-(coherence**2)), strict=True):
-        # Where only one of two is not at its place, both are at one place, which is no exchange.
+        # Both must be wrong: else two sensors are at one place, which is no exchange.
         is_off = max(at_own[sensor], at_own[place]) < _OWN_PLACE
         if is_off and coherence[sensor, place] > _OTHER_PLACE:
             pairs[names[sensor]] = names[place]

@@ -328,13 +328,18 @@ class PlateSelfMeasurement:
         try:
             can = await self._player.open()
             sensors, unused = await plate_sensors(self._rig, self._player.amplifiers)
-            tones = interleaved(
-                self._rig,
-                _frequency_range(can.limits.frequencies, sensors),
-                is_quick=self._is_quick,
-            )
+            low, high = can.limits.frequencies
+            high = min(high, *(each.frequency_max for each in sensors))
+            if not low < high:
+                raise CommandError(
+                    f"sensors must measure above {low:g} Hz, the lowest frequency of rig and "
+                    f"amplifiers, got up to {high:g} Hz"
+                )
+            tones = interleaved(self._rig, (low, high), is_quick=self._is_quick)
             await self._player.group.arm()
-            await self._hold_clocks()
+            end = threads.now() + CLOCK_SETTLING
+            while threads.now() < end and max(self._player.group.clock_errors.values()) > _AGREED:
+                await self._wait(HEARTBEAT)
             started = threads.now()
             heard, half, last = await self._all(tones, sensors)
             await self._player.silence()
@@ -350,12 +355,6 @@ class PlateSelfMeasurement:
             notes=tuple(unused),
             details={"settling_s": tones.settling, "window_s": tones.window},
         )
-
-    async def _hold_clocks(self) -> None:
-        """Wait until the clocks of the amplifiers agree, or as long as that takes at most."""
-        end = threads.now() + CLOCK_SETTLING
-        while threads.now() < end and max(self._player.group.clock_errors.values()) > _AGREED:
-            await self._wait(HEARTBEAT)
 
     async def _all(
         self, tones: ToneSchedule, sensors: Sequence[PlateSensor]
@@ -534,20 +533,6 @@ def _described(sensor: PlateSensor) -> Mapping[str, object]:
         "x_m": None if place.era else place.x,
         "y_m": None if place.era else place.y,
     }
-
-
-def _frequency_range(
-    playable: tuple[float, float], sensors: Sequence[PlateSensor]
-) -> tuple[float, float]:
-    """Return frequencies [Hz] that rig and amplifiers play and sensors measure."""
-    low, high = playable
-    high = min(high, *(each.frequency_max for each in sensors))
-    if not low < high:
-        raise CommandError(
-            f"sensors must measure above {low:g} Hz, the lowest frequency of rig and amplifiers, "
-            f"got up to {high:g} Hz"
-        )
-    return low, high
 
 
 def checked_level(rig: Rig, level: float | None) -> float:

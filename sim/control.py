@@ -411,11 +411,7 @@ async def _finish(context: SimulationContext, request: Request, now: float) -> R
 
 
 async def _plate(context: SimulationContext, request: Request, now: float) -> Response:
-    context.bench.change_plate(_changed(context, read(PlateRequest, request)), now=now)
-    return {"ok": True, "time_s": context.bench.time}
-
-
-def _changed(context: SimulationContext, change: PlateRequest) -> PlateErrors:
+    change = read(PlateRequest, request)
     first, rig = context.first_plate, context.bench.rig
     names = [era.name for era in rig.eras]
     if not change.stiffness.keys() <= set(names):
@@ -424,12 +420,14 @@ def _changed(context: SimulationContext, change: PlateRequest) -> PlateErrors:
         name: first.stiffness.get(name, 1.0) * change.stiffness.get(name, 1.0) for name in names
     }
     check_on_plate("a mass", [(x, y) for x, y, _ in change.masses], rig.plate)
-    return replace(
+    changed = replace(
         first,
         modulus=first.modulus * change.modulus,
         stiffness=stiffness,
         masses=(*first.masses, *(PointLoad(x, y, mass=mass) for x, y, mass in change.masses)),
     )
+    context.bench.change_plate(changed, now=now)
+    return {"ok": True, "time_s": context.bench.time}
 
 
 OPERATIONS: Mapping[str, Operation] = {

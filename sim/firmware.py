@@ -102,21 +102,16 @@ async def running(program: Path, folder: Path, name: str) -> AsyncIterator[Runni
             stderr=asyncio.subprocess.DEVNULL,
         )
         stack.push_async_callback(_terminate, process)
-        yield RunningFirmware(f"serial://{await _terminal_of(process, name)}", pipe)
-
-
-async def _terminal_of(process: asyncio.subprocess.Process, name: str) -> str:
-    """The pseudo-terminal that the process prints; raises LinkError."""
-    assert process.stdout is not None  # noqa: S101  a pipe was requested
-    try:
-        async with asyncio.timeout(_STARTUP_TIMEOUT):
-            line = (await process.stdout.readline()).decode()
-    except TimeoutError:
-        raise LinkError(f"firmware of {name}: not ready in {_STARTUP_TIMEOUT:g} s") from None
-    found = re.search(r"/dev/\S+", line)
-    if found is None:
-        raise LinkError(f"firmware of {name}: no line was opened, got {line.strip()!r}")
-    return found[0]
+        assert process.stdout is not None  # noqa: S101  a pipe was requested
+        try:
+            async with asyncio.timeout(_STARTUP_TIMEOUT):
+                line = (await process.stdout.readline()).decode()
+        except TimeoutError:
+            raise LinkError(f"firmware of {name}: not ready in {_STARTUP_TIMEOUT:g} s") from None
+        found = re.search(r"/dev/\S+", line)
+        if found is None:
+            raise LinkError(f"firmware of {name}: no line was opened, got {line.strip()!r}")
+        yield RunningFirmware(f"serial://{found[0]}", pipe)
 
 
 async def _terminate(process: asyncio.subprocess.Process) -> None:
@@ -139,25 +134,21 @@ def frequencies_in(samples: FloatArray, *, rate: float) -> list[float]:
     found: list[float] = []
     for channel in samples.T:
         if np.abs(channel).max() >= _SILENT:
-            found += _peaks(channel, rate=rate)
+            size = _PADDING * len(channel)
+            spectrum = np.abs(np.fft.rfft(channel * np.hanning(len(channel)), size))
+            middle = spectrum[1:-1]
+            is_peak = (middle > spectrum[:-2]) & (middle >= spectrum[2:])
+            at = np.flatnonzero(is_peak & (middle > _LEAST * spectrum.max())) + 1
+            # Each local maximum lies at the top of a parabola through three logarithms.
+            below, top, above = (np.log(spectrum[at + offset] + 1e-12) for offset in (-1, 0, 1))
+            offsets = (below - above) / (2 * (below - 2 * top + above))
+            found += ((at + offsets) * rate / size).tolist()
     step = QUANTITIES["frequency"].step
     tones: list[float] = []
     for frequency in sorted(round(each / step) * step for each in found):
         if not tones or frequency - tones[-1] > _APART:
             tones.append(frequency)
     return tones
-
-
-def _peaks(channel: FloatArray, *, rate: float) -> list[float]:
-    """Local maxima of the spectrum of a channel (n,), by a parabola through three logarithms."""
-    size = _PADDING * len(channel)
-    spectrum = np.abs(np.fft.rfft(channel * np.hanning(len(channel)), size))
-    middle = spectrum[1:-1]
-    is_peak = (middle > spectrum[:-2]) & (middle >= spectrum[2:])
-    at = np.flatnonzero(is_peak & (middle > _LEAST * spectrum.max())) + 1
-    below, top, above = (np.log(spectrum[at + offset] + 1e-12) for offset in (-1, 0, 1))
-    offsets = (below - above) / (2 * (below - 2 * top + above))
-    return ((at + offsets) * rate / size).tolist()  # type: ignore[no-any-return]
 
 
 _MAX_LAG = 0.06  # s; of the samples' clock

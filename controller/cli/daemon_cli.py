@@ -25,7 +25,6 @@ from registry.plugins import did_you_mean
 if TYPE_CHECKING:
     from controller.api.client import Client
     from controller.api.methods import ArmResult
-    from controller.api.schema import RigSummary
 
 Socket = Annotated[
     Path | None,
@@ -134,9 +133,13 @@ def of_method(method: str) -> Callable[..., None]:
     """The command of a method of the API, which shows the state after it."""
 
     def call(socket: Socket = None, as_json: JsonOption = False) -> None:
+        from controller.api.schema import headline
+
         with connected(socket) as era:
             getattr(era, method)()
-            _print_state(era, as_json=as_json)
+            status = era.status()
+            answer = {"state": status.state, "cause": status.cause, "remedy": status.remedy}
+            print_report([headline(status.state, status.cause)], answer, as_json=as_json)
 
     return call
 
@@ -185,7 +188,7 @@ def touch(
     import asyncio
 
     from controller.sources.tuio import read_capture, replay_capture
-    from model.config.units import parse_point
+    from model.config.units import in_metres, parse_point
 
     if (at is None) == (replay is None):
         raise InputError("era touch must have either fingers, such as 0.10,0.05, or --replay FILE")
@@ -194,7 +197,15 @@ def touch(
         return
     positions = [parse_point(text, what="era touch") for text in at or ()]
     with connected(socket) as era:
-        _check_positions(positions, era.hello("era").rig)
+        plate = era.hello("era").rig
+        length, width = plate.length_m, plate.width_m
+        for x, y in positions:  # the daemon would only reject and count those beyond the plate
+            if not (0 <= x <= length and 0 <= y <= width):
+                remedy = in_metres(x, y, length=length, width=width)
+                raise InputError(
+                    f"era touch must be on the plate of {length:g} m by {width:g} m, "
+                    f"got {x:g},{y:g}" + (remedy or "; coordinates start at its south-west corner")
+                )
         started_at = time.monotonic()
         _hold(era, positions, started_at + duration / 2)
         status = era.status()  # right after a touch, whose contact lasts for 150 ms
@@ -294,30 +305,6 @@ def _print_lease(granted: "ArmResult", how_long: str, *, as_json: bool) -> None:
         typer.echo(granted.model_dump_json())
     else:
         typer.echo(f"on: armed {how_long}; era stop stops everything at once")
-
-
-def _check_positions(positions: "list[tuple[float, float]]", rig: "RigSummary") -> None:
-    """Refuse fingers beyond the plate, which the daemon would only reject and count."""
-    from model.config.units import in_metres
-
-    for x, y in positions:
-        if not (0 <= x <= rig.length_m and 0 <= y <= rig.width_m):
-            raise InputError(
-                f"era touch must be on the plate of {rig.length_m:g} m by {rig.width_m:g} m, got "
-                f"{x:g},{y:g}"
-                + (
-                    in_metres(x, y, length=rig.length_m, width=rig.width_m)
-                    or "; coordinates start at its south-west corner"
-                )
-            )
-
-
-def _print_state(era: "Client", *, as_json: bool) -> None:
-    from controller.api.schema import headline
-
-    status = era.status()
-    answer = {"state": status.state, "cause": status.cause, "remedy": status.remedy}
-    print_report([headline(status.state, status.cause)], answer, as_json=as_json)
 
 
 layout_app = typer.Typer(no_args_is_help=True, help="Check surface layouts, or choose one.")

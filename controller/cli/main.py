@@ -108,7 +108,9 @@ def run(
 
     on_loaded: called once the modules are loaded.
     """
-    debug, arguments = _take_debug(arguments)
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    kept = [argument for argument in arguments[:end] if argument != "--debug"]
+    debug, arguments = len(kept) < end, [*kept, *arguments[end:]]
     group, statuses = load_commands(modules)
     try:
         on_loaded()
@@ -125,13 +127,6 @@ def run(
             traceback.print_exc()
         return _report(error, statuses)
     return status
-
-
-def _take_debug(arguments: Sequence[str]) -> tuple[bool, list[str]]:
-    """Return whether --debug is among the arguments before `--`, and the others."""
-    end = arguments.index("--") if "--" in arguments else len(arguments)
-    kept = [argument for argument in arguments[:end] if argument != "--debug"]
-    return len(kept) < end, [*kept, *arguments[end:]]
 
 
 class _Commands(TyperGroup):

@@ -333,7 +333,14 @@ class Wav(ContentFormat):
 
     def read(self, content: bytes, source: str, channel: int) -> Pattern:
         """Return the pattern of one channel."""
-        rate, samples = _samples(content, source)
+        try:
+            rate, samples = samples_of(content)
+        except InputError as error:
+            raise refusal(source, str(error)) from error
+        if not _MIN_RATE <= rate <= _MAX_RATE:
+            raise refusal(source, f"sample rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate}")
+        if problem := too_much(len(samples) / rate, 0):
+            raise refusal(source, problem)
         count = samples.shape[1]
         if count > 2:
             raise refusal(source, f"must have 1 or 2 channels, got {count}")
@@ -344,19 +351,6 @@ class Wav(ContentFormat):
         if count == 2:
             remarks = (f"channel {channel} of 2 read", *remarks)
         return Pattern(len(signal) / rate, intensity, sharpness, (), remarks)
-
-
-def _samples(content: bytes, source: str) -> tuple[int, FloatArray]:
-    """Return the rate [Hz], and samples (n, channels) of which 1 is full scale."""
-    try:
-        rate, samples = samples_of(content)
-    except InputError as error:
-        raise refusal(source, str(error)) from error
-    if not _MIN_RATE <= rate <= _MAX_RATE:
-        raise refusal(source, f"sample rate must be {_MIN_RATE} to {_MAX_RATE} Hz, got {rate}")
-    if problem := too_much(len(samples) / rate, 0):
-        raise refusal(source, problem)
-    return rate, samples
 
 
 def course_of(signal: FloatArray, rate: int) -> tuple[Curve, Curve, tuple[str, ...]]:

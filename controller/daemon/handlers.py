@@ -329,7 +329,11 @@ class ApiService:
             )
         contact = self._nearest(params)
         if not effect.is_prepared(effect.level_db_sl if level is None else level):
-            epoch, effect = self._supervisor.operation.epoch, await self._prepared(effect, level)
+            made = effect.for_table(self._table.frequencies)  # its renditions are its own
+            work = partial(made.prepare, made.level_db_sl if level is None else level)
+            async with self._preparing:
+                await in_thread(work, name="content")
+            epoch, effect = self._supervisor.operation.epoch, made
             contact = self._nearest(params)
             if self._supervisor.operation.epoch != epoch:
                 raise RpcError(
@@ -345,14 +349,6 @@ class ApiService:
         )
         self._controller.cycle.request_update()
         return Empty()
-
-    async def _prepared(self, effect: Effect, level_db_sl: float | None) -> Effect:
-        """Return an effect prepared at a level, its own by default: in a thread, one at a time."""
-        made = effect.for_table(self._table.frequencies)  # its renditions are its own
-        work = partial(made.prepare, made.level_db_sl if level_db_sl is None else level_db_sl)
-        async with self._preparing:
-            await in_thread(work, name="content")
-        return made
 
     def _nearest(self, params: PlayParams) -> Contact:
         """Return the contact at which is played; raises RpcError without one, or if disarmed."""

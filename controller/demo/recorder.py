@@ -540,7 +540,9 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     Latency and onset are of the touch's first pattern.
     """
     first, main_part = touch.patterns[0], max(touch.patterns, key=_significance)
-    predicted, applied = _felt_by(touch, main_part), main_part.applied
+    key = touch.contact.key
+    applied = main_part.applied
+    predicted = next(felt for felt in applied.targets if felt.contact.key == key)
     played = _content_of(predicted, applied)
     pattern = played.layer
     vibration = await main_part.steady if main_part.steady else {}
@@ -594,12 +596,6 @@ def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
     """Order of patterns: by contents, then by steadiness, then by time."""
     applied = pattern.applied
     return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
-
-
-def _felt_by(touch: _Touch, playing: _PlayedPattern) -> Prediction:
-    """What is predicted of a touch while a pattern plays for it."""
-    key = touch.contact.key
-    return next(felt for felt in playing.applied.targets if felt.contact.key == key)
 
 
 def _content_of(felt: Prediction, applied: PlayReport) -> LayerContent:

@@ -171,7 +171,12 @@ def layout_of(
     document: Document, plate: Plate | None, *, level_db_sl: float = STRONG_DB_SL
 ) -> SurfaceLayout:
     """Make the layout of a document; arguments and errors as of `load_layout`."""
-    _check_kind(document)
+    if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
+        kind = "a rig" if "plate" in document.data else "a daemon file"
+        raise InputError(
+            f"{document.source}: must be a surface layout, got {kind}; "
+            "era config init layout.yaml --kind layout  writes one"
+        )
     validation = Validation(document, LayoutSection)
     effects = _effects(document, validation, level_db_sl)
     for name in islice(validation.mapping(("regions",)), _MAX_REGIONS):
@@ -181,7 +186,23 @@ def layout_of(
     _check_levels(validation, effects)
     section = validation.finish()
     return SurfaceLayout(
-        regions=tuple(_region(name, region) for name, region in section.regions.items()),
+        regions=tuple(
+            Region(
+                name=name,
+                shape=region.shape,
+                on_press=region.on_press,
+                on_move=region.on_move,
+                on_release=region.on_release,
+                level_db_sl=region.level if isinstance(region.level, float) else None,
+                has_level=region.level is not None,
+                priority=region.priority,
+                band=region.tuned_band,
+                is_own=region.own,
+                may_share=region.may_share,
+                is_protected=region.protected,
+            )
+            for name, region in section.regions.items()
+        ),
         effects={name: effect for name, effect in effects.items() if effect is not None},
         elsewhere=section.elsewhere,
     )
@@ -191,16 +212,6 @@ def is_layout_document(document: Document) -> bool:
     """Whether a configuration file is a surface layout."""
     own = LayoutSection.model_fields.keys()
     return bool(document.data.keys() & own) and not document.data.keys() & {"plate", "rig"}
-
-
-def _check_kind(document: Document) -> None:
-    """Refuse another kind of file as a whole instead of all its unknown keys."""
-    if not is_layout_document(document) and document.data.keys() & {"plate", "rig"}:
-        kind = "a rig" if "plate" in document.data else "a daemon file"
-        raise InputError(
-            f"{document.source}: must be a surface layout, got {kind}; "
-            "era config init layout.yaml --kind layout  writes one"
-        )
 
 
 def _effects(
@@ -323,23 +334,6 @@ def _check_use(
         can_end = "duration" in type(effect).model_fields
         remedy = "give it a duration" if can_end else "choose an effect that does"
         validation.add(path, f"{name} must end by itself; {remedy}")
-
-
-def _region(name: str, section: RegionSection) -> Region:
-    return Region(
-        name=name,
-        shape=section.shape,
-        on_press=section.on_press,
-        on_move=section.on_move,
-        on_release=section.on_release,
-        level_db_sl=section.level if isinstance(section.level, float) else None,
-        has_level=section.level is not None,
-        priority=section.priority,
-        band=section.tuned_band,
-        is_own=section.own,
-        may_share=section.may_share,
-        is_protected=section.protected,
-    )
 
 
 def _checked(document: Document) -> CheckedFile:

@@ -93,7 +93,11 @@ class SocketLock:
         check_socket_path(path)
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _check_folder(path.parent)
+            # In a folder of another user, the socket could be replaced, or a link to it redirected.
+            status, link = path.parent.stat(), path.parent.lstat()
+            is_foreign = not {status.st_uid, link.st_uid} <= {0, os.getuid()}
+            if is_foreign or status.st_mode & stat.S_IWOTH:
+                raise InputError(f"{path.parent}: other users can write to this folder; {_REMEDY}")
             self._lock = _open_lock(path.with_name(f"{path.name}.lock"))
         except OSError as error:
             raise InputError(f"{error.filename}: {error.strerror}; {_REMEDY}") from error
@@ -167,14 +171,6 @@ def _open_lock(file: Path) -> IO[str]:
         raise InputError(f"{file}: must be a file of this user; remove it or {_REMEDY}")
     os.fchmod(descriptor, 0o600)
     return os.fdopen(descriptor, "a+", encoding="utf-8")
-
-
-def _check_folder(folder: Path) -> None:
-    """Refuse a folder in which another user could replace the socket."""
-    status, link = folder.stat(), folder.lstat()  # the owner of a symbolic link can redirect it
-    is_foreign = not {status.st_uid, link.st_uid} <= {0, os.getuid()}
-    if is_foreign or status.st_mode & stat.S_IWOTH:
-        raise InputError(f"{folder}: other users can write to this folder; {_REMEDY}")
 
 
 MIN_DESCRIPTORS = 64

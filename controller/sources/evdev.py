@@ -147,38 +147,30 @@ class SlotReader:
         Slots that are negative are ignored. Raises InputError for type A.
         """
         if kind == EV_ABS:
-            self._feed_axis(code, value)
+            if code == ABS_MT_SLOT:
+                self._current = value
+            elif code in SLOT_AXES and self._current >= 0:
+                if code == ABS_MT_TRACKING_ID:
+                    if self._current in self._changed and not self._dropped:
+                        self._pending.append(self.touches)
+                    self._changed.add(self._current)
+                setattr(self._slots.setdefault(self._current, SlotState()), SLOT_AXES[code], value)
         elif kind == EV_SYN and code == SYN_MT_REPORT:
             raise InputError(TYPE_A)
         elif kind == EV_SYN and code == SYN_DROPPED:
             self._dropped = True
         elif kind == EV_SYN and code == SYN_REPORT:
-            return self._report()
+            if self._dropped:  # the events since then are incomplete
+                self._slots.clear()
+            report = PanelReport((*self._pending, self.touches), is_partial=self._dropped)
+            self._pending, self._changed, self._dropped = [], set(), False
+            return report
         return None
 
     def resynchronise(self, slots: Mapping[int, SlotState], *, current: int) -> None:
         """Replace all state by the kernel's; current: slot of the next event."""
         self._current = current
         self._slots = {number: replace(state) for number, state in slots.items()}
-
-    def _report(self) -> PanelReport:
-        """Complete the current report."""
-        if self._dropped:  # the events since then are incomplete
-            self._slots.clear()
-        report = PanelReport((*self._pending, self.touches), is_partial=self._dropped)
-        self._pending, self._changed, self._dropped = [], set(), False
-        return report
-
-    def _feed_axis(self, code: int, value: int) -> None:
-        """Process one EV_ABS event."""
-        if code == ABS_MT_SLOT:
-            self._current = value
-        elif code in SLOT_AXES and self._current >= 0:
-            if code == ABS_MT_TRACKING_ID:
-                if self._current in self._changed and not self._dropped:
-                    self._pending.append(self.touches)
-                self._changed.add(self._current)
-            setattr(self._slots.setdefault(self._current, SlotState()), SLOT_AXES[code], value)
 
     def _touch(self, slot: SlotState) -> Touch | None:
         """Return the touch in a slot, None unless a finger with known coordinates is there."""

@@ -366,19 +366,14 @@ def without_superseded(waiting: Sequence[Datagram]) -> list[Datagram]:
     is_complete: dict[tuple[Peer, bytes], bool] = {}
     kept = []
     for each in reversed(waiting):
-        sender = (each.peer, _source_name(each.data))
+        _, found, rest = each.data.partition(_SOURCE)
+        sender = (each.peer, rest.partition(b"\0")[0] if found else b"")
         if sender not in is_complete:
             is_complete[sender] = len(is_complete) < _MAX_SENDERS and _is_complete_bundle(each.data)
         elif is_complete[sender]:
             continue
         kept.append(each)
     return kept[::-1]
-
-
-def _source_name(datagram: bytes) -> bytes:
-    """Return the raw name in the source message of a datagram without decoding the rest."""
-    _, found, rest = datagram.partition(_SOURCE)
-    return rest.partition(b"\0")[0] if found else b""
 
 
 def _is_complete_bundle(datagram: bytes) -> bool:

@@ -292,11 +292,6 @@ class ExpectedOutputs:
 
     # What happens
 
-    def _may_end(self, layer: int, start: float, end: float) -> bool:
-        """Whether a layer may end by itself between two times."""
-        half = self._plays.half[layer]
-        return start - half <= self.playback.end_of(layer) <= end + half
-
     def _faded(self, one: LayerSet, time: float) -> float:
         """Return when what a layer plays has faded, however it ends by a time, also by a set."""
         ramp = max(_RAMP.from_wire(one.ramp), self.playback.ramp_of(one.layer))
@@ -335,7 +330,9 @@ class ExpectedOutputs:
                 lasting.clear()
             if not one.renew:
                 lasting.add(one.valid_for)
-            if self._may_end(number, start, end):  # and then on other ways than by the set
+            half = self._plays.half[number]
+            if start - half <= self.playback.end_of(number) <= end + half:
+                # It may end by itself, and then on other ways than by the set.
                 goes_on = one.renew or any(each.keep_phase for each in one.commands)
                 self._unknown[number] = math.inf if goes_on else self._faded(one, end)
             elif not one.renew and not one.after:

@@ -122,7 +122,10 @@ def versions() -> dict[str, Any]:
         except PackageNotFoundError:
             dependencies[name] = "not installed"
     plug_ins = {
-        group.removeprefix(_GROUPS): _entry_points(group)
+        group.removeprefix(_GROUPS): {
+            name: ", ".join(sorted(f"{point.value} ({_package(point.dist)})" for point in points))
+            for name, points in sorted(plugins_of(group).items())
+        }
         for group in sorted(entry_points().groups)
         if group.startswith(_GROUPS)
     }
@@ -133,14 +136,6 @@ def versions() -> dict[str, Any]:
         "machine": platform.machine(),
         "packages": dict(sorted(dependencies.items())),
         "plug-ins": plug_ins,
-    }
-
-
-def _entry_points(group: str) -> dict[str, str]:
-    """All entry points of a group by name, with their packages."""
-    return {
-        name: ", ".join(sorted(f"{point.value} ({_package(point.dist)})" for point in points))
-        for name, points in sorted(plugins_of(group).items())
     }
 
 

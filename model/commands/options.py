@@ -90,25 +90,20 @@ def progress_bar(unit: str) -> "Iterator[Progress]":
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _lines(unit)
+        printed = time.monotonic()
+
+        def update(done: int, total: int) -> None:
+            nonlocal printed
+            if time.monotonic() - printed >= _LINE_INTERVAL:
+                printed = time.monotonic()
+                sys.stderr.write(f"{done} of {total} {unit}\n")
+
+        yield update
         return
     columns = (BarColumn(), MofNCompleteColumn(), unit, TimeRemainingColumn())
     with Bars(*columns, console=console) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _lines(unit: str) -> "Progress":
-    """Return an update(done, total) that prints a line every two seconds."""
-    printed = time.monotonic()
-
-    def update(done: int, total: int) -> None:
-        nonlocal printed
-        if time.monotonic() - printed >= _LINE_INTERVAL:
-            printed = time.monotonic()
-            sys.stderr.write(f"{done} of {total} {unit}\n")
-
-    return update
 
 
 def print_report(rows: Iterable[str | None], answer: Mapping[str, Any], *, as_json: bool) -> None:

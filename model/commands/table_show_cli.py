@@ -40,12 +40,14 @@ def show(
     with Stopwatch() as timed, progress_bar("questions") as progress:
         overview = find_overview(table, progress=progress)
     summary, cells = summarize(table, overview), overview.cells
+    length, width, _ = summary["plate_m"]
+    quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
     rows = [
         *_summary_rows(summary, mapped=str(cells.grid)),
         "",
         *_map_rows(cells, listed=weak),
         f"computed in {timed.elapsed:.1f} s",
-        _example_query(table_file, summary["plate_m"]),
+        next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across),
     ]
     print_report(rows, summary | {"map": cells.as_json()}, as_json=as_json)
 
@@ -130,13 +132,6 @@ def _map_rows(cells: "WeakCells", *, listed: bool) -> Iterator[str]:
             strict=True,
         ):
             yield f"({x:.4f}, {y:.4f}) m {median:7.1f} dB {tenth:7.1f} dB"
-
-
-def _example_query(table_file: Path, plate: list[float]) -> str:
-    """Format a query with fingers at one and three quarters across the plate."""
-    length, width, _ = plate
-    quarter, across = (f"{part * length:.3g},{part * width:.3g}" for part in (0.25, 0.75))
-    return next_line("era", "table", "query", table_file, "--target", quarter, "--quiet", across)
 
 
 def verify(

@@ -543,15 +543,6 @@ def mean_over(
     places = np.atleast_2d(np.asarray(places, dtype=float))
     if places.shape[1] == 2 or not places[:, 2].any():
         return evaluate(places[:, :2])
-    points, weights = _quadrature(places, length, width)
-    mean: Any = weights @ evaluate(points)
-    return mean  # type: ignore[no-any-return]
-
-
-def _quadrature(
-    places: FloatArray, length: float, width: float
-) -> tuple[FloatArray, sparse.csr_array]:
-    """Points (p, 2) on footprints, and weights of each footprint's mean, (n, p)."""
     is_disc = places[:, 2] > 0
     counts = np.where(is_disc, _ACROSS * _ALONG, 1)
     ends = np.concatenate([[0], np.cumsum(counts)])
@@ -560,7 +551,9 @@ def _quadrature(
     on_discs = np.repeat(is_disc, counts)
     points[on_discs], values[on_discs] = _on_discs(places[is_disc], length, width)
     shape = (len(places), len(points))
-    return points, sparse.csr_array((values, np.arange(len(points)), ends), shape=shape)
+    weights = sparse.csr_array((values, np.arange(len(points)), ends), shape=shape)
+    mean: Any = weights @ evaluate(points)
+    return mean  # type: ignore[no-any-return]
 
 
 def _on_discs(discs: FloatArray, length: float, width: float) -> tuple[FloatArray, FloatArray]:

@@ -716,7 +716,13 @@ def _homogeneous(
 ) -> Plate:
     """The plate of a rigidity with the laminate's mass and rotary inertia."""
     density = laminate.surface_density
-    thickness = math.sqrt(12 * _rotary_inertia(laminate, bent) / density)
+    # Each layer turns about its own middle and moves lengthwise, the latter as far as it is bonded.
+    E, nu, h, z = _columns(laminate.layers)
+    stiffness = E * h / (1 - nu**2)
+    off_neutral = bent.bonded * (z - stiffness @ z / stiffness.sum())
+    densities = np.array([layer.surface_density for layer in laminate.layers])
+    rotary_inertia = float(densities @ (h**2 / 12 + off_neutral**2))
+    thickness = math.sqrt(12 * rotary_inertia / density)
     return Plate(
         length=length,
         width=width,
@@ -729,18 +735,6 @@ def _homogeneous(
         ),
         loss_factor=loss_factor,
     )
-
-
-def _rotary_inertia(laminate: Laminate, bent: Bending) -> float:
-    """Mass moment per area [kg]: each layer about its own middle, and what moves it lengthwise.
-
-    The share of the latter is that of perfect bonding.
-    """
-    E, nu, h, z = _columns(laminate.layers)
-    stiffness = E * h / (1 - nu**2)
-    off_neutral = bent.bonded * (z - stiffness @ z / stiffness.sum())
-    densities = np.array([layer.surface_density for layer in laminate.layers])
-    return float(densities @ (h**2 / 12 + off_neutral**2))
 
 
 def _rounded(value: float) -> float:

@@ -198,12 +198,21 @@ def export_mat(table: LocalizationTable, path: Path) -> None:
             f"a .mat file of version 5 must have up to {MAX_MAT_BYTES / 1e9:.1f} GB, got "
             f"{size / 1e9:.1f} GB; open the table itself, a .npz file, with numpy.load"
         )
+    by_unit = {
+        key: each.dimension.key(key)
+        for section in _SECTIONS
+        for key, field in section.model_fields.items()
+        for each in quantities(field)
+    } | _NAMES
     content = {
         "format_version": float(FORMAT_VERSION),
         "code_version": table.code_version,
         "fingerprint": table.fingerprint,
         "mode": table.drive_mode,
-        **_physics(table),
+        **{
+            name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)
+            for name in PHYSICS  # all of the rig that a table must have
+        },
         "mesh": str(table.mesh),
         "reference_mesh": str(table.reference_mesh),
         "discretisation_error": table.discretisation_error,
@@ -278,20 +287,6 @@ _SECTIONS: tuple[type[Section], ...] = (
 _NAMES = {"x": "x_m", "y": "y_m", "gains": "gain_hz_ratio_rad", "magnet_mass": "magnet_mass_kg"} | {
     "voltage": "voltage_v"
 }
-
-
-def _physics(table: LocalizationTable) -> dict[str, Any]:
-    """Return all of the rig that a table must have, with the units of the rig's file."""
-    by_unit = {
-        key: each.dimension.key(key)
-        for section in _SECTIONS
-        for key, field in section.model_fields.items()
-        for each in quantities(field)
-    } | _NAMES
-    return {
-        name: _exported(getattr(table, name), {} if name == "uncertainty" else by_unit)
-        for name in PHYSICS
-    }
 
 
 def _exported(value: Any, names: Mapping[str, str]) -> Any:

@@ -165,11 +165,6 @@ class Raster:
         return count, np.array([self.length, self.width]) / (count - 1)
 
     @cached_property
-    def _side(self) -> IntArray:
-        """The same of a patch."""
-        return np.array(self.patch)
-
-    @cached_property
     def _patch_index(self) -> IntArray:
         """Numbers of a patch's points, counted from its lowest, (patch,)."""
         side_x, side_y = self.patch
@@ -193,7 +188,7 @@ class Raster:
 
         (k, patch) and (k, p, patch).
         """
-        (count, spacing), side = self._points, self._side
+        (count, spacing), side = self._points, np.array(self.patch)
         start = np.rint(centres / spacing - (side - 1) / 2).astype(int)
         start = np.minimum(np.maximum(start, 0), count - side)
         local = (points / spacing - start[:, None]) * (2 / (side - 1)) - 1
@@ -559,7 +554,11 @@ class LocalizationTable:
         if not self.uncertainty.place:
             return found, np.zeros(found.plate.forces.shape)
         by_field = [isinstance(each, Exciter) for each in self.eras]
-        return with_places(found, self._shifts_of_eras, self._gram_inside, by_field)
+        # Without the edges, which bend most, and where few fingers rest.
+        points = self.raster.points
+        shapes = self.shapes[(np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)]
+        gram = np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
+        return with_places(found, self._shifts_of_eras, gram, by_field)
 
     @cached_property
     def at_harmonics(self) -> PlateOnEras:
@@ -610,14 +609,6 @@ class LocalizationTable:
     def _mean_square(self, fields: Complex64Array) -> FloatArray:
         """Mean square over the plate of fields in its coordinates (..., r), (...)."""
         return np.asarray(np.vecdot(fields, fields @ self._gram).real, dtype=float)
-
-    @property
-    def _gram_inside(self) -> Float32Array:
-        """Of the plate but its edges, which bend most, and where few fingers rest."""
-        points = self.raster.points
-        inside = (np.abs(points / points[-1] - 0.5) < 0.5 - EDGE).all(axis=1)
-        shapes = self.shapes[inside]
-        return np.asarray(shapes.T @ shapes / np.float32(len(shapes)))
 
     @cached_property
     def _gram(self) -> Float32Array:

@@ -112,7 +112,11 @@ def save_table(table: LocalizationTable, path: Path | str) -> None:
     """
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     place = expect_path(path, what="path")
-    arrays = _arrays(table)
+    arrays = {
+        name: np.ascontiguousarray(getattr(table, name), dtype=dtype)
+        for name, dtype in _DTYPES.items()
+        if name != "header"
+    }
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -200,14 +204,6 @@ def _options(table: LocalizationTable) -> str:
     return f"--mode {table.drive_mode} --grid {table.grid} --frequencies {frequencies}"
 
 
-def _arrays(table: LocalizationTable) -> dict[str, NDArray[Any]]:
-    return {
-        name: np.ascontiguousarray(getattr(table, name), dtype=dtype)
-        for name, dtype in _DTYPES.items()
-        if name != "header"
-    }
-
-
 def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
     """SHA-256 over the header without its checksum, and over every array with its shape."""
     hashed = {key: value for key, value in header.items() if key != "sha256"}
@@ -282,7 +278,20 @@ class TableProblem:
 
     def __post_init__(self) -> None:
         """Refuse frequencies that make no table, and a table that would be too large to be read."""
-        _check_frequencies(self.frequencies, self.rig)
+        frequencies = self.frequencies
+        if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
+            raise InputError("frequencies of a table must be finite numbers, at least one")
+        if not (np.diff(frequencies) > 0).all():
+            raise InputError("frequencies of a table must ascend without repetition")
+        low, high = self.rig.limits.frequency_min, self.rig.limits.frequency_max
+        if frequencies[0] < low or frequencies[-1] > high:
+            raise InputError(
+                f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, "
+                f"got {frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the "
+                "limits"
+            )
+        for each in (self.rig.threshold, *self.rig.promised_thresholds):
+            check_has_threshold(frequencies, each)
         check_supported(self.rig.plate, self.rig.eras, loads=self.rig.masses)
         plate = self.rig.plate
         check_scales(plate, 1 + self.rig.uncertainty.thickness)
@@ -422,21 +431,6 @@ def _no_error(problem: TableProblem) -> Arrays:
     return {"discretisation_error": np.zeros(len(problem.frequencies))}
 
 
-def _check_frequencies(frequencies: FloatArray, rig: Rig) -> None:
-    if len(frequencies) == 0 or not (np.isfinite(frequencies).all()):
-        raise InputError("frequencies of a table must be finite numbers, at least one")
-    if not (np.diff(frequencies) > 0).all():
-        raise InputError("frequencies of a table must ascend without repetition")
-    low, high = rig.limits.frequency_min, rig.limits.frequency_max
-    if frequencies[0] < low or frequencies[-1] > high:
-        raise InputError(
-            f"frequencies must be within the rig's limits.frequency of {low:g} to {high:g} Hz, got "
-            f"{frequencies[0]:g} to {frequencies[-1]:g} Hz; choose others or change the limits"
-        )
-    for each in (rig.threshold, *rig.promised_thresholds):
-        check_has_threshold(frequencies, each)
-
-
 MAX_CACHED_TABLES = 50  # of some megabytes each; the least recently used go first
 
 _CURRENT = f"table-{FORMAT_VERSION}.{NUMERICS_VERSION}-"
@@ -539,12 +533,19 @@ def table_following(table: LocalizationTable, rig: Rig) -> LocalizationTable:
             f"thickness and frequencies must be within {100 * max_scale:g} % of the table's, got "
             f"factors of {thicker:.4g} and {faster:.4g}; build it again"
         )
+    # Shapes where nothing has moved stay as they were built.
+    own, places = (footprints_of(each.eras, each.masses) for each in (table, rig))
+    shapes = table.shapes_at(places)
+    for number, place in enumerate(places):
+        same = np.flatnonzero(np.abs(own - place).max(axis=1) < _SAME_PLACE)
+        if len(same):
+            shapes[number] = table.attachment_shapes[same[0]]
     return replace(
         like,
         omega=faster * table.omega,
         losses=faster**2 * table.losses,
         dispersion=faster**2 * table.dispersion,
-        attachment_shapes=_attachment_shapes(table, rig) / np.sqrt(thicker),
+        attachment_shapes=shapes / np.sqrt(thicker),
         shapes=(table.shapes / np.float32(np.sqrt(thicker))).astype(np.float32),
     )
 
@@ -554,14 +555,3 @@ def _taking(own: _Part, other: _Part, names: Sequence[str]) -> _Part:
     if type(other) is not type(own):
         return own
     return replace(own, **{name: getattr(other, name) for name in names})
-
-
-def _attachment_shapes(table: LocalizationTable, rig: Rig) -> FloatArray:
-    """Shapes (eras + masses, r) where the rig has them, as built where nothing has changed."""
-    own, places = (footprints_of(each.eras, each.masses) for each in (table, rig))
-    shapes = table.shapes_at(places)
-    for number, place in enumerate(places):
-        same = np.flatnonzero(np.abs(own - place).max(axis=1) < _SAME_PLACE)
-        if len(same):
-            shapes[number] = table.attachment_shapes[same[0]]
-    return shapes

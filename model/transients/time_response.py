@@ -81,9 +81,11 @@ class ForcedVibration:
 
     def as_free(self, numbers: Sequence[int], times: Sequence[float]) -> ComplexArray:
         """Return z (j, m) of free vibrations in the state of solutions (j,) at times (j,) [s]."""
-        z = self.modal(numbers, times)
-        # The conjugate of an eigenvector is that of the conjugate eigenvalue.
-        return np.asarray(-0.5j * (z[:, self.plate.half] - z[:, self.plate.partner].conj()))
+        z, half = self.modal(numbers, times), self.plate.half
+        # The conjugate of an eigenvector is that of the conjugate eigenvalue, which LAPACK puts
+        # behind each eigenvalue above the real axis; a real one is its own.
+        partner = half + (self.plate.decay.imag > 0)
+        return np.asarray(-0.5j * (z[:, half] - z[:, partner].conj()))
 
     def acceleration(self, number: int, times: FloatArray, shapes: ComplexArray) -> FloatArray:
         """Return the acceleration (n, p) in a solution at times (n,) [s]; shapes (2 r, p): by z."""
@@ -249,16 +251,6 @@ class PlateInTime:
         return np.asarray(numbers[order])
 
     @cached_property
-    def partner(self) -> NDArray[np.intp]:
-        """Indices (m,) of the conjugates of the eigenvalues in `half`; a real one is its own."""
-        # LAPACK puts the conjugate behind each eigenvalue above the real axis.
-        return np.asarray(self.half + (self.decay.imag > 0))
-
-    @cached_property
-    def _upper(self) -> FloatArray:
-        return np.where(self.eigenvalues.imag > 0, 2.0, 1.0)[self.half]
-
-    @cached_property
     def decay(self) -> ComplexArray:
         """Eigenvalues (m,) of `half` [1/s]."""
         return self.eigenvalues[self.half]
@@ -266,7 +258,7 @@ class PlateInTime:
     @cached_property
     def free_state(self) -> ComplexArray:
         """Matrix (2 r, m): displacement and velocity of a free vibration are Re[free_state @ z]."""
-        return self.vectors[:, self.half] * self._upper
+        return self.vectors[:, self.half] * np.where(self.eigenvalues.imag > 0, 2.0, 1.0)[self.half]
 
     @cached_property
     def free_acceleration(self) -> ComplexArray:

@@ -329,7 +329,9 @@ class SimulatedAmplifier:
         """
         self.tick(now)
         if name == "Set" and not is_last(values):
-            self._keep(values, now)
+            is_held = self.state == _ENABLED and values["session"] == self.session
+            if is_held and self._intake.keep(values, now):
+                self._last_fed = now
             return {}
         message, following = MESSAGES[name], TRANSITIONS.get((self.state, name))
         if following is None or (name == "Arm" and self._is_interlock_open):
@@ -511,12 +513,6 @@ class SimulatedAmplifier:
         if self._silent_from <= now and self._is_cause_gone(now):
             self.fault = "NONE"
             self._enter(following, now)
-
-    def _keep(self, part: Values, now: float) -> None:
-        """Keep a part of a set but the last, or drop it without a word."""
-        is_held = self.state == _ENABLED and part["session"] == self.session
-        if is_held and self._intake.keep(part, now):
-            self._last_fed = now
 
     def _take(self, part: Values, now: float) -> Values:
         """Take the last part of a set, and play it where it is whole and says so."""

@@ -96,7 +96,12 @@ class StraightClocks:
             now = clock.straight(time)
             lasts = _lasts(self.straight[name], now)
             if lasts < _SOON:
-                self.straight[name] = _renewed(self.straight[name], now)
+                known = self.straight[name]
+                # The mean pace since another clock was right, where that is alike.
+                mean = known.pace + _behind(known, now) / max(now.time - known.time, _SOON)
+                self.straight[name] = (
+                    now._replace(pace=mean) if abs(mean - now.pace) < _ALIKE else now
+                )
                 lasts = _lasts(self.straight[name], now)
                 renewed.append(name)
             self._due[name] = time + min(lasts / 2, clock.steady(time, _DRIFT))
@@ -107,12 +112,6 @@ def _lasts(known: StraightClock, now: StraightClock) -> float:
     """Return for how long [s] a clock is right enough, negative if it is wrong."""
     drift, left = abs(now.pace - known.pace), WRONG - abs(_behind(known, now))
     return left / drift if drift else math.copysign(math.inf, left)
-
-
-def _renewed(known: StraightClock, now: StraightClock) -> StraightClock:
-    """Return the clock of now, at its mean pace since another was right where that is alike."""
-    mean = known.pace + _behind(known, now) / max(now.time - known.time, _SOON)
-    return now._replace(pace=mean) if abs(mean - now.pace) < _ALIKE else now
 
 
 def _behind(known: StraightClock, now: StraightClock) -> float:
@@ -256,9 +255,29 @@ class Sensing:
     def handle(self, name: str, values: Values, now: float) -> Values:
         """Reply to GetSensors, Measure or GetReading at a time [s]; raises Refusal."""
         if name == "GetSensors":
-            return self._listed(values["first"])
+            described = [
+                {
+                    "unit": SENSOR_UNITS["ACCELERATION"],
+                    "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
+                    "x": _place(sensor.x),
+                    "y": _place(sensor.y),
+                    "range": float(np.float32(sensor.reach)),
+                    "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
+                }
+                for sensor in self.sensors
+            ]
+            listed = described[values["first"] :][: (MAX_WORDS - 2) // _SENSOR_WORDS]
+            return {"all": len(described), "count": len(listed), "sensors": listed}
         if name == "Measure":
-            return self._measure(values, now)
+            measurement = ToneMeasurement(
+                values["reading"],
+                _Q["window"].from_wire(values["window"]),
+                tuple(_Q["frequency"].from_wire(each) for each in values["frequencies"]),
+            )
+            # The same again is a repeated request, whose reply was lost.
+            if self.reader is None or measurement != self.reader.measurement:
+                self._begin(measurement, now)
+            return self._reading(_MAX_SENSORS, now)
         return self._reading(values["first"], now)
 
     def changed(self, moment: float) -> None:
@@ -281,33 +300,6 @@ class Sensing:
     def _frequency_max(self) -> float:
         nyquist = self._plate.sample_rate / 2
         return _Q["frequency"].quantise(min(_BELOW_NYQUIST * nyquist, _FREQUENCY_MAX))
-
-    def _listed(self, first: int) -> Values:
-        """Describe the sensors from one on, as many as fit."""
-        described = [self._described(sensor) for sensor in self.sensors]
-        listed = described[first:][: (MAX_WORDS - 2) // _SENSOR_WORDS]
-        return {"all": len(described), "count": len(listed), "sensors": listed}
-
-    def _described(self, sensor: Accelerometer) -> Values:
-        return {
-            "unit": SENSOR_UNITS["ACCELERATION"],
-            "channel": NO_CHANNEL if sensor.channel is None else sensor.channel,
-            "x": _place(sensor.x),
-            "y": _place(sensor.y),
-            "range": float(np.float32(sensor.reach)),
-            "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
-        }
-
-    def _measure(self, values: Values, now: float) -> Values:
-        """Begin to measure, unless it is the same again: its reply was lost."""
-        measurement = ToneMeasurement(
-            values["reading"],
-            _Q["window"].from_wire(values["window"]),
-            tuple(_Q["frequency"].from_wire(each) for each in values["frequencies"]),
-        )
-        if self.reader is None or measurement != self.reader.measurement:
-            self._begin(measurement, now)
-        return self._reading(_MAX_SENSORS, now)
 
     def _begin(self, measurement: ToneMeasurement, now: float) -> None:
         ascending = sorted(measurement.frequencies)
@@ -571,7 +563,15 @@ class Bench:
         Also the frequencies [Hz] driven in it, ascending.
         """
         self._sample_plate(until)
-        return self._fingers.felt(since, until), self._frequencies(since, until)
+        present = [(index, output, math.inf) for index, output in enumerate(self._applied_outputs)]
+        driven = {
+            tone.frequency
+            for index, output, end in [*self._played, *present]
+            for tone in output
+            if tone.transition.start + self._delays[index] < until
+            and min(end, tone.silent_from + self._delays[index]) > since
+        }
+        return self._fingers.felt(since, until), sorted(driven)
 
     def felt(self, since: float, until: float) -> dict[str, FeltVibration]:
         """Vibration at each finger in such a window, by id."""
@@ -699,19 +699,6 @@ class Bench:
         errors = self._errors[index]
         moving = [*playing, *imperfections.of_voices(playing, errors.harmonic)]
         return realised(motion_of(moving, clock, stroke=stroke, delay=delay), errors)
-
-    def _frequencies(self, since: float, until: float) -> list[float]:
-        """The frequencies [Hz] at which bases were moved by commands in a window."""
-        present = [(index, output, math.inf) for index, output in enumerate(self._applied_outputs)]
-        return sorted(
-            {
-                tone.frequency
-                for index, output, end in [*self._played, *present]
-                for tone in output
-                if tone.transition.start + self._delays[index] < until
-                and min(end, tone.silent_from + self._delays[index]) > since
-            }
-        )
 
 
 def _tabulated(solve: Callable[[], LoadedPlate], sample_rate: float) -> LoadedPlate:

@@ -164,24 +164,21 @@ class _Unit:
         number, offset = divmod(address, BOX)
         if offset >= REPLY_OFFSET and number in BY_NUMBER:
             first = number * BOX + REPLY_OFFSET
-            area = self._reply_area(BY_NUMBER[number], now)
+            message = BY_NUMBER[number]
+            tag, result, words = self._replies.get(message.number, (0, 0, ()))
+            if message.name in PRESENT:
+                if result:  # a refusal is read once
+                    self._replies[message.number] = tag, 0, ()
+                else:
+                    result, words = self._execute(message, (), now)
+            elif message.name == "SetAddress":
+                self.is_moving = self.address > 0 and result == 0
+            row = (tag, result, *words)
+            area = row + (0,) * (AREA - len(row))  # zeros behind a reply
         else:
-            first, area = IDENTITY_REGISTER, pack_identity(self.amplifier.identity)
+            first, area = IDENTITY_REGISTER, tuple(pack_identity(self.amplifier.identity))
         is_within = first <= address <= address + count <= first + len(area)
         return area[address - first :][:count] if is_within else ()
-
-    def _reply_area(self, message: Message, now: float) -> Sequence[int]:
-        """Return the registers of a reply, with zeros behind it."""
-        tag, result, words = self._replies.get(message.number, (0, 0, ()))
-        if message.name in PRESENT:
-            if result:  # a refusal is read once
-                self._replies[message.number] = tag, 0, ()
-            else:
-                result, words = self._execute(message, (), now)
-        elif message.name == "SetAddress":
-            self.is_moving = self.address > 0 and result == 0
-        row = (tag, result, *words)
-        return row + (0,) * (AREA - len(row))
 
 
 def _written(request: Pdu) -> Message | None:

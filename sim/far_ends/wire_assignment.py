@@ -86,7 +86,8 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
     for device in devices:
         wire = wires[device.name]
         if len(devices) > 1 and wire.line_kind is None:
-            wire = replace(wire, line_kind=_default_line(wire))
+            port = Path(wire.line).name.rstrip("0123456789")
+            wire = replace(wire, line_kind=KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind]))
         lines.setdefault(wire, []).append(device)
     urls: dict[str, str] = {}
     async with AsyncExitStack() as stack:
@@ -97,12 +98,6 @@ async def open_wires(wires: Mapping[str, SimulatedWire], devices: Devices) -> Ur
 
 def _numbered(devices: Devices) -> dict[int, AmplifierDevice]:
     return {device.address: device for device in devices}
-
-
-def _default_line(wire: SimulatedWire) -> str:
-    """The default kind of line of a wire; of a serial line by the port of its URL."""
-    port = Path(wire.line).name.rstrip("0123456789")
-    return KIND_OF_PORT.get(port, _LINE_OF_WIRE[wire.kind])
 
 
 def _speed(wire: SimulatedWire, default: int) -> int | None:

@@ -250,7 +250,10 @@ class Sampler:
             into = out[start : start + BLOCK]
             tau = float(times[start] - forced.times[solution])
             now = np.exp(self._decay * tau) * free.conj()
-            kept = self._kept(now)
+            strengths = np.abs(now) * self._strengths
+            counts = strengths > max(_NEGLIGIBLE * strengths.max(), _SMALLEST)
+            last = counts.nonzero()[0][-1:]
+            kept = int(last[0]) + 1 if len(last) else 0  # how many free vibrations count
             amplitudes = self._rows(self._free[:kept] * now[:kept, None])
             np.matmul(self._free_table[: len(into), : 2 * kept], amplitudes, out=into)
             driven: ComplexArray = self._constant[rows]
@@ -268,17 +271,17 @@ class Sampler:
         """Real and imaginary parts (n, 2 k) of a table (n, k)."""
         return np.ascontiguousarray(table).view(float).astype(self.precision, copy=False)
 
-    def _kept(self, free: ComplexArray) -> int:
-        """How many free vibrations count."""
-        strengths = np.abs(free) * self._strengths
-        counts = strengths > max(_NEGLIGIBLE * strengths.max(), _SMALLEST)
-        last = counts.nonzero()[0][-1:]
-        return int(last[0]) + 1 if len(last) else 0
-
     def _use(self, forced: ForcedVibration, solution: int) -> None:
         """Tabulate the exponentials of a solution."""
         if forced is not self._forced:
-            self._find_amplitudes(forced)
+            self._forced = forced
+            s = 1j * forced.omegas[:, None]
+            constant = s**2 * forced.a0
+            if forced.a1 is not None:
+                constant += 2 * s * forced.a1
+                # Im[a exp(s t)] is Re[-i a exp(s t)].
+                self._growth = np.asarray(1j * ((s**2 * forced.a1) @ self._by_forced).conj())
+            self._constant = np.asarray(1j * (constant @ self._by_forced).conj())
         self._solution = solution
         omegas = forced.omegas[forced.rows(solution)]
         table = _sinusoids(omegas.tobytes(), self.sample_rate)
@@ -287,17 +290,6 @@ class Sampler:
             table = np.hstack([table, np.arange(BLOCK)[:, None] / self.sample_rate * table])
             self._exponents = np.tile(self._exponents, 2)
         self._forced_table = self._columns(table)
-
-    def _find_amplitudes(self, forced: ForcedVibration) -> None:
-        """Find the amplitudes of all solutions at the points, all at once."""
-        self._forced = forced
-        s = 1j * forced.omegas[:, None]
-        constant = s**2 * forced.a0
-        if forced.a1 is not None:
-            constant += 2 * s * forced.a1
-            # Im[a exp(s t)] is Re[-i a exp(s t)].
-            self._growth = np.asarray(1j * ((s**2 * forced.a1) @ self._by_forced).conj())
-        self._constant = np.asarray(1j * (constant @ self._by_forced).conj())
 
 
 @lru_cache(_TABLES_KEPT)

@@ -149,7 +149,13 @@ async def _serve(
     bench = context.bench
     async with contextlib.AsyncExitStack() as stack:
         if isinstance(bench, FirmwareBench) and simulation.firmware is not None:
-            context.urls = await _start_firmware(stack, bench, simulation.firmware)
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
+            bench.firmware = {
+                name: await stack.enter_async_context(running(simulation.firmware, folder, name))
+                for name in bench.amplifiers
+            }
+            os.nice(_NICE)
+            context.urls = {name: each.url for name, each in bench.firmware.items()}
         else:
             await _open_devices(stack, simulation, context)
         context.urls = stack.enter_context(linked_urls(context.urls, simulation.links))
@@ -181,19 +187,6 @@ async def _open_devices(
     ]
     context.urls = await stack.enter_async_context(open_wires(simulation.wires, devices))
     context.devices = {device.name: device for device in devices}
-
-
-async def _start_firmware(
-    stack: contextlib.AsyncExitStack, bench: FirmwareBench, firmware: Path
-) -> dict[str, str]:
-    """Run the firmware for each amplifier; returns the URLs by name."""
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="era-")))
-    bench.firmware = {
-        name: await stack.enter_async_context(running(firmware, folder, name))
-        for name in bench.amplifiers
-    }
-    os.nice(_NICE)
-    return {name: each.url for name, each in bench.firmware.items()}
 
 
 def _await_eof(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:

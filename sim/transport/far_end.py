@@ -79,11 +79,19 @@ def _moved(url: str, paths: Mapping[str, str]) -> str:
 def linked(link: Path, *, to: str) -> Iterator[str]:
     """A symbolic link to a path while this lasts; yields its absolute path. Raises InputError."""
     with _lock(link):
-        _make(link, to=to)
+        if not link.is_symlink() and link.exists():
+            raise InputError(f"--link {link}: exists and is no symbolic link; choose another path")
+        made = link.with_name(f".{link.name}.{os.getpid()}")
+        try:
+            made.symlink_to(to)
+            made.replace(link)
+        except OSError as problem:
+            raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
         try:
             yield str(link.absolute())
         finally:
-            _remove(link, to=to)
+            if link.is_symlink() and str(link.readlink()) == to:  # not another's by now
+                link.unlink()
 
 
 @contextmanager
@@ -102,22 +110,6 @@ def _lock(link: Path) -> Iterator[None]:
                 f"--link {link}: in use by another amplifier; choose another path"
             ) from None
         yield
-
-
-def _make(link: Path, *, to: str) -> None:
-    if not link.is_symlink() and link.exists():
-        raise InputError(f"--link {link}: exists and is no symbolic link; choose another path")
-    made = link.with_name(f".{link.name}.{os.getpid()}")
-    try:
-        made.symlink_to(to)
-        made.replace(link)
-    except OSError as problem:
-        raise InputError(f"--link {link}: cannot be made: {problem.strerror}") from None
-
-
-def _remove(link: Path, *, to: str) -> None:
-    if link.is_symlink() and str(link.readlink()) == to:  # not another's by now
-        link.unlink()
 
 
 _READ_MAX = 4096

@@ -57,15 +57,14 @@ class Finding(Exception):
     seen = expected = sent = came = ""
 
 
-def _is_empty(value: object) -> bool:
-    return isinstance(value, Sized) and not value
-
-
 class ContractViolation(Finding):
     """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
-        must, got = ("none" if _is_empty(each) else str(each) for each in (expected, seen))
+        must, got = (
+            "none" if isinstance(each, Sized) and not each else str(each)
+            for each in (expected, seen)
+        )
         self.expected, self.seen = must, f"{what}: {got}"
         super().__init__(f"{what} must be {must}, got {got}")
 

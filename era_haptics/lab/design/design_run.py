@@ -46,7 +46,7 @@ from model.errors import (
 )
 from model.figures import COLORS, Template, draw_eras, label_plate, save_figure, write_template
 from model.files.array_file import whole_or_nothing
-from model.files.csv_file import Columns, write_columns
+from model.files.csv_file import write_columns
 from model.finger import STRONG_DB_SL
 from model.processes import Progress, check_progress, on_cluster, on_processes, unseen
 from model.rig.actuator_keys import KINDS
@@ -499,7 +499,13 @@ def write_design(folder: Path, design: Design, data: Mapping[str, Value]) -> lis
     rig, table = folder / "rig.yaml", folder / "layouts.csv"
     with whole_or_nothing(rig) as stream:
         stream.write(rig_text(design, data).encode())
-    write_columns(table, _columns(design.layouts))
+    rows = [_row(each) for each in design.layouts]
+    at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
+    columns = {key: ["" if row[key] is None else row[key] for row in rows] for key in rows[0]}
+    contrast = [f"{each.mean_db:.6g}" if each.judged else "" for each in design.layouts]
+    write_columns(
+        table, {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
+    )
     pictures = {"contrast.png": contrast_figure, "count.png": count_figure}
     for name, figure in pictures.items():
         save_figure(figure(design), folder / name)
@@ -619,15 +625,6 @@ def summary(design: Design) -> dict[str, Any]:
         "contents": problem.contacts.contents,
         "sets": len(design.sets),
     }
-
-
-def _columns(layouts: Sequence[RankedLayout]) -> Columns:
-    """A row for each layout, in the order of their ranks."""
-    rows = [_row(each) for each in layouts]
-    at = [" ".join(f"({x:.6g};{y:.6g})" for x, y in row["at_m"].values()) for row in rows]
-    columns = {key: ["" if row[key] is None else row[key] for row in rows] for key in rows[0]}
-    contrast = [f"{each.mean_db:.6g}" if each.judged else "" for each in layouts]
-    return {"rank": range(1, len(rows) + 1), **columns, "at_m": at, "contrast_db": contrast}
 
 
 def _row(layout: RankedLayout) -> dict[str, Any]:

@@ -123,7 +123,13 @@ class Scorer:
         self._cells = np.empty((0, 2))
         if uncertainty.field > 0:
             self._cells = Grid(12, 9).centres(rig.plate)
-        self._groups = _grouped([len(each) for each in sets], numbers.ravel())
+        # The sets of each size are one array (s, k).
+        sizes = [len(each) for each in sets]
+        first = np.cumsum(sizes) - sizes
+        self._groups = tuple(
+            numbers.ravel()[first[np.equal(sizes, size)][:, None] + np.arange(size)]
+            for size in np.unique(sizes).tolist()
+        )
         # Of a fingertip's points from its centre, (v, f, m, p).
         every, tips = np.arange(len(centres)), self._solved(centres).to_tips
         tips = tips.reshape(*tips.shape[:2], *weights.shape, -1)
@@ -272,15 +278,6 @@ class Scorer:
 def _mean_power(values: Complex64Array, weights: Float32Array) -> Float32Array:
     """Mean of |values|² (f, m, p, n) over fingertips of weights (m, p), (f, m, n)."""
     return np.asarray((weights[:, None] @ power_of(values))[:, :, 0])
-
-
-def _grouped(sizes: Sequence[int], numbers: IntArray) -> tuple[IntArray, ...]:
-    """Sets of these sizes, one after the other in numbers, as one array (s, k) for each size."""
-    first = np.cumsum(sizes) - sizes
-    return tuple(
-        numbers[first[np.equal(sizes, size)][:, None] + np.arange(size)]
-        for size in np.unique(sizes).tolist()
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,20 +141,19 @@ def fitted(frequencies: FloatArray, impedance: ComplexArray, *, what: str) -> Ci
     return found
 
 
-def _shares(f: FloatArray, resonance: float, q: float) -> ComplexArray:
-    """What R_e, L, K and R_m are multiplied by, (f, 4)."""
-    omega = 2 * np.pi * f
-    motion = 1 / (1 + 1j * q * (f / resonance - resonance / f))
-    return np.stack([np.ones_like(f), 1j * omega, np.sqrt(1j * omega), motion], axis=1)
-
-
 def _fit(f: FloatArray, impedance: ComplexArray) -> Circuit:
     """Least squares of relative differences, from the best of resonances and Q that are tried."""
     size = np.abs(impedance)
     ones = _parts(impedance / size)
 
     def matrix(resonance: float, q: float) -> FloatArray:
-        return _parts(_shares(f, resonance, q) / size[:, None])
+        omega = 2 * np.pi * f
+        motion = 1 / (1 + 1j * q * (f / resonance - resonance / f))
+        # What R_e, L, K and R_m are multiplied by.
+        shares: ComplexArray = np.stack(
+            [np.ones_like(f), 1j * omega, np.sqrt(1j * omega), motion], axis=1
+        )
+        return _parts(shares / size[:, None])
 
     def residual(x: FloatArray) -> FloatArray:
         return np.asarray(matrix(*x[4:]) @ x[:4] - ones)

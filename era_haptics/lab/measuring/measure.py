@@ -426,8 +426,18 @@ def measure_through(
         run = play_run(desk, card, again, _REPEATED, periods=periods, before=found.looped)
         repeats.append(_repeats(desk, found, again, run.whole))
         progress(runs + number, runs + 2)
+    # Responses with the usual error of readings, and the noise beside it.
+    responses = found.responses
+    values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
+    plain = Measurement.of(
+        [Sensor(each.name, x=each.x, y=each.y, mass=each.mass) for each in desk.sensors],
+        responses.frequencies,
+        values,
+    )
+    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
+    noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
     measurement = replace(
-        _measurement(desk, found),
+        replace(plain, std=np.hypot(plain.std, noise)),
         half_level=repeats[0],
         at_end=repeats[1],
         drives_lag=True,
@@ -449,20 +459,6 @@ def measure_through(
         notes=(),
         details={"latency_s": found.latency, "repeated_runs": found.repeated},
     )
-
-
-def _measurement(desk: Desk, found: MeasuredResponses) -> Measurement:
-    """Responses with the usual error of readings and the noise beside it."""
-    responses = found.responses
-    values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
-    plain = Measurement.of(
-        [Sensor(each.name, x=each.x, y=each.y, mass=each.mass) for each in desk.sensors],
-        responses.frequencies,
-        values,
-    )
-    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
-    noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
-    return replace(plain, std=np.hypot(plain.std, noise))
 
 
 def _repeats(

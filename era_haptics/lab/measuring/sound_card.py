@@ -173,7 +173,11 @@ def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEs
     heard = spectra[:, lines]  # (runs, f, inputs)
     played = np.array([multisine.played(run) for run in range(len(recorded))])  # (runs, f, s)
     values = np.linalg.solve(played.transpose(1, 0, 2), heard.transpose(1, 0, 2))
-    noise = _noise(spectra, lines, periods)
+    # The noise is in the bins around each line that no period has.
+    offsets = np.arange(-_AROUND * periods, _AROUND * periods + 1)
+    offsets = offsets[offsets % periods != 0]
+    bins = np.clip(lines[:, None] + offsets, 1, spectra.shape[1] - 1)
+    noise = np.asarray((np.abs(spectra[:, bins]) ** 2).mean(axis=(0, 2)))
     power = (np.abs(heard) ** 2).mean(axis=0)
     size = np.abs(multisine.played(0)[:, :1])
     return ResponseEstimate(
@@ -182,14 +186,6 @@ def estimate(multisine: Multisine, recorded: Sequence[FloatArray]) -> ResponseEs
         np.clip(1 - noise / np.maximum(power, 1e-300), 0.0, 1.0),
         _even(spectra, lines, periods, noise),
     )
-
-
-def _noise(spectra: ComplexArray, lines: IntArray, periods: int) -> FloatArray:
-    """Mean power of the bins around each line that no period has, (f, inputs)."""
-    offsets = np.arange(-_AROUND * periods, _AROUND * periods + 1)
-    offsets = offsets[offsets % periods != 0]
-    bins = np.clip(lines[:, None] + offsets, 1, spectra.shape[1] - 1)
-    return np.asarray((np.abs(spectra[:, bins]) ** 2).mean(axis=(0, 2)))
 
 
 def _even(spectra: ComplexArray, lines: IntArray, periods: int, noise: FloatArray) -> FloatArray:

@@ -95,7 +95,9 @@ class CanDecoder(Decoder):
                 if _IS_FRAME.match(piece):
                     seen.append((piece, damaged("a malformed frame line")))
                 continue
-            sender = self._sender(frame)
+            is_numbered = frame.data[:1] != b"\0"
+            made = Assembler(self._counters, is_numbered=is_numbered)
+            sender = self._senders.setdefault((frame.id, is_numbered), made)
             take = self._from_host if direction == "amplifier" else self._from_bus
             message = take(time, frame, sender)
             if sender.given_up is not None:
@@ -104,11 +106,6 @@ class CanDecoder(Decoder):
                 sender.given_up = None
             seen.append((piece, message))
         return seen
-
-    def _sender(self, frame: CanFrame) -> Assembler:
-        is_numbered = frame.data[:1] != b"\0"
-        made = Assembler(self._counters, is_numbered=is_numbered)
-        return self._senders.setdefault((frame.id, is_numbered), made)
 
     def _words(self, time: float, frame: CanFrame, sender: Assembler) -> Words | Notice | None:
         """Take a frame; returns the message that it completes, or that it fits none."""
@@ -192,18 +189,15 @@ class ModbusDecoder(Decoder):
         """Decode bytes; returns the complete frames."""
         take = self._request if direction == "amplifier" else self._response
         seen: list[DecodedFrame] = []
-        for adu in self._split(direction, time, data):
-            seen.append((adu.raw, take(adu) if adu.pdu else damaged("a malformed ADU")))
-            if not adu.pdu and direction == "amplifier" and not self._over_tcp:
-                self._open.clear()
-        return seen
-
-    def _split(self, direction: Direction, time: float, data: bytes) -> list[Adu]:
         reader = self._readers[direction]
         is_late = not self._over_tcp and time > self._last.get(direction, time) + _PAUSE
         found = [*(reader.end() if is_late else ()), *reader.feed(data)]
         self.rest[direction], self._last[direction] = reader.rest, time
-        return found
+        for adu in found:
+            seen.append((adu.raw, take(adu) if adu.pdu else damaged("a malformed ADU")))
+            if not adu.pdu and direction == "amplifier" and not self._over_tcp:
+                self._open.clear()
+        return seen
 
     def _request(self, adu: Adu) -> Message:
         self._requests += 1

@@ -140,7 +140,11 @@ class WatchedWire:
             self._report.frame(self.name, time, direction, raw)
             if isinstance(message, Notice) and message.what == "damaged":
                 since = min(started_at, message.started_at)
-                self._damaged(direction, time, message.text, since)
+                if direction == "amplifier":
+                    self._damaged_at = time
+                if not self.is_disturbed(since):
+                    sender = "host" if direction == "amplifier" else "amplifier"
+                    self._report.add(self.name, "garbage", time, f"{sender} sent {message.text}")
             elif direction == "amplifier" and message is not None:
                 self._sent(time, raw, message, started_at)
             elif message is not None:
@@ -163,13 +167,6 @@ class WatchedWire:
                     session.report_always("answer", now, f"{session.name}: {what}")
             if now > sent.started_at + _PENDING_TIMEOUT:
                 del self._pending[key]
-
-    def _damaged(self, direction: Direction, time: float, why: str, started_at: float) -> None:
-        if direction == "amplifier":
-            self._damaged_at = time
-        if not self.is_disturbed(started_at):
-            sender = "host" if direction == "amplifier" else "amplifier"
-            self._report.add(self.name, "garbage", time, f"{sender} sent {why}")
 
     def _sent(self, time: float, raw: bytes, message: Message, started_at: float) -> None:
         """Process a frame of the host."""

@@ -67,10 +67,11 @@ from collections.abc import (
 )
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from drivers.errors import LinkError
 from model.answer.stimulus import check_on_plate
@@ -85,117 +86,25 @@ from sim.plant.fingers import Accelerometer, Position, measure_vibration
 from sim.plant.imperfections import PlateErrors
 from sim.sensors import Accelerometers, Recorder, Recording
 
-Request: TypeAlias = dict[str, Any]
-
 _MAX_STEP = 3600.0  # s of virtual time in one request
 _MAX_TONES = 64
 _MAX_KEY = 60  # characters of a key in an error
 _At = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]  # [x, y] in m
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
+_Finger = Annotated[str, Field(min_length=1, max_length=40)]  # its id
 _Mass = Annotated[tuple[FiniteFloat, FiniteFloat, _Positive], Field(strict=False)]
 
 
-class _Form(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True)
-
-
-_T = TypeVar("_T", bound=_Form)
-
-
-def read(form: type[_T], request: Request) -> _T:
-    """Read a request by its form; raises InputError with the key."""
-    try:
-        return form.model_validate(request)
-    except ValidationError as error:
-        key, problem = first_problem(error)
-        raise InputError(f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")) from None
-
-
-class FingersRequest(_Form):
-    """All fingers: positions, those without weight, and loads times that of the rig's fingertip."""
-
-    fingers: dict[str, _At]
-    observers: list[str] = []
-    loads: dict[str, FiniteFloat] = {}
-
-    @model_validator(mode="after")
-    def _are_of_fingers(self) -> Self:
-        if not {*self.observers, *self.loads} <= self.fingers.keys():
-            raise ValueError("observers and loads must be of these fingers")
-        return self
-
-
-class FingerRequest(_Form):
-    """One finger by its id."""
-
-    finger: Annotated[str, Field(min_length=1, max_length=40)]
-
-
-class TouchRequest(FingerRequest):
-    """One finger, where it is, and its load if it has another one."""
-
-    at_m: _At
-    load: FiniteFloat | None = None
-
-
-class WindowRequest(_Form):
-    """A window of time [s]."""
-
-    since_s: FiniteFloat
-    until_s: FiniteFloat
-
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
-        if self.since_s >= self.until_s:
-            raise ValueError("since_s must be less than until_s")
-        return self
-
-
-class TonesRequest(WindowRequest):
-    """Frequencies [Hz] within a window."""
-
-    frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)]
-
-
-class SensorRequest(_Form):
+class SensorPlacement(BaseModel):
     """A place, and fields of an `Accelerometer`; nothing else."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     at_m: _At
     noise_density: FiniteFloat = Field(0.0, alias="noise_m_s2_rthz")
     reach: FiniteFloat = Field(0.0, alias="reach_m_s2")
     resolution: FiniteFloat = Field(0.0, alias="resolution_m_s2")
     scale: FiniteFloat = 1.0
-
-
-class SensorsRequest(_Form):
-    """All sensors by name."""
-
-    sensors: dict[str, SensorRequest]
-
-
-class RecordRequest(_Form):
-    """A file to record to."""
-
-    file: Annotated[str, Field(min_length=1)]
-
-
-class PlateRequest(_Form):
-    """Factors of the plate as it was at first, and masses [x, y, kg]; nothing else."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    op: str
-    modulus: _Positive = 1.0
-    stiffness: dict[str, _Positive] = {}
-    masses: list[_Mass] = []
-
-
-class StepRequest(_Form):
-    """Virtual time to go on by [s]."""
-
-    seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
 
 
 @dataclass
@@ -280,33 +189,114 @@ class SimulationContext:
 
 
 Response: TypeAlias = dict[str, Any]
-Operation: TypeAlias = Callable[[SimulationContext, Request, float], Awaitable[Response]]
-"""Executes a request at a time [s], or raises InputError and changes nothing."""
+_Function: TypeAlias = Callable[..., Awaitable[Response]]
+
+OPERATIONS: dict[str, tuple[type[BaseModel], _Function]] = {}
+"""The operations by name, in the order of `hello`: keys of a request, and what carries it out."""
 
 
-async def _fingers(context: SimulationContext, request: Request, now: float) -> Response:
-    given = read(FingersRequest, request)
-    return _placed(context, given.fingers, now, observers=given.observers, loads=given.loads)
+def operation(
+    *names: str, extra: Literal["allow", "ignore", "forbid"] = "ignore"
+) -> Callable[[_Function], _Function]:
+    """Register a function as the operations of these names; extra: what other keys are.
+
+    It is called with the context, the time [s] and the keys of a request, which are its further
+    parameters. It returns the response, or raises InputError and changes nothing.
+    """
+
+    def register(function: _Function) -> _Function:
+        _, _, *keys = signature(function).parameters.values()
+        keys = [each for each in keys if each.kind is each.KEYWORD_ONLY]
+        form: dict[str, Any] = {
+            "__module__": __name__,
+            "__annotations__": {each.name: each.annotation for each in keys},
+            "model_config": ConfigDict(frozen=True, strict=True, extra=extra),
+            **{each.name: each.default for each in keys if each.default is not each.empty},
+        }
+        OPERATIONS.update(dict.fromkeys(names, (type(names[0], (BaseModel,), form), function)))
+        return function
+
+    return register
 
 
-async def _touch_or_move(context: SimulationContext, request: Request, now: float) -> Response:
-    name, bench = read(FingerRequest, request).finger, context.bench
-    if (name in bench.positions) != (request["op"] == "move"):
-        state = "already" if name in bench.positions else "not"
-        raise InputError(f"finger {name!r} is {state} on the plate")
-    given = read(TouchRequest, request)
+def _check_window(since_s: float, until_s: float) -> None:
+    if since_s >= until_s:
+        raise InputError("since_s must be less than until_s")
+
+
+VERSION = 3
+
+
+@operation("hello")
+async def _hello(context: SimulationContext, now: float) -> Response:
+    return {
+        "protocol": "era-sim-control",
+        "version": VERSION,
+        "clock": "wall" if context.step is None else "virtual",
+        "ops": list(OPERATIONS),
+        "urls": dict(context.urls),
+    }
+
+
+@operation("state")
+async def _state(context: SimulationContext, now: float) -> Response:
+    bench = context.bench
+    bench.advance(now)
+    amplifiers = {}
+    for name, amplifier in bench.amplifiers.items():
+        summary = amplifier.summary(bench.time)
+        amplifiers[name] = {
+            "state": summary.state,
+            "fault": summary.fault,
+            "token": summary.token,
+            "high_voltage": summary.is_high_voltage,
+            "levels": list(summary.levels),
+        }
+    resting = {name: list(position) for name, position in bench.positions.items()}
+    return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
+
+
+@operation("fingers")
+async def _fingers(
+    context: SimulationContext,
+    now: float,
+    *,
+    fingers: dict[str, _At],
+    observers: Annotated[list[str], Field(default_factory=list)],
+    loads: Annotated[dict[str, FiniteFloat], Field(default_factory=dict)],
+) -> Response:
+    if not {*observers, *loads} <= fingers.keys():
+        raise InputError("observers and loads must be of these fingers")
+    return _placed(context, fingers, now, observers=observers, loads=loads)
+
+
+@operation("touch", "move")
+async def _touch_or_move(
+    context: SimulationContext,
+    now: float,
+    *,
+    op: str,
+    finger: _Finger,
+    at_m: _At,
+    load: FiniteFloat | None = None,
+) -> Response:
+    bench = context.bench
+    if (finger in bench.positions) != (op == "move"):
+        state = "already" if finger in bench.positions else "not"
+        raise InputError(f"finger {finger!r} is {state} on the plate")
     loads = dict(bench.loads)
-    if given.load is not None:
-        loads[name] = given.load
-    positions = {**bench.positions, name: given.at_m}
+    if load is not None:
+        loads[finger] = load
+    positions = {**bench.positions, finger: at_m}
     return _placed(context, positions, now, observers=bench.observers, loads=loads)
 
 
-async def _lift(context: SimulationContext, request: Request, now: float) -> Response:
-    name, present = read(FingerRequest, request).finger, context.bench.positions
-    if name not in present:
-        raise InputError(f"finger {name!r} is not on the plate")
-    rest = {id: at for id, at in present.items() if id != name}
+@operation("lift")
+async def _lift(context: SimulationContext, now: float, *, finger: _Finger) -> Response:
+    present = context.bench.positions
+    if finger not in present:
+        raise InputError(f"finger {finger!r} is not on the plate")
+    rest = {id: at for id, at in present.items() if id != finger}
     return _placed(context, rest, now, observers=context.bench.observers, loads=context.bench.loads)
 
 
@@ -323,13 +313,15 @@ def _placed(
     return {"ok": True, "time_s": context.bench.time}
 
 
-async def _felt(context: SimulationContext, request: Request, now: float) -> Response:
-    window = read(WindowRequest, request)
-    await context.solved(
-        window.until_s
-    )  # in a thread, as the fits below: amplifiers must go on replying
+@operation("felt")
+async def _felt(
+    context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
+) -> Response:
+    _check_window(since_s, until_s)
+    # In a thread, as the fits below: amplifiers must go on replying.
+    await context.solved(until_s)
     context.bench.advance(now)
-    records, frequencies = context.bench.records(window.since_s, window.until_s)
+    records, frequencies = context.bench.records(since_s, until_s)
     felt = {
         id: await asyncio.to_thread(measure_vibration, record, frequencies)
         for id, record in records.items()
@@ -348,18 +340,24 @@ async def _felt(context: SimulationContext, request: Request, now: float) -> Res
     }
 
 
-async def _sensors(context: SimulationContext, request: Request, now: float) -> Response:
-    sensors = [
+@operation("sensors")
+async def _sensors(
+    context: SimulationContext, now: float, *, sensors: dict[str, SensorPlacement]
+) -> Response:
+    placed = [
         Accelerometer(name, *each.at_m, **each.model_dump(exclude={"at_m"}, exclude_unset=True))
-        for name, each in read(SensorsRequest, request).sensors.items()
+        for name, each in sensors.items()
     ]
     context.bench.advance(now)
-    context.accelerometers.place(sensors)
+    context.accelerometers.place(placed)
     return {"ok": True, "time_s": context.bench.time}
 
 
-async def _signals(context: SimulationContext, request: Request, now: float) -> Response:
-    recording = _recorded(context, request, now)
+@operation("signals")
+async def _signals(
+    context: SimulationContext, now: float, *, since_s: FiniteFloat, until_s: FiniteFloat
+) -> Response:
+    recording = _recorded(context, now, since_s, until_s)
     columns = zip(
         recording.names, recording.points.tolist(), recording.samples.T.tolist(), strict=True
     )
@@ -370,13 +368,22 @@ async def _signals(context: SimulationContext, request: Request, now: float) -> 
     }
 
 
-async def _tones(context: SimulationContext, request: Request, now: float) -> Response:
-    frequencies, nyquist = read(TonesRequest, request).frequencies_hz, context.bench.sample_rate / 2
-    if len(set(frequencies)) < len(frequencies) or max(frequencies) >= nyquist:
+@operation("tones")
+async def _tones(
+    context: SimulationContext,
+    now: float,
+    *,
+    since_s: FiniteFloat,
+    until_s: FiniteFloat,
+    frequencies_hz: Annotated[list[_Positive], Field(min_length=1, max_length=_MAX_TONES)],
+) -> Response:
+    _check_window(since_s, until_s)
+    nyquist = context.bench.sample_rate / 2
+    if len(set(frequencies_hz)) < len(frequencies_hz) or max(frequencies_hz) >= nyquist:
         raise InputError(f"frequencies_hz must be different ones below {nyquist:g} Hz")
-    recording = _recorded(context, request, now)
+    recording = _recorded(context, now, since_s, until_s)
     # In a thread: a long fit must not delay the amplifiers' replies.
-    phasors = await asyncio.to_thread(recording.tones, frequencies)
+    phasors = await asyncio.to_thread(recording.tones, frequencies_hz)
     columns = zip(recording.names, recording.points.tolist(), phasors.T, strict=True)
     return {
         "sensors": {
@@ -386,20 +393,23 @@ async def _tones(context: SimulationContext, request: Request, now: float) -> Re
     }
 
 
-def _recorded(context: SimulationContext, request: Request, now: float) -> Recording:
-    window = read(WindowRequest, request)
+def _recorded(context: SimulationContext, now: float, since_s: float, until_s: float) -> Recording:
+    _check_window(since_s, until_s)
     context.bench.advance(now)
-    return context.accelerometers.read(window.since_s, window.until_s)
+    return context.accelerometers.read(since_s, until_s)
 
 
-async def _record(context: SimulationContext, request: Request, now: float) -> Response:
-    file = read(RecordRequest, request).file
+@operation("record")
+async def _record(
+    context: SimulationContext, now: float, *, file: Annotated[str, Field(min_length=1)]
+) -> Response:
     context.bench.advance(now)
     context.record(Path(file))
     return {"ok": True, "time_s": context.bench.time}
 
 
-async def _finish(context: SimulationContext, request: Request, now: float) -> Response:
+@operation("finish")
+async def _finish(context: SimulationContext, now: float) -> Response:
     context.bench.advance(now)
     recorder = context.stop_recording()
     await asyncio.to_thread(recorder.finish)
@@ -410,98 +420,45 @@ async def _finish(context: SimulationContext, request: Request, now: float) -> R
     }
 
 
-async def _plate(context: SimulationContext, request: Request, now: float) -> Response:
-    change = read(PlateRequest, request)
+@operation("plate", extra="forbid")
+async def _plate(
+    context: SimulationContext,
+    now: float,
+    *,
+    op: str,
+    modulus: _Positive = 1.0,
+    stiffness: Annotated[dict[str, _Positive], Field(default_factory=dict)],
+    masses: Annotated[list[_Mass], Field(default_factory=list)],
+) -> Response:
     first, rig = context.first_plate, context.bench.rig
     names = [era.name for era in rig.eras]
-    if not change.stiffness.keys() <= set(names):
+    if not stiffness.keys() <= set(names):
         raise InputError(f"stiffness must be an object of factors by ERA ({', '.join(names)})")
-    stiffness = {
-        name: first.stiffness.get(name, 1.0) * change.stiffness.get(name, 1.0) for name in names
-    }
-    check_on_plate("a mass", [(x, y) for x, y, _ in change.masses], rig.plate)
+    check_on_plate("a mass", [(x, y) for x, y, _ in masses], rig.plate)
     changed = replace(
         first,
-        modulus=first.modulus * change.modulus,
-        stiffness=stiffness,
-        masses=(*first.masses, *(PointLoad(x, y, mass=mass) for x, y, mass in change.masses)),
+        modulus=first.modulus * modulus,
+        stiffness={
+            name: first.stiffness.get(name, 1.0) * stiffness.get(name, 1.0) for name in names
+        },
+        masses=(*first.masses, *(PointLoad(x, y, mass=mass) for x, y, mass in masses)),
     )
     context.bench.change_plate(changed, now=now)
     return {"ok": True, "time_s": context.bench.time}
 
 
-OPERATIONS: Mapping[str, Operation] = {
-    "fingers": _fingers,
-    "touch": _touch_or_move,
-    "move": _touch_or_move,
-    "lift": _lift,
-    "felt": _felt,
-    "sensors": _sensors,
-    "signals": _signals,
-    "tones": _tones,
-    "record": _record,
-    "finish": _finish,
-    "plate": _plate,
-}
-
-
-VERSION = 3
-
-
-async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
-    """Execute one request line at a time [s]."""
-    try:
-        request = json.loads(line)
-        if not isinstance(request, dict):
-            raise InputError("a line must be a JSON object")
-        op = request.get("op")
-        if not isinstance(op, str) or op not in _OPERATIONS:
-            raise InputError(f"op must be one of {', '.join(_OPERATIONS)}, got {str(op)[:40]!r}")
-        return await _OPERATIONS[op](context, request, now)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        return {"error": f"invalid JSON: {error}"}
-    except InputError as error:
-        return {"error": str(error)}
-    except OSError as error:
-        problem = f"{error.filename or 'file'}: cannot be written: {error.strerror}"
-        return {"error": problem if error.strerror else str(error)}
-
-
-async def _hello(context: SimulationContext, request: Request, now: float) -> Response:
-    return {
-        "protocol": "era-sim-control",
-        "version": VERSION,
-        "clock": "wall" if context.step is None else "virtual",
-        "ops": list(_OPERATIONS),
-        "urls": dict(context.urls),
-    }
-
-
-async def _state(context: SimulationContext, request: Request, now: float) -> Response:
-    bench = context.bench
-    bench.advance(now)
-    amplifiers = {}
-    for name, amplifier in bench.amplifiers.items():
-        summary = amplifier.summary(bench.time)
-        amplifiers[name] = {
-            "state": summary.state,
-            "fault": summary.fault,
-            "token": summary.token,
-            "high_voltage": summary.is_high_voltage,
-            "levels": list(summary.levels),
-        }
-    resting = {name: list(position) for name, position in bench.positions.items()}
-    return {"time_s": bench.time, "fingers": resting, "amplifiers": amplifiers}
-
-
-async def _inject_fault(context: SimulationContext, request: Request, now: float) -> Response:
-    window = parse_fault({key: value for key, value in request.items() if key != "op"})
+@operation("inject_fault", extra="allow")
+async def _inject_fault(
+    context: SimulationContext, now: float, *, op: str, **given: Any
+) -> Response:
+    window = parse_fault(given)
     for device in context.devices_of(window.amplifier):
         device.inject_fault(window)
     return {"ok": True, "time_s": now}
 
 
-async def _faults(context: SimulationContext, request: Request, now: float) -> Response:
+@operation("faults")
+async def _faults(context: SimulationContext, now: float) -> Response:
     listed = {}
     for name, device in context.devices.items():
         begin = device.faults.begin
@@ -517,14 +474,17 @@ async def _faults(context: SimulationContext, request: Request, now: float) -> R
     return {"faults": listed}
 
 
-async def _recover(context: SimulationContext, request: Request, now: float) -> Response:
-    for device in context.devices_of(request.get("amplifier")):
+@operation("recover")
+async def _recover(context: SimulationContext, now: float, *, amplifier: Any = None) -> Response:
+    for device in context.devices_of(amplifier):
         device.recover()
     return {"ok": True, "time_s": now}
 
 
-async def _step(context: SimulationContext, request: Request, now: float) -> Response:
-    seconds = read(StepRequest, request).seconds
+@operation("step")
+async def _step(
+    context: SimulationContext, now: float, *, seconds: Annotated[_Positive, Field(le=_MAX_STEP)]
+) -> Response:
     if context.step is None:
         raise InputError("step needs virtual time: start era sim with --virtual-time")
     await context.step(seconds)
@@ -532,15 +492,27 @@ async def _step(context: SimulationContext, request: Request, now: float) -> Res
     return {"ok": True, "time_s": context.bench.time}
 
 
-_OPERATIONS: Mapping[str, Operation] = {
-    "hello": _hello,
-    "state": _state,
-    **OPERATIONS,
-    "inject_fault": _inject_fault,
-    "faults": _faults,
-    "recover": _recover,
-    "step": _step,
-}
+async def carry_out(context: SimulationContext, line: bytes, *, now: float) -> Response:
+    """Execute one request line at a time [s]."""
+    try:
+        request = json.loads(line)
+        if not isinstance(request, dict):
+            raise InputError("a line must be a JSON object")
+        op = request.get("op")
+        if not isinstance(op, str) or op not in OPERATIONS:
+            raise InputError(f"op must be one of {', '.join(OPERATIONS)}, got {str(op)[:40]!r}")
+        form, function = OPERATIONS[op]
+        return await function(context, now, **dict(form.model_validate(request)))
+    except ValidationError as error:
+        key, problem = first_problem(error)
+        return {"error": f"{key[:_MAX_KEY]}: {problem}".removeprefix(": ")}
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return {"error": f"invalid JSON: {error}"}
+    except InputError as error:
+        return {"error": str(error)}
+    except OSError as error:
+        problem = f"{error.filename or 'file'}: cannot be written: {error.strerror}"
+        return {"error": problem if error.strerror else str(error)}
 
 
 LINE_MAX = 64 * 1024  # bytes; thirty fingers take a tenth of it

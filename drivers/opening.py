@@ -8,8 +8,7 @@ from drivers.errors import LinkError
 from drivers.host.amplifier import Amplifier
 from drivers.host.line import Line
 from drivers.ports import Port
-from drivers.wires.known import address_of
-from drivers.wires.wire import Wire, WireAddress
+from drivers.wires.wire import Wire, WireAddress, address_of
 from registry.limits import GuardLimits
 
 

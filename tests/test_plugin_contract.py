@@ -24,8 +24,8 @@ from controller.effects.player import EffectPlayer
 from controller.sources.touch import _SOURCES, Contact, ContactKey, TouchSource, open_source
 from controller.sources.tuio import TuioSource
 from drivers.errors import CommandError
-from drivers.wires.known import address_of
 from drivers.wires.serial_line import SerialAddress
+from drivers.wires.wire import address_of
 from model.errors import InputError
 from model.structure.material import KNOWN_MATERIALS, known_material, material_names
 from registry.plugins import failure_text

@@ -46,8 +46,7 @@ from drivers.protocol.definition import (
 from drivers.protocol.records import Number, Record, Rows, Values, bits_of
 from drivers.urls import ADDRESS, BAUD, BUS_ERROR, CLOCK_ERRORS, RTU_BAUD, line_kind_of
 from drivers.wires.can_frames import BITRATE, NODE_MAX, SLCAN, SLCAN_RATES, TextReader, cob_id
-from drivers.wires.known import address_of
-from drivers.wires.wire import WireAddress, reply_words, request_words
+from drivers.wires.wire import WireAddress, address_of, reply_words, request_words
 from registry import threads
 from registry.limits import GuardLimits
 

@@ -1,1 +1,1 @@
-"""Kinds of wire by the scheme of a URL: a file each, and a line in `drivers.wires.known`."""
+"""Kinds of wire by the scheme of a URL: a file each, and a line in `drivers.wires.wire`."""

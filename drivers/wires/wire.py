@@ -3,6 +3,10 @@
 A wire carries one request at a time and matches what arrives with it: a reply to an earlier request
 counts as unexpected, damaged bytes as invalid. `WireAddress` is an amplifier's URL on a kind of
 wire, `PortAbove` a port that changes or delays the bytes of another one.
+
+Wires are found by the scheme of a URL: those of this project, and entry points of installed
+packages. Entry points are of the group `era_haptics.wires`, named by scheme; each is a class
+derived from `WireAddress`, and made with the URL.
 """
 
 from abc import ABC, abstractmethod
@@ -11,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol, TypeAlias
 
-from drivers.errors import LinkError, WireCounters
+from drivers.errors import CommandError, LinkError, WireCounters
 from drivers.ports import Port
 from drivers.protocol.definition import (
     EVENT,
@@ -37,6 +41,7 @@ from drivers.protocol.records import (
     Text,
     Values,
 )
+from registry.plugins import PluginRegistry
 
 WIDEST = QUANTITIES["channel_count"].maximum, QUANTITIES["layer_count"].maximum
 """Channels and layers of the largest amplifier there can be."""
@@ -272,3 +277,29 @@ class PortAbove:
     async def wait_closed(self) -> None:
         """Wait until it is closed."""
         await self.below.wait_closed()
+
+
+_WIRES: PluginRegistry[Callable[[str], WireAddress]] = PluginRegistry(
+    "wire",
+    "era_haptics.wires",
+    WireAddress,
+    error=CommandError,
+    own={
+        "can+python-can": "drivers.wires.can_bus:PythonCanAddress",
+        "can+slcan": "drivers.wires.can_bus:SlcanAddress",
+        "can+socketcan": "drivers.wires.can_bus:PythonCanAddress",
+        "can+socketcand": "drivers.wires.can_bus:SocketcandAddress",
+        "modbus+rtu": "drivers.wires.modbus:ModbusAddress",
+        "modbus+tcp": "drivers.wires.modbus:ModbusAddress",
+        "serial": "drivers.wires.serial_line:SerialAddress",
+        "serial+tcp": "drivers.wires.serial_line:SerialAddress",
+        "sim": "sim.memory_line:SimulatedAddress",
+    },
+    ending="://",
+    example="serial:///dev/ttyUSB0?baud=921600",
+)
+
+
+def address_of(url: str) -> WireAddress:
+    """Parse the URL of an amplifier; CommandError for an unknown or invalid one."""
+    return _WIRES.make(url)

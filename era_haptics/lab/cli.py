@@ -1,4 +1,12 @@
-"""The lab's share of the `era` command: to measure, judge, design, check and report."""
+"""The lab's share of the `era` command: to measure, judge, design, check and report.
+
+`era report` collects what a bug report needs in one file; `era figure` draws the founding paper's
+figures.
+"""
+
+import os
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -8,9 +16,93 @@ from era_haptics.lab.checks.layout_cli import layout_app
 from era_haptics.lab.conformance.conformance_cli import conformance
 from era_haptics.lab.design.design_cli import design_app
 from era_haptics.lab.measuring.measure_cli import MeasureCommand, measure, outputs
-from era_haptics.lab.paper_figures_cli import figure_app
-from era_haptics.lab.report_cli import report
 from era_haptics.lab.witness.witness_cli import witness
+from model.commands.options import (
+    FolderOption,
+    JsonOption,
+    MeshOption,
+    RigArgument,
+    Stopwatch,
+    next_line,
+    print_report,
+)
+from model.errors import InputError
+
+
+def report(
+    configs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
+        "era-report.zip"
+    ),
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
+    ] = None,
+) -> None:
+    """Collect versions, files and daemon state for a bug report.
+
+    Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
+    """
+
+    from era_haptics.lab.report import collect, write_zip
+
+    for path in configs or ():
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check its name and folder")
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
+    collected = collect(configs or [], socket=socket, home=home)
+    write_zip(output, collected)
+    for name, text in collected.files.items():
+        print(f"  {name}: {len(text)} characters")
+    for what in collected.missing:
+        print(f"  skipped: {what}")
+    print(f"wrote {output}\nNext: look before you send: names and causes are not hidden")
+
+
+figure_app = typer.Typer()
+
+
+@figure_app.command()
+def figure(
+    number: Annotated[
+        str, typer.Argument(metavar="6|7|10|11|12|13|all", help="Number of the figure.")
+    ],
+    rig_file: RigArgument,
+    output: FolderOption,
+    mesh: MeshOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a figure of the founding paper.
+
+    Write a CSV file of its numbers beside it.
+    """
+    from era_haptics.lab.paper_figures import paper_figures
+    from model.figures import save_figure
+    from model.files.csv_file import write_columns
+    from model.rig.rig_file import load_rig
+
+    rig = load_rig(rig_file, mesh=mesh)
+    output.mkdir(parents=True, exist_ok=True)
+    names, files = [], []
+    with Stopwatch() as timed:
+        for made in paper_figures(rig, number):
+            picture = output / f"{made.name}.png"
+            save_figure(made.figure, picture)
+            tables = [output / f"{made.name}{suffix}.csv" for suffix in made.tables]
+            for table, columns in zip(tables, made.tables.values(), strict=True):
+                write_columns(table, columns)
+            names.append(made.name)
+            files += [str(path) for path in (picture, *tables)]
+    rows = [
+        f"{timed.elapsed:.1f} s, mesh {rig.mesh}; wrote",
+        *(f"  {name}" for name in files),
+        next_line("era", "design", rig_file, "-o", "design"),
+    ]
+    answer = {"figures": names, "mesh": [rig.mesh.nx, rig.mesh.ny]}
+    print_report(rows, answer | {"time_s": timed.elapsed, "files": files}, as_json=as_json)
+
 
 amp = typer.Typer()
 amp.command()(conformance)

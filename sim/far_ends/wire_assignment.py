@@ -19,7 +19,7 @@ from pathlib import Path
 from drivers.errors import CommandError
 from drivers.urls import ADDRESS, BAUD, KIND_OF_PORT, RTU_BAUD, Endpoint
 from drivers.wires.can_frames import BITRATE
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from model.errors import InputError
 from sim.bench.amplifier_device import AmplifierDevice
 from sim.far_ends.can_amplifiers import BUS_NAME, BusNodes, CanBus, SlcanAdapter, SocketcandClient

@@ -63,7 +63,7 @@ from drivers.protocol.definition import (
     sensor_reading,
 )
 from drivers.protocol.records import Record
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from model.answer.answer import MIN_CONTRAST_DB, OWN_CONTRAST_DB
 from model.answer.promise import MIN_RAISED_CONTRAST_DB
 from model.cli import app

@@ -21,7 +21,7 @@ from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.protocol.definition import MESSAGES, QUANTITIES, STATUS
 from drivers.protocol.records import Number, Record, Refusal, WireQuantity
 from drivers.trace import Direction, TraceWriter, tracing
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from firmware_records import records_header
 from hand_written import HALF, Talk
 from interrupted import full_disk

@@ -11,7 +11,7 @@ from functools import partial
 
 from drivers.errors import LinkError
 from drivers.protocol.definition import MAX_WORDS
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from era_haptics.lab.conformance.check import (
     Check,
     CheckResult,

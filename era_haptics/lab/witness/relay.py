@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from drivers.errors import CommandError, LinkError
 from drivers.ports import open_port
 from drivers.urls import Endpoint
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from era_haptics.lab.witness.capture import Direction, WireKind
 from era_haptics.lab.witness.witness import Witness
 from model.errors import InputError

@@ -24,7 +24,7 @@ from controller.daemon.layouts import config_change
 from controller.process.child import child_command
 from controller.sources.touch import Touch
 from daemons import ENABLED, ready_daemon
-from model.commands.config_cli import config_app
+from model.cli import config_app
 from model.config.document import ConfigError
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig

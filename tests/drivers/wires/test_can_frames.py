@@ -35,7 +35,7 @@ from drivers.wires.can_frames import (
     segments,
     unpack_frames,
 )
-from drivers.wires.known import address_of
+from drivers.wires.wire import address_of
 from registry.limits import GuardLimits
 from virtual_lines import in_virtual_time
 

@@ -32,7 +32,6 @@ from drivers.urls import Endpoint
 from drivers.wires import can_bus, modbus_frames
 from drivers.wires.can_bus import PythonCanAddress
 from drivers.wires.can_frames import SLCAN, SOCKETCAND, CanFrame, TextReader
-from drivers.wires.known import address_of
 from drivers.wires.modbus import ModbusWire, SilentPort
 from drivers.wires.modbus_frames import (
     Adu,
@@ -45,6 +44,7 @@ from drivers.wires.modbus_frames import (
     response_to,
 )
 from drivers.wires.serial_frames import PAYLOAD_MAX, Frame, FrameReader, encode_frame, frame_length
+from drivers.wires.wire import address_of
 from long_form import in_turn, shortly
 from registry import threads
 from virtual_lines import in_virtual_time

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from controller.cli.main import run
+from model.cli import config_app
 from model.commands import options
-from model.commands.config_cli import config_app
 from model.commands.options import next_line, progress_bar
 from model.errors import InputError
 from model.rig.rig_file import example_rig_path, load_rig

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 import era_haptics as era
 from era_haptics.lab.cli import app as lab_app
+from era_haptics.lab.cli import figure_app
 from era_haptics.lab.design import problem, score
-from era_haptics.lab.paper_figures_cli import figure_app
 from model.cli import app
 from model.compiled.kernels import WITHOUT_KERNELS
 from model.config.document import read_document

@@ -179,9 +179,9 @@ def calibration_figure(calibration: Calibration) -> Figure:
 
 def promise_figure(found: MeasuredVerification) -> Figure:
     """Draw measured over promised felt contrast; points below the line break their promise."""
-    promised = np.array([each.promise.contrast_db for each in found.measured])
-    measured = np.array([each.contrast_db for each in found.measured])
-    quiet = np.array([len(each.promise.sensors) - 1 for each in found.measured])
+    promised = np.array([each.contrast_db for each in found.measured])
+    measured = np.array([each.measured_contrast_db for each in found.measured])
+    quiet = np.array([len(each.sensors) - 1 for each in found.measured])
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
     both = np.concatenate([promised, measured])

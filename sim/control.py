@@ -277,13 +277,15 @@ async def _touch_or_move(
     *,
     op: str,
     finger: _Finger,
-    at_m: _At,
+    at_m: _At | None = None,
     load: FiniteFloat | None = None,
 ) -> Response:
     bench = context.bench
     if (finger in bench.positions) != (op == "move"):
         state = "already" if finger in bench.positions else "not"
         raise InputError(f"finger {finger!r} is {state} on the plate")
+    if at_m is None:
+        raise InputError("at_m: missing")
     loads = dict(bench.loads)
     if load is not None:
         loads[finger] = load

@@ -5,6 +5,7 @@ Each kind is a section of a layout with its parameters, and a run that follows o
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -84,7 +85,7 @@ class Click(Effect):
 _HYSTERESIS = 0.0005  # m; a finger has passed a detent once it is this far beyond it
 
 
-class Notches:
+class NotchesRun(EffectRun):
     """Clicks of a duration [s] at equal distances along a coordinate of one finger.
 
     The finger starts halfway between two notches; it has passed one when it is hysteresis beyond.
@@ -92,23 +93,25 @@ class Notches:
 
     def __init__(
         self,
-        start: float,
+        contact: Contact,
+        coordinate: Callable[[Contact], float],
         *,
         spacing: float,
         hysteresis: float,
         duration: float,
         level_db_sl: float | None,
     ) -> None:
-        self._middle = start  # of the two notches around the finger
+        self._coordinate = coordinate
+        self._middle = coordinate(contact)  # of the two notches around the finger
         self._spacing = spacing
         self._hysteresis = hysteresis
         self._duration = duration
         self._level = level_db_sl
         self._pulse: Pulse | None = None  # of the last notch
 
-    def at(self, coordinate: float, now: float) -> EffectStimulus | NoStimulus:
+    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus:
         """Return a click from each passing on; several notches passed at once are one click."""
-        away = coordinate - self._middle
+        away = self._coordinate(contact) - self._middle
         passed = math.floor((abs(away) - self._hysteresis) / self._spacing + 0.5)
         if passed > 0:
             self._middle += math.copysign(passed * self._spacing, away)
@@ -142,30 +145,14 @@ class Detents(Effect):
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start halfway between two detents."""
-        notches = Notches(
-            self.position(contact),
+        return NotchesRun(
+            contact,
+            attrgetter(self.along),
             spacing=self.spacing,
             hysteresis=_HYSTERESIS,
             duration=self.duration,
             level_db_sl=level_db_sl,
         )
-        return _DetentsRun(self, notches)
-
-    def position(self, contact: Contact) -> float:
-        """Return the position [m] of a finger along the detents."""
-        return contact.x if self.along == "x" else contact.y
-
-
-class _DetentsRun(EffectRun):
-    """Follows the position of one finger between detents."""
-
-    def __init__(self, detents: Detents, notches: Notches) -> None:
-        self._detents = detents
-        self._notches = notches
-
-    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return a click from each passing on."""
-        return self._notches.at(self._detents.position(contact), now)
 
 
 _ANGLE_HYSTERESIS = 0.02  # rad; of a detent, or _HYSTERESIS along the circle where that is more
@@ -191,38 +178,32 @@ class Dial(Effect):
 
     def start(self, contact: Contact, now: float, *, level_db_sl: float | None) -> EffectRun:
         """Start outside of all regions: nothing is felt."""
-        return _Nothing()
+        return self.start_in(None, contact, now, level_db_sl=level_db_sl)
 
     def start_in(
         self, region: Region | None, contact: Contact, now: float, *, level_db_sl: float | None
     ) -> EffectRun:
         """Start halfway between two detents."""
-        if region is None:
-            return self.start(contact, now, level_db_sl=level_db_sl)
-        return _DialRun(self, region.shape.centre, level_db_sl)
-
-
-class _Nothing(EffectRun):
-    """Nothing as long as the finger stays."""
-
-    def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
-        """Return nothing."""
-        return NoStimulus()
+        return _DialRun(self, None if region is None else region.shape.centre, level_db_sl)
 
 
 class _DialRun(EffectRun):
-    """Follows the angle of one finger, turn after turn."""
+    """Follows the angle of one finger about a centre, turn after turn; without one, nothing."""
 
-    def __init__(self, dial: Dial, centre: tuple[float, float], level_db_sl: float | None) -> None:
+    def __init__(
+        self, dial: Dial, centre: tuple[float, float] | None, level_db_sl: float | None
+    ) -> None:
         self._dial = dial
         self._centre = centre
         self._level = level_db_sl
         self._angle = 0.0  # [rad], with its turns
         self._last: float | None = None  # [rad] within one turn; None before the first
-        self._notches: Notches | None = None
+        self._notches: NotchesRun | None = None
 
     def feel(self, contact: Contact, now: float) -> EffectStimulus | NoStimulus | None:
         """Return a click from each passing on."""
+        if self._centre is None:
+            return NoStimulus()
         x, y = contact.x - self._centre[0], contact.y - self._centre[1]
         radius = math.hypot(x, y)
         if radius < _CENTRE_RADIUS:
@@ -233,14 +214,15 @@ class _DialRun(EffectRun):
             self._angle += math.remainder(angle - self._last, math.tau)
         self._last = angle
         if self._notches is None:
-            self._notches = Notches(
-                self._angle,
+            self._notches = NotchesRun(
+                contact,
+                lambda _: self._angle,
                 spacing=self._dial.spacing,
                 hysteresis=max(_ANGLE_HYSTERESIS, _HYSTERESIS / radius),
                 duration=self._dial.duration,
                 level_db_sl=self._level,
             )
-        return self._notches.at(self._angle, now)
+        return self._notches.feel(contact, now)
 
 
 RAMP_STEP_DB = 2.0

@@ -151,8 +151,23 @@ _FALLING = {SWITCHED_ON: OFF, REACTING: FAULT}
 _NEVER: Interval = (-math.inf, math.inf)
 
 
-class ExpectedStates:
-    """The states of one amplifier; state and latch are None while unknown; times [s].
+_WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
+FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
+"""Requests that feed the watchdog unless they are refused."""
+_ONLY_IN = {
+    **dict.fromkeys(("Set", "Commit", "Silence"), (ENABLED,)),
+    "SetAddress": DISARMED,
+    "Arm": (*DISARMED, SWITCHED_ON, ENABLED),
+}
+"""States in which alone a request is accepted."""
+_NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
+"""Refusals of a part by what it does not hold."""
+_Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
+"""A committed set: its moment, token and layers, and whether it plays to the word."""
+
+
+class ExpectedAmplifier:
+    """One amplifier; state, latch, token and session are None while unknown; times [s].
 
     report: takes what is wrong, always: what nothing excuses, unclear: why that is not known.
     may_fail: it may have faults of its own. slack: of times, left_slack: of the time that is left
@@ -176,13 +191,14 @@ class ExpectedStates:
         self.forget()
         self.last_status = -math.inf
 
-    def _expect(self, rule: str, time: float, what: str, must: object, seen: object) -> None:
-        """Report what is not as it must be."""
-        if must != seen:
-            self.report(rule, time, what, must=must, seen=seen)
-
     def forget(self, cause: str = "what was not heard") -> None:
         """Treat all as unknown until the next status."""
+        self.token: int | None = None
+        self.session: int | None = None
+        self.sets = ExpectedSet()
+        self.clock = ExpectedClock(self.report, self.slack)
+        self._waiting: _Waiting | None = None
+        self._started = -math.inf  # by when a set that has waited has surely started
         self.state: int | None = None
         self.fault = FAULTS["NONE"]
         self.latch: int | None = None
@@ -210,6 +226,14 @@ class ExpectedStates:
             self._settle("what was not heard")
             self.outputs.forget()
 
+    def _expect(self, rule: str, time: float, what: str, must: object, seen: object) -> None:
+        """Report what is not as it must be."""
+        if must != seen:
+            self.report(rule, time, what, must=must, seen=seen)
+
+    def _name_of(self, state: int | None) -> str:
+        return "unknown" if state is None else name_of(STATES, state)
+
     @property
     def is_enabled(self) -> bool:
         """Whether it is armed, as far as is known."""
@@ -228,181 +252,6 @@ class ExpectedStates:
         early, late = self.watchdog * (1 - DRIFT), (self.watchdog + _TRIP) * (1 + DRIFT)
         return self.fed[0] + early - ROUNDED, self.fed[1] + late
 
-    # What it does
-
-    def _trip(self, fault: int, since: Interval, cause: str) -> None:
-        self.fault = fault
-        self._latch_again()
-        self._faults.appendleft((fault, since))
-        is_whole = fault == FAULTS["WATCHDOG"] and not self._may_fail
-        self._fall_silent(REACTING, since, FADE, cause, has_floor=is_whole)
-
-    def _latch_again(self) -> None:
-        self.latch = None if self.latch is None else token_after(self.latch)
-
-    def _fall_silent(
-        self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
-    ) -> None:
-        self.state = state
-        self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
-
-    def _clear(self, latch: int, state: int, when: Interval) -> None:
-        """Leave a stop or a fault, once all is silent, where its cause is gone."""
-        is_gone = self.fault in (FAULTS["NONE"], FAULTS["WATCHDOG"])
-        is_off = state in DISARMED and when[1] >= self.silent[0] - ROUNDED
-        if is_off and self.latch is not None:
-            self._expect("latched", when[1], "latch of Clear", self.latch, latch)
-        if is_off or (is_gone and self._is_silent(when)):
-            self.state, self.fault = OFF, FAULTS["NONE"]
-            self.outputs.cause = "Clear"
-
-    # What it shows
-
-    def note_state(self, shown: Values, when: Interval) -> bool:
-        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
-        now, fault, latch, end = shown["state"], shown["fault"], shown["latch"], when[1]
-        if self.state is None:
-            self._adopt(shown, when)
-        before = self.state
-        if now in (REACTING, FAULT) and before in (ENABLED, SWITCHED_ON, STOPPED):
-            self._tripped(fault, when)
-        known = self._states(when)
-        if now not in known:
-            what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
-            must = one_of(map(self._name_of, known))
-            self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
-            return False
-        if fault and fault != self.fault and self._may_fail and not self.is_shown:
-            self.fault = fault  # which came before the watchdog, of which nothing was seen
-            self._faults[0] = fault, (self.last_status, end)
-        rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
-        self._expect(rule, end, f"fault after {cause}", self.fault, fault)
-        if self.latch is not None:
-            self._expect("latched", end, f"latch after {cause}", self.latch, latch)
-        self.state, self.fault, self.latch, self.is_shown = now, fault, latch, True
-        return True
-
-    def _is_silent(self, when: Interval) -> bool:
-        """Whether it must have been silent, and its state show so, between two times."""
-        return when[0] > self.silent[1] + _SETTLING + ROUNDED + self.slack
-
-    def _states(self, when: Interval) -> list[int]:
-        """Return the states in which it may be between two times."""
-        here = self.state or 0
-        if here not in _FALLING:
-            return [0, OFF] if here == STATES["NOT_READY"] else [here]
-        states = [] if self._is_silent(when) else [here]
-        if when[1] > self.silent[0] - ROUNDED - self.slack:
-            states.append(_FALLING[here])
-        return states
-
-    def _rule_against(self, now: int) -> str:
-        """Which rule a state breaks."""
-        if not self.is_shown:
-            return "watchdog" if now == ENABLED else "latched"
-        if now == ENABLED:
-            return "armed"
-        return "latched" if self.state in LATCHED else "state"
-
-    def _tripped(self, fault: int, when: Interval) -> None:
-        """Check a transition into a fault: the watchdog not before its time."""
-        since = min(self.last_status, when[1]), when[1]
-        if fault == FAULTS["WATCHDOG"]:
-            early, late = self.expiry
-            enabled_until = when[1] if self.is_enabled else self.outputs.began[1]
-            if enabled_until < early - self.slack:
-                what = f"time of the watchdog ({self.outputs.cause})"
-                must = f"from {early:.4f} to {late:.4f} s"
-                self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")
-            since = self._expired_by(when[1])
-        elif fault == FAULTS["NONE"] or not self._may_fail:
-            must, seen = "WATCHDOG" if fault else "one", name_of(FAULTS, fault)
-            self.report("state", when[1], "fault of a fault reaction", must=must, seen=seen)
-        self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
-
-    def _expired_by(self, time: float) -> Interval:
-        """Return between which times the watchdog tripped that has tripped by a time."""
-        early, late = self.expiry
-        first = min(max(early, self.last_status), time)
-        return first, max(min(late, time), first)
-
-    def _adopt(self, shown: Values, when: Interval) -> None:
-        """Go on with a status as it is."""
-        state = shown["state"]
-        if state != self.state:
-            self.state, self.silent = state, (-math.inf, math.inf)
-            if state in (*DISARMED, FAULT):
-                self._settle(self._name_of(state), when)
-                self.silent = -math.inf, when[1]
-            elif state == ENABLED:
-                self.fed = -math.inf, when[1]
-                self.outputs.forget()
-            if self.is_in_fault:
-                self._faults.appendleft((shown["fault"], (-math.inf, when[1])))
-        self.fault, self.latch = shown["fault"], shown["latch"]
-        self.is_shown, self.last_status = True, when[0]
-
-    def _name_of(self, state: int | None) -> str:
-        return "unknown" if state is None else name_of(STATES, state)
-
-    def _check_voltage(self, shown: Values, when: Interval) -> None:
-        """Check high voltage, and the interlock of one that has it."""
-        is_fading = when[1] < self.silent[0] - ROUNDED - self.slack and any(shown["levels"])
-        must_be = self.state in (ENABLED, SWITCHED_ON) or (self.state == STOPPED and is_fading)
-        where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
-        if must_be:
-            is_open = has_flag(shown, "interlock_open")
-            self._expect("high_voltage", end, f"interlock_open {where}", False, is_open)
-        if must_be or self._is_silent(when):
-            is_on = has_flag(shown, "high_voltage")
-            self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
-
-    def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
-        """Check a list of faults: the newest first, those that were seen, of their ages."""
-        ages = [each["age"] for each in listed]
-        self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
-        unfed = {each["channel"] for each in listed if each["fault"] == FAULTS["WATCHDOG"]}
-        self._expect("faults", when[1], "channels of watchdog faults", set(), unfed - {NO_CHANNEL})
-        faults = [(each["fault"], each["age"] / 1000) for each in listed]
-        left = iter(faults)
-        for fault, since in self._faults:
-            drift = DRIFT * (when[1] - since[0])
-            slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
-            low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
-            if not any(each == fault and low <= age <= high for each, age in left):
-                must = f"{name_of(FAULTS, fault)} of {low:.3f} to {high:.3f} s ago, in its turn"
-                self.report("faults", when[1], "listed faults", must=must, seen=faults)
-                return
-
-
-_WARM = QUANTITIES["temperature"].to_wire(60.0)  # from here on an amplifier may derate
-FEEDING = frozenset(name for name, message in MESSAGES.items() if message.feeds)
-"""Requests that feed the watchdog unless they are refused."""
-_ONLY_IN = {
-    **dict.fromkeys(("Set", "Commit", "Silence"), (ENABLED,)),
-    "SetAddress": DISARMED,
-    "Arm": (*DISARMED, SWITCHED_ON, ENABLED),
-}
-"""States in which alone a request is accepted."""
-_NOT_LOOKED_AT = "WRONG_SESSION", "WRONG_STATE", "BUSY"
-"""Refusals of a part by what it does not hold."""
-_Waiting: TypeAlias = tuple[Interval, int, tuple[LayerSet, ...], bool]
-"""A committed set: its moment, token and layers, and whether it plays to the word."""
-
-
-class ExpectedAmplifier(ExpectedStates):
-    """One amplifier; token and session are None while unknown; times [s]."""
-
-    def forget(self, cause: str = "what was not heard") -> None:
-        """Treat all as unknown until the next status."""
-        self.token: int | None = None
-        self.session: int | None = None
-        self.sets = ExpectedSet()
-        self.clock = ExpectedClock(self.report, self.slack)
-        self._waiting: _Waiting | None = None
-        self._started = -math.inf  # by when a set that has waited has surely started
-        super().forget(cause)
-
     @property
     def to_play(self) -> Playback:
         """What it plays, with the set that waits, from its moment on."""
@@ -413,24 +262,7 @@ class ExpectedAmplifier(ExpectedStates):
         playback.commit(layers, token, sum(when) / 2)
         return playback
 
-    # What it does
-
-    def advance(self, time: float) -> None:
-        """Apply what must have happened without a request until now."""
-        if self.is_enabled and time > self.expiry[1] + ROUNDED + self.slack:
-            self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
-            self.is_shown = False
-        if self._waiting is not None and time > self._waiting[0][1] + self.slack:
-            self._start_waiting()
-
-    def _fall_silent(
-        self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
-    ) -> None:
-        self.sets.drop()
-        if self.may_start(when):  # so that what falls silent is unknown
-            self.outputs.forget()
-        self._waiting = None
-        super()._fall_silent(state, when, ramp, cause, has_floor=has_floor)
+    # What it is asked and does
 
     def granted(self, name: str, values: Values, reply: Values, when: Interval) -> None:
         """Apply a request that was carried out between two times, and compare its reply."""
@@ -497,6 +329,44 @@ class ExpectedAmplifier(ExpectedStates):
             case "Mark":
                 self.clock.mark(when)
 
+    def _clear(self, latch: int, state: int, when: Interval) -> None:
+        """Leave a stop or a fault, once all is silent, where its cause is gone."""
+        is_gone = self.fault in (FAULTS["NONE"], FAULTS["WATCHDOG"])
+        is_off = state in DISARMED and when[1] >= self.silent[0] - ROUNDED
+        if is_off and self.latch is not None:
+            self._expect("latched", when[1], "latch of Clear", self.latch, latch)
+        if is_off or (is_gone and self._is_silent(when)):
+            self.state, self.fault = OFF, FAULTS["NONE"]
+            self.outputs.cause = "Clear"
+
+    def advance(self, time: float) -> None:
+        """Apply what must have happened without a request until now."""
+        if self.is_enabled and time > self.expiry[1] + ROUNDED + self.slack:
+            self._trip(FAULTS["WATCHDOG"], self.expiry, "the watchdog")
+            self.is_shown = False
+        if self._waiting is not None and time > self._waiting[0][1] + self.slack:
+            self._start_waiting()
+
+    def _trip(self, fault: int, since: Interval, cause: str) -> None:
+        self.fault = fault
+        self._latch_again()
+        self._faults.appendleft((fault, since))
+        is_whole = fault == FAULTS["WATCHDOG"] and not self._may_fail
+        self._fall_silent(REACTING, since, FADE, cause, has_floor=is_whole)
+
+    def _latch_again(self) -> None:
+        self.latch = None if self.latch is None else token_after(self.latch)
+
+    def _fall_silent(
+        self, state: int, when: Interval, ramp: float, cause: str, *, has_floor: bool = True
+    ) -> None:
+        self.sets.drop()
+        if self.may_start(when):  # so that what falls silent is unknown
+            self.outputs.forget()
+        self._waiting = None
+        self.state = state
+        self.silent = self.outputs.silence(when, ramp, cause, has_floor=has_floor)
+
     # Sets
 
     def _take(self, part: Values, reply: Values, when: Interval) -> None:
@@ -543,6 +413,12 @@ class ExpectedAmplifier(ExpectedStates):
             what = f"set {token} that is committed"
             self.report("token", when[1], what, must="staged", seen=seen)
         self._play(token, when, self.clock.moment(commit["at"], when))
+
+    def may_start(self, when: Interval) -> bool:
+        """Whether a set that waits, or has waited, may start within an interval."""
+        if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
+            return True
+        return when[0] <= self._started + self.slack
 
     def _start_waiting(self, sooner: Interval = (math.inf, math.inf)) -> None:
         """Start the set that waits at its moment, or sooner before another one."""
@@ -594,16 +470,119 @@ class ExpectedAmplifier(ExpectedStates):
         self._check_voltage(shown, when)
         self.last_status = when[0]
 
-    def may_start(self, when: Interval) -> bool:
-        """Whether a set that waits, or has waited, may start within an interval."""
-        if self._waiting is not None and when[1] >= self._waiting[0][0] - self.slack:
-            return True
-        return when[0] <= self._started + self.slack
+    def note_state(self, shown: Values, when: Interval) -> bool:
+        """Compare state, fault and latch, and go on with them; returns whether the state fits."""
+        now, fault, latch, end = shown["state"], shown["fault"], shown["latch"], when[1]
+        if self.state is None:
+            self._adopt(shown, when)
+        before = self.state
+        if now in (REACTING, FAULT) and before in (ENABLED, SWITCHED_ON, STOPPED):
+            self._tripped(fault, when)
+        known = self._states(when)
+        if now not in known:
+            what = f"state {when[0] - self.outputs.began[1]:.3f} s after {self.outputs.cause}"
+            must = one_of(map(self._name_of, known))
+            self.report(self._rule_against(now), end, what, must=must, seen=self._name_of(now))
+            return False
+        if fault and fault != self.fault and self._may_fail and not self.is_shown:
+            self.fault = fault  # which came before the watchdog, of which nothing was seen
+            self._faults[0] = fault, (self.last_status, end)
+        rule, cause = "latched" if now in LATCHED else "state", self.outputs.cause
+        self._expect(rule, end, f"fault after {cause}", self.fault, fault)
+        if self.latch is not None:
+            self._expect("latched", end, f"latch after {cause}", self.latch, latch)
+        self.state, self.fault, self.latch, self.is_shown = now, fault, latch, True
+        return True
 
     def _adopt(self, shown: Values, when: Interval) -> None:
         """Go on with a status as it is."""
-        super()._adopt(shown, when)
+        state = shown["state"]
+        if state != self.state:
+            self.state, self.silent = state, (-math.inf, math.inf)
+            if state in (*DISARMED, FAULT):
+                self._settle(self._name_of(state), when)
+                self.silent = -math.inf, when[1]
+            elif state == ENABLED:
+                self.fed = -math.inf, when[1]
+                self.outputs.forget()
+            if self.is_in_fault:
+                self._faults.appendleft((shown["fault"], (-math.inf, when[1])))
+        self.fault, self.latch = shown["fault"], shown["latch"]
         self.token = shown.get("token", self.token)
+        self.is_shown, self.last_status = True, when[0]
+
+    def _states(self, when: Interval) -> list[int]:
+        """Return the states in which it may be between two times."""
+        here = self.state or 0
+        if here not in _FALLING:
+            return [0, OFF] if here == STATES["NOT_READY"] else [here]
+        states = [] if self._is_silent(when) else [here]
+        if when[1] > self.silent[0] - ROUNDED - self.slack:
+            states.append(_FALLING[here])
+        return states
+
+    def _is_silent(self, when: Interval) -> bool:
+        """Whether it must have been silent, and its state show so, between two times."""
+        return when[0] > self.silent[1] + _SETTLING + ROUNDED + self.slack
+
+    def _rule_against(self, now: int) -> str:
+        """Which rule a state breaks."""
+        if not self.is_shown:
+            return "watchdog" if now == ENABLED else "latched"
+        if now == ENABLED:
+            return "armed"
+        return "latched" if self.state in LATCHED else "state"
+
+    def _tripped(self, fault: int, when: Interval) -> None:
+        """Check a transition into a fault: the watchdog not before its time."""
+        since = min(self.last_status, when[1]), when[1]
+        if fault == FAULTS["WATCHDOG"]:
+            early, late = self.expiry
+            enabled_until = when[1] if self.is_enabled else self.outputs.began[1]
+            if enabled_until < early - self.slack:
+                what = f"time of the watchdog ({self.outputs.cause})"
+                must = f"from {early:.4f} to {late:.4f} s"
+                self.report("watchdog", when[1], what, must=must, seen=f"{when[1]:.4f} s")
+            since = self._expired_by(when[1])
+        elif fault == FAULTS["NONE"] or not self._may_fail:
+            must, seen = "WATCHDOG" if fault else "one", name_of(FAULTS, fault)
+            self.report("state", when[1], "fault of a fault reaction", must=must, seen=seen)
+        self._trip(fault, since, f"fault {name_of(FAULTS, fault)}")
+
+    def _expired_by(self, time: float) -> Interval:
+        """Return between which times the watchdog tripped that has tripped by a time."""
+        early, late = self.expiry
+        first = min(max(early, self.last_status), time)
+        return first, max(min(late, time), first)
+
+    def _check_voltage(self, shown: Values, when: Interval) -> None:
+        """Check high voltage, and the interlock of one that has it."""
+        is_fading = when[1] < self.silent[0] - ROUNDED - self.slack and any(shown["levels"])
+        must_be = self.state in (ENABLED, SWITCHED_ON) or (self.state == STOPPED and is_fading)
+        where, end = f"in {self._name_of(self.state)} after {self.outputs.cause}", when[1]
+        if must_be:
+            is_open = has_flag(shown, "interlock_open")
+            self._expect("high_voltage", end, f"interlock_open {where}", False, is_open)
+        if must_be or self._is_silent(when):
+            is_on = has_flag(shown, "high_voltage")
+            self._expect("high_voltage", end, f"high_voltage {where}", must_be, is_on)
+
+    def _check_faults(self, listed: Sequence[Values], when: Interval) -> None:
+        """Check a list of faults: the newest first, those that were seen, of their ages."""
+        ages = [each["age"] for each in listed]
+        self._expect("faults", when[1], "ages of faults", sorted(ages), ages)
+        unfed = {each["channel"] for each in listed if each["fault"] == FAULTS["WATCHDOG"]}
+        self._expect("faults", when[1], "channels of watchdog faults", set(), unfed - {NO_CHANNEL})
+        faults = [(each["fault"], each["age"] / 1000) for each in listed]
+        left = iter(faults)
+        for fault, since in self._faults:
+            drift = DRIFT * (when[1] - since[0])
+            slack = ROUNDED + self.slack + (drift if drift < math.inf else 0.0)
+            low, high = when[0] - since[1] - slack, when[1] - since[0] + slack
+            if not any(each == fault and low <= age <= high for each, age in left):
+                must = f"{name_of(FAULTS, fault)} of {low:.3f} to {high:.3f} s ago, in its turn"
+                self.report("faults", when[1], "listed faults", must=must, seen=faults)
+                return
 
     def _check_achieved(self, number: int, reply: Values, when: Interval) -> None:
         """Compare what a layer plays with what it must."""

@@ -170,7 +170,7 @@ _NUMBERS = {"frequency": "", "level": "1", "phase": "0"}
 
 
 def parse_drives(texts: Sequence[str], rig: "Rig") -> "Excitation":
-    """Parse texts of `--drive`, such as `SW=110`, `NE=250@0.5` or `NE=250@0.5:90`, to an excitation.
+    """Parse texts of `--drive`, such as `SW=110` or `NE=250@0.5:90`, to an excitation.
 
     The level is 1, full stroke, and the phase 0 where they are left out. Raises InputError.
     """

@@ -307,11 +307,11 @@ def _measured_rows(found: "MeasuredVerification") -> Iterator[str]:
     yield "                                    felt contrast, dB            level, dB SL"
     yield "target  quiet                  promised   median  measured  promised  measured"
     for each in found.measured:
-        target, *quiet = each.promise.sensors
+        target, *quiet = each.sensors
         yield (
-            f"{target:7s} {', '.join(quiet):20s} {each.promise.contrast_db:10.1f} "
-            f"{each.promise.median_db:8.1f} {each.contrast_db:9.1f} "
-            f"{each.promise.level_db_sl:9.1f} {each.level_db_sl:9.1f}  "
+            f"{target:7s} {', '.join(quiet):20s} {each.contrast_db:10.1f} "
+            f"{each.median_db:8.1f} {each.measured_contrast_db:9.1f} "
+            f"{each.level_db_sl:9.1f} {each.measured_level_db_sl:9.1f}  "
             f"{'kept' if each.is_kept else 'BROKEN'}"
         )
     yield (

@@ -6,6 +6,7 @@ uncertainty give at these points, solved exactly; fingers would feel other numbe
 tips. The lab measures (`era_haptics.lab.measuring`), since it knows sound cards.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,27 +46,22 @@ class Promise:
     """Felt contrast that half of the plates give."""
     level_db_sl: float
     """Level at the target that nine of ten plates give."""
-
-
-@dataclass(frozen=True)
-class MeasuredPromise:
-    """A promise, and the felt contrast and level that accelerometers measured."""
-
-    promise: Promise
-    contrast_db: float
-    level_db_sl: float
+    measured_contrast_db: float = math.nan
+    """Felt contrast that accelerometers measured; NaN before."""
+    measured_level_db_sl: float = math.nan
+    """Level at the target that accelerometers measured; NaN before."""
 
     @property
     def is_kept(self) -> bool:
         """Whether at least the promised contrast was measured."""
-        return self.contrast_db >= self.promise.contrast_db
+        return self.measured_contrast_db >= self.contrast_db
 
 
 @dataclass(frozen=True)
 class MeasuredVerification:
     """The outcome of all promises that were played."""
 
-    measured: tuple[MeasuredPromise, ...]
+    measured: tuple[Promise, ...]
 
     @property
     def kept_share(self) -> float:
@@ -82,16 +78,16 @@ class MeasuredVerification:
         return {
             "promises": [
                 {
-                    "target": each.promise.sensors[0],
-                    "quiet": list(each.promise.sensors[1:]),
+                    "target": each.sensors[0],
+                    "quiet": list(each.sensors[1:]),
                     "drive_frequencies_hz": sorted(
-                        {tone.frequency for tone in each.promise.layer.excitation.values()}
+                        {tone.frequency for tone in each.layer.excitation.values()}
                     ),
-                    "promised_contrast_db": each.promise.contrast_db,
-                    "median_contrast_db": each.promise.median_db,
-                    "measured_contrast_db": each.contrast_db,
-                    "promised_level_db_sl": each.promise.level_db_sl,
-                    "measured_level_db_sl": each.level_db_sl,
+                    "promised_contrast_db": each.contrast_db,
+                    "median_contrast_db": each.median_db,
+                    "measured_contrast_db": each.measured_contrast_db,
+                    "promised_level_db_sl": each.level_db_sl,
+                    "measured_level_db_sl": each.measured_level_db_sl,
                     "kept": each.is_kept,
                 }
                 for each in self.measured
@@ -130,10 +126,11 @@ def promises(
 
 def measured_promise(
     table: LocalizationTable, promise: Promise, frequencies: FloatArray, amplitudes: FloatArray
-) -> MeasuredPromise:
-    """Compare amplitudes (f, sensors) [m/s²] at the sensors of a promise, frequencies (f,) [Hz]."""
+) -> Promise:
+    """Note amplitudes (f, sensors) [m/s²] at the sensors of a promise, frequencies (f,) [Hz]."""
     target, *quiet = sensation_level(frequencies, amplitudes, table.threshold).tolist()
-    return MeasuredPromise(promise, target - max(quiet), target)
+    contrast = target - max(quiet)
+    return replace(promise, measured_contrast_db=contrast, measured_level_db_sl=target)
 
 
 def _drawn(

@@ -133,19 +133,6 @@ class Probe(Protocol):
         """
 
 
-class SampledPlate(Protocol):
-    """A plate in the time domain, sampled at a rate [Hz] while probes listen to it."""
-
-    sample_rate: float
-
-    @property
-    def probes(self) -> list[Probe]:
-        """The listeners, which have all samples up to the present time."""
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Reduced shapes (p, r) at points (p, 2) [m]."""
-
-
 @dataclass(frozen=True)
 class ToneMeasurement:
     """Tones [Hz] that are measured over a window [s]; number: of the reading."""
@@ -164,7 +151,7 @@ class ToneReader:
 
     def __init__(
         self,
-        plate: SampledPlate,
+        plate: "Bench",
         measurement: ToneMeasurement,
         sensors: Sequence[Accelerometer],
         *,
@@ -234,7 +221,7 @@ class Sensing:
 
     def __init__(
         self,
-        plate: SampledPlate,
+        plate: "Bench",
         amplifier: SimulatedAmplifier,
         feet: Sequence[Accelerometer],
         *,

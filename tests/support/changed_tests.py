@@ -35,7 +35,8 @@ ALSO: Sequence[tuple[Sequence[str], Sequence[str]]] = (
     (
         (
             *("drivers/protocol/", "controller/api/", "controller/cli/", "drivers/by_hand/cli.py"),
-            *("controller/effects/", "model/commands/", "model/rig/sections.py", "sim/cli.py"),
+            *("controller/effects/", "model/cli.py", "model/commands/"),
+            *("model/rig/sections.py", "sim/cli.py"),
             *("era_haptics/", "docs/generators/"),
         ),
         ("make pages",),

@@ -3,8 +3,9 @@
 Each block goes up to the next section, below the comment that has its names: `<!-- api: query;
 Drive: frequency, level; Client(): * -->` is a function, a class with two of its members, and one
 that is made elsewhere, with all of its members. Functions are a list, a class has a heading and a
-list of its members. Defaults are of what a program makes. `Example:` at the end of a docstring is a
-session, which tests/docs/test_python_examples.py types.
+list of its members, of which the fields with docstrings come first. Defaults are of what a program
+makes. `Example:` at the end of a docstring is a session, which tests/docs/test_python_examples.py
+types.
 """
 
 import ast
@@ -12,6 +13,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import era_haptics
@@ -76,11 +78,14 @@ def _unwrapped(kind: type, member: ast.stmt) -> ast.stmt:
 
 def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> Iterator[str]:
     """A class with its fields; below its text those of its members that are named, `*` for all."""
-    fields, listed = [], []
-    for member in tree.body:
+    fields, listed, documented = [], [], []
+    for member, below in pairwise([*tree.body, ast.Pass()]):
         if isinstance(member, ast.AnnAssign) and not ast.unparse(member.target).startswith("_"):
             name, default, value = ast.unparse(member).partition(" = ")
             fields.append(name if is_made_elsewhere else name + default + value)
+            if isinstance(below, ast.Expr):
+                told = " ".join(ast.literal_eval(below.value).split())
+                documented.append(f"- `{name}`: {told}")
         elif isinstance(member, Function):
             if member.name == "__init__" and not is_made_elsewhere:
                 fields.append(ast.unparse(member.args).removeprefix("self, "))
@@ -89,7 +94,8 @@ def _class(tree: ast.ClassDef, members: list[str], is_made_elsewhere: bool) -> I
     yield from [f"### {tree.name}", ""]
     yield from _text(tree, f"`{tree.name}({', '.join(fields)})`: " if fields else "", "")
     described = [member for member in listed if ast.get_docstring(member)]
-    yield from [""] if listed else []
+    yield from [""] if documented or listed else []
+    yield from documented
     for member in described:
         yield from _item(member)
     others = [f"`{_signature(each)}`" for each in listed if each not in described]

@@ -66,30 +66,35 @@ MAX_UNCERTAINTY = 1000.0
 class Uncertainty:
     """One standard deviation of each parameter; independent of each other.
 
-    gain: of each channel, relative; phase_deg: of each channel [degrees]; thickness: of the plate,
-    relative; stiffness: of each ERA, relative; damping: a factor, of the ERAs' damping and of the
-    plate's loss factor, 1 for none; fingertip: of the logarithm of each finger's load; common_gain:
-    of all channels together, relative; field: of what an ERA alone does at a finger, relative to
-    its root mean square over the plate, beside all others; modulus: of the plate's modulus of
-    elasticity, relative, and known where the thickness is; place: of each ERA along x and along y
-    [m]; harmonic: second harmonic of each ERA's motion, root mean square as a share of its own
-    amplitude, of any phase; supports: of the logarithm of the stiffness of each foot, 0.3 of a rig
-    file with feet by default. The defaults are those of a plate as built from its drawing and not
-    measured.
+    The defaults are those of a plate as built from its drawing and not measured.
     """
 
     gain: float = 0.05
+    """Of each channel, relative."""
     phase_deg: float = 5.0
+    """Of each channel [degrees]."""
     thickness: float = 0.02
+    """Of the plate, relative."""
     stiffness: float = 0.1
+    """Of each ERA, relative."""
     damping: float = 1.5
+    """A factor, of the ERAs' damping and of the plate's loss factor; 1 for none."""
     fingertip: float = 0.5
+    """Of the logarithm of each finger's load."""
     common_gain: float = 0.0
+    """Of all channels together, relative."""
     field: float = 0.0
+    """Of what an ERA alone does at a finger, relative to its root mean square over the plate,
+    beside all others."""
     modulus: float = 0.02
+    """Of the plate's modulus of elasticity, relative, and known where the thickness is."""
     place: float = 0.001
+    """Of each ERA along x and along y [m]."""
     harmonic: float = 0.01
+    """Second harmonic of each ERA's motion, root mean square as a share of its own amplitude, of
+    any phase."""
     supports: float = 0.0
+    """Of the logarithm of the stiffness of each foot; 0.3 of a rig file with feet by default."""
 
     def __post_init__(self) -> None:
         """Refuse values that are not finite, negative ones, and a factor below 1."""
@@ -168,36 +173,37 @@ class Channel:
 
 @dataclass(frozen=True)
 class Rig:
-    """A plate on its ERAs, with wiring and limits.
-
-    eras: those that are driven. wiring: channel by the name of the ERA; amplifiers: URL by name;
-    masses: on the plate, and what supports it without being driven, last of them ERAs without an
-    amplifier, whose names are supports; laminate: of which the plate is made, also where its layers
-    are solved as a homogeneous one; uncertainty: of its parameters; fingertip: load of each finger
-    on the plate, None for weightless ones; threshold: name of the set of detection thresholds that
-    levels are above (`model.finger`); promised_thresholds: of the sets by which promises
-    hold, beside that one; outputs: the amplifiers whose full level is an output, to which bases
-    move by their gains, not a motion;
-    clock_errors: what each amplifier is taken to state of its clock [s], infinite for one that
-    cannot be steered; document: its keys.
-    """
+    """A plate on its ERAs, with wiring and limits."""
 
     plate: Plate
     mesh: PlateMesh
     eras: tuple[Actuator, ...]
+    """Those that are driven."""
     wiring: Mapping[str, Channel]
+    """Channel by the name of the ERA."""
     amplifiers: Mapping[str, str]
+    """URL by name."""
     limits: GuardLimits
     masses: tuple[PointLoad, ...] = ()
+    """On the plate, and what supports it without being driven: last, ERAs without an amplifier."""
     laminate: Laminate | None = None
+    """Of which the plate is made, also where its layers are solved as a homogeneous one."""
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    """Of its parameters."""
     fingertip: Fingertip | None = field(default_factory=Fingertip)
+    """Load of each finger on the plate; None for weightless ones."""
     threshold: str = DEFAULT_THRESHOLD
+    """Name of the set of detection thresholds that levels are above (`model.finger`)."""
     promised_thresholds: tuple[str, ...] = THRESHOLDS
+    """Names of the sets by which promises hold, beside that one."""
     supports: tuple[str, ...] = ()
+    """Names of the ERAs without an amplifier."""
     outputs: frozenset[str] = frozenset()
+    """The amplifiers whose full level is an output, to which bases move by their gains."""
     clock_errors: Mapping[str, float] = field(default_factory=dict)
+    """What each amplifier is taken to state of its clock [s]; infinite if it cannot be steered."""
     document: Document | None = field(default=None, compare=False, repr=False)
+    """Its keys."""
 
     def __post_init__(self) -> None:
         """Check that ERAs and masses are on the plate, and places and names of ERAs unique."""

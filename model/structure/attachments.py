@@ -263,20 +263,20 @@ MIN_LOAD, MAX_LOAD = 0.1, 10.0
 
 @dataclass(frozen=True)
 class Fingertip:
-    """Load of one fingertip.
-
-    stiffness [N/m], damping [N s/m]: of the pulp; contact_mass [kg]: moves with the plate;
-    phalanx_mass [kg], joint_stiffness [N/m], joint_damping [N s/m]: of the bone behind the pulp and
-    of the joint that holds it to the rest plane. The defaults are those of a finger that presses
-    lightly.
-    """
+    """Load of one fingertip; the defaults are those of a finger that presses lightly."""
 
     stiffness: float = 1000.0
+    """Of the pulp [N/m]."""
     damping: float = 2.0
+    """Of the pulp [N s/m]."""
     contact_mass: float = 0.0002
+    """Mass that moves with the plate [kg]."""
     phalanx_mass: float = 0.005
+    """Of the bone behind the pulp [kg]."""
     joint_stiffness: float = 500.0
+    """Of the joint that holds the bone to the rest plane [N/m]."""
     joint_damping: float = 2.0
+    """Of that joint [N s/m]."""
 
     def __post_init__(self) -> None:
         """Refuse values not finite or negative, no damping of the pulp, and no phalanx."""

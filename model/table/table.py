@@ -245,20 +245,7 @@ def default_drive_frequencies(limits: GuardLimits) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LocalizationTable:
-    """Modes of one plate on its ERAs, and all else that patterns follow from.
-
-    - drive_mode: default of a question
-    - frequencies: (f,) [Hz]
-    - omega: (r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)
-    - losses: (r,) [rad²/s²], of it beside those of the plate's loss factor
-    - dispersion_frequencies: (k,) [Hz], dispersion: (k, r) [rad²/s²], change of its omega² with
-      frequency (`model.structure.modal_elasticity`), k = 0 for none
-    - attachment_shapes: (eras + masses, r) [1/sqrt(kg)], its shapes at ERAs and masses
-    - shapes: (points, r) [1/sqrt(kg)], its shapes on the raster
-    - discretisation_error: (f,), estimated relative L2 error of the fields over the raster
-      (`model.vibration`), maximum over the ERAs
-    - clocks: errors of those of its amplifiers, which no file has: of those that are connected
-    """
+    """Modes of one plate on its ERAs, and all else that patterns follow from."""
 
     plate: Plate
     eras: tuple[Actuator, ...]
@@ -271,17 +258,28 @@ class LocalizationTable:
     raster: Raster
     grid: Grid
     drive_mode: str
+    """Default of a question."""
     code_version: str
     frequencies: FloatArray
+    """(f,) [Hz]."""
     omega: FloatArray
+    """(r,) [rad/s], of the reduced free plate (`model.reduction.reduced_plate`)."""
     losses: FloatArray
+    """(r,) [rad²/s²], of it beside those of the plate's loss factor."""
     dispersion_frequencies: FloatArray
+    """(k,) [Hz], of `dispersion`; k = 0 for none."""
     dispersion: ComplexArray
+    """Change (k, r) [rad²/s²] of its omega² with frequency (`model.structure.modal_elasticity`)."""
     attachment_shapes: FloatArray
+    """Its shapes (eras + masses, r) [1/sqrt(kg)] at ERAs and masses."""
     shapes: NDArray[np.float32]
+    """Its shapes (points, r) [1/sqrt(kg)] on the raster."""
     reference_mesh: PlateMesh
     discretisation_error: FloatArray
+    """Estimated relative L2 error (f,) of the fields over the raster (`model.vibration`), maximum
+    over the ERAs."""
     clocks: ClockErrors = EXACT_CLOCKS
+    """Errors of those of its amplifiers, which no file has: of those that are connected."""
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]

@@ -17,8 +17,8 @@ from era_haptics.lab.conformance.judge_client import (
     STATED,
     AlreadyArmed,
     Capabilities,
+    CheckOutcome,
     ContractViolation,
-    Finding,
     JudgeClient,
     NotApplicable,
     Rows,
@@ -68,7 +68,7 @@ class Result(StrEnum):
 
 
 _RESULTS = {
-    Finding: Result.PASSED,
+    CheckOutcome: Result.PASSED,
     NotApplicable: Result.SKIPPED,
     TooLate: Result.SKIPPED,
     UnusableCapability: Result.NOT_RUN,
@@ -89,7 +89,7 @@ class CheckResult:
     number: int
     result: Result
     reason: str = ""
-    finding: Finding = field(default_factory=Finding)
+    finding: CheckOutcome = field(default_factory=CheckOutcome)
     seconds: float = 0.0
     attempts: int = 1
 
@@ -269,9 +269,9 @@ async def _run(
     return result, why and f"{check.name} failed"
 
 
-async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[Finding, str]:
+async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[CheckOutcome, str]:
     """Run the steps once; return what they found, and why nothing more can be run, or ""."""
-    finding = Finding()
+    finding = CheckOutcome()
     subject: Subject | None = None
     client.heard.clear()
     try:
@@ -286,14 +286,14 @@ async def _attempt(check: Check, client: JudgeClient, level: float) -> tuple[Fin
             expected="none",
             seen=client.heard[:1],
         )
-    except Finding as found:
+    except CheckOutcome as found:
         finding = found
     if subject:
         subject.is_at_rest = False  # whatever it was sent
     if isinstance(finding, ContractViolation):
         finding.came = client.came.hex(" ")
         finding.sent = in_words(subject.sent_set) if subject else ""
-    is_greeted = check.greets and type(finding) is Finding
+    is_greeted = check.greets and type(finding) is CheckOutcome
     left = None if is_greeted else await _left(check, client, subject, level)
     finding = left if left and not isinstance(finding, ContractViolation) else finding
     return finding, str(left or "")
@@ -316,7 +316,7 @@ async def _carry_out(check: Check, subject: Subject, level: float) -> None:
 
 async def _left(
     check: Check, client: JudgeClient, subject: Subject | None, level: float
-) -> Finding | None:
+) -> CheckOutcome | None:
     """Leave it silent, or identified where it was not; returns why it is not, after a few tries."""
     due = threads.now() + _RETRIED
     while subject is None or check.drives:

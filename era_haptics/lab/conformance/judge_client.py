@@ -47,7 +47,7 @@ from era_haptics.lab.expected_output import DRIFT, Interval
 from registry import threads
 
 
-class Finding(Exception):
+class CheckOutcome(Exception):
     """What ends the steps of a check; by itself: nothing is wrong.
 
     seen, expected: of a violation; sent: the last set before it, in words and hexadecimal; came:
@@ -57,7 +57,7 @@ class Finding(Exception):
     seen = expected = sent = came = ""
 
 
-class ContractViolation(Finding):
+class ContractViolation(CheckOutcome):
     """The amplifier does other than the contract: what must be what, and what was seen."""
 
     def __init__(self, what: str, *, expected: object, seen: object) -> None:
@@ -85,15 +85,15 @@ class UntimedClock(ContractViolation):
     """Its clock does not go on with time: nothing that plays can be judged."""
 
 
-class NotApplicable(Finding):
+class NotApplicable(CheckOutcome):
     """The amplifier, or its wire, does not have what is checked, as the contract allows."""
 
 
-class UnusableCapability(Finding):
+class UnusableCapability(CheckOutcome):
     """A capability that the check needs is not as it must be, which its own check reports."""
 
 
-class TooLate(Finding):
+class TooLate(CheckOutcome):
     """This machine was too late for what the check needs: it must be made again."""
 
 

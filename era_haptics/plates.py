@@ -6,11 +6,9 @@ Pictures are matplotlib figures, made without pyplot.
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
 from numpy.lib.stride_tricks import sliding_window_view
 
 from era_haptics.drive import (
@@ -30,7 +28,6 @@ from model.answer.answer import Answer
 from model.answer.stimulus import Placement, Stimulus, check_on_plate, together
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError, expect, expect_number, is_whole, shown
-from model.figures import contents_figure, contrast_map_figure, layer_figure, map_figure
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.reduction.reduced_plate import (
     ReducedPlate,
@@ -46,6 +43,9 @@ from model.vibration import PlateMap, Tone, plate_map
 from sim.plant.excited_plate import LEVEL_WINDOW, PlatePlayback, play, play_signals
 from sim.plant.fingers import FingerRecord
 from sim.plant.imperfections import Imperfections, draw_of_ensemble
+
+if TYPE_CHECKING:  # slow to import, as what draws
+    from matplotlib.figure import Figure
 
 
 class SolvedPlate:
@@ -226,7 +226,7 @@ class SolvedPlate:
         return reduce_free_plate(self._free, attached)
 
 
-def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
+def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> "Figure":
     """Draw the peak acceleration over the plate in g (1 g = 9.8 m/s²), ERAs, nulls as red crosses.
 
     The picture of `era plate map`. Raises InputError for a drive that the rig cannot play.
@@ -234,13 +234,15 @@ def draw_map(plate: SolvedPlate, drive: Played, *, title: str = "") -> Figure:
     Example:
         >>> era.draw_map(plate, {"SW": 110}).savefig("map.png")
     """
+    from model.figures import map_figure
+
     expect(plate, SolvedPlate, what="plate", made_by="era.SolvedPlate(rig)")
     layers = layers_of(drive, plate.rig)
     active = {name for layer in layers for each in layer.excitations for name in each}
     return map_figure(plate.rig, plate.map(drive), active=active, title=title)
 
 
-def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> Figure:
+def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> "Figure":
     """Draw the level of a layer of an answer over the plate [dB SL], and the fingers.
 
     Raises InputError for a layer that it does not have.
@@ -248,6 +250,8 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     Example:
         >>> era.draw_answer(table, only).savefig("answer.png")
     """
+    from model.figures import layer_figure
+
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.query(table, target)")
     if not is_whole(layer) or not 0 <= layer < len(answer.layers):
@@ -258,7 +262,7 @@ def draw_answer(table: LocalizationTable, answer: Answer, *, layer: int = 0) -> 
     return layer_figure(table, answer, layer)
 
 
-def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
+def draw_contents(table: LocalizationTable, answer: Answer) -> "Figure":
     """Draw all layers of an answer over the plate, each in its colour, grey where they mix.
 
     Beside every finger its frequency, verdict, promised level and contrast; each layer alone. The
@@ -267,6 +271,8 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
     Example:
         >>> era.draw_contents(table, both).savefig("contents.png")
     """
+    from model.figures import contents_figure
+
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(answer, Answer, what="answer", made_by="era.answer(table, fingers)")
     if not answer.layers:
@@ -283,7 +289,7 @@ def draw_contents(table: LocalizationTable, answer: Answer) -> Figure:
     )
 
 
-def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
+def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> "Figure":
     """Draw promised contrast of every place to quiet fingers, drive modes side by side.
 
     The picture of `era table map`.
@@ -291,12 +297,14 @@ def draw_contrast_map(table: LocalizationTable, found: ContrastMap) -> Figure:
     Example:
         >>> era.draw_contrast_map(table, found).savefig("contrast.png")
     """
+    from model.figures import contrast_map_figure
+
     expect(table, LocalizationTable, what="table", made_by="era.table(rig)")
     expect(found, ContrastMap, what="found", made_by="era.contrast_map(table, quiet)")
     return contrast_map_figure(table, found)
 
 
-def draw_playback(playback: PlatePlayback) -> Figure:
+def draw_playback(playback: PlatePlayback) -> "Figure":
     """Draw the acceleration at each finger over time [m/s²], on a logarithmic scale.
 
     The peak within a period of the lowest frequency, of signals within 30 ms: the mean over the
@@ -305,6 +313,9 @@ def draw_playback(playback: PlatePlayback) -> Figure:
     Example:
         >>> era.draw_playback(plate.play(only)).savefig("playback.png")
     """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullLocator
+
     expect(playback, PlatePlayback, what="playback", made_by="plate.play(pattern, target)")
     figure = Figure(figsize=(6.4, 3.8), layout="constrained")
     axes = figure.subplots()

@@ -348,13 +348,16 @@ def with_base(document: Document) -> Document:
     path = base_path(document)
     if not path.is_file():
         refuse(f"must be a rig file beside this one, got {name}, which is not there; put it back")
+    if path.resolve() == Path(document.source).resolve():
+        refuse(f"must be the rig file that was fitted, got {name}, this file; name the other one")
     base = read_document(path)
+    check_is_rig(base)
     if "base" in base.data:
         refuse(f"must be a whole rig, got {name}, which has a base of its own; name that one")
     if document.data.get("base_fingerprint") != base_fingerprint(base):
         refuse(
-            f"{name} must have the plate, ERAs and masses that it had when they were fitted; undo "
-            "what was changed there, or fit anew"
+            f"{name} must have the plate, ERAs, masses and supports, as written, that it had when "
+            "they were fitted; undo what was changed there, or fit anew"
         )
     over = {key: value for key, value in document.data.items() if key not in BASE_KEYS}
     for kind in _NAMED:

@@ -829,10 +829,10 @@ BASES = {
     "missing": ("base: rig.yaml", "base: ring.yaml", r":\d+: base: must be a rig file beside"),
     "outside": ("base: rig.yaml", "base: ../rig.yaml", r"base: must be in the folder of this file"),
     "absolute": ("base: rig.yaml", "base: /rig.yaml", r"base: must be in the folder of this file"),
-    "itself": ("base: rig.yaml", "base: rig.fitted.yaml", r"base: must be a whole rig, got"),
+    "itself": ("base: rig.yaml", "base: rig.fitted.yaml", r"base: must be the rig file that"),
     "a number": ("base: rig.yaml", "base: 3", r"base: must be the name of a rig file, got 3"),
     "another ERA": ("  A:", "  Z:", r"eras.Z: must be in rig.yaml, which has none of this name"),
-    "no fingerprint": ("base_fingerprint", "#", r"base: rig.yaml must have the plate, ERAs and"),
+    "no fingerprint": ("base_fingerprint", "#", r"base: rig.yaml must have the plate, ERAs,"),
     "unknown key": ("    stiffness:", "    stifness:", r"eras.A.stifness: "),
 }
 
@@ -849,6 +849,14 @@ def test_a_base_that_does_not_fit_is_refused_with_its_line(
         load_rig(output)
 
 
+def test_a_base_that_is_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    """A daemon's file in the base's place is called that, not a rig that has changed."""
+    *_, output = fitted(tmp_path, FLOW, other_values)
+    (tmp_path / "rig.yaml").write_text("rig: other.yaml\nsocket: era.sock\n", "utf-8")
+    with pytest.raises(InputError, match=r"rig\.yaml: must be a rig, got a daemon file"):
+        load_rig(output)
+
+
 def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
     """URL, channels and limits of the base hold; another plate or ERA needs another fit."""
     *_, output = fitted(tmp_path, FLOW, other_values)
@@ -859,7 +867,7 @@ def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
     assert back.wiring["C"].number == 5
     for one, other in (("2 mm", "3 mm"), ("[0.3, 0]", "[0.2, 0]")):
         base.write_text(FLOW.replace(one, other), "utf-8")
-        with pytest.raises(ConfigError, match=r"rig.yaml must have the plate, ERAs and masses"):
+        with pytest.raises(ConfigError, match=r"rig.yaml must have the plate, ERAs, masses"):
             load_rig(output)
     base.write_text(FLOW.replace("mesh: 12x9", "mesh: 12x"), "utf-8")
     with pytest.raises(ConfigError, match=r"rig\.yaml:3: mesh: "):

@@ -370,7 +370,12 @@ def show(
     assert rig.document.over is not None  # noqa: S101  else there were no rows
     base = str(rig.document.over.data["base"])
     table = [
-        (key, _value_text(before), _value_text(after), "" if error is None else f"± {error:.3g}")
+        (
+            key,
+            "-" if before is None else _value_text(before),
+            "left out" if after is None else _value_text(after),
+            "" if error is None else f"± {error:.3g}",
+        )
         for key, before, after, error in changes
     ]
     heading = ("", base, fitted.name, "standard error")
@@ -393,8 +398,6 @@ def _value_text(value: object) -> str:
             return counted(len(value), "row")
         case list():
             return f"[{', '.join(map(_value_text, value))}]"
-        case None:
-            return "-"
     return str(value)
 
 

@@ -220,7 +220,9 @@ def _restated_material(data: Any, path: KeyPath, value: dict[str, Any]) -> dict[
 
 def _values(rig: Rig, section: RigSection) -> dict[KeyPath, Any]:
     """Values of a rig that a fit may change, by where its file has them, as it states them."""
-    found: dict[KeyPath, Any] = {("uncertainty",): asdict(rig.uncertainty)}
+    found: dict[KeyPath, Any] = {
+        ("uncertainty", key): value for key, value in asdict(rig.uncertainty).items()
+    }
     of_plate = section.plate.stated(rig.plate, rig.laminate)
     found |= {("plate", *path): value for path, value in of_plate.items()}
     for era in rig.eras:
@@ -337,6 +339,12 @@ def save_rig(rig: Rig, path: Path | str) -> None:
     """
     expect(rig, Rig, what="rig", made_by='era.load_rig("rig.yaml")')
     place, document = expect_path(path, what="path"), stated(rig)
+    if (over := document.over) is not None:
+        for file in (Path(over.source), base_path(over)):
+            if place.resolve() == file.resolve():
+                raise InputError(
+                    f"path must be another file than {file}, which this fitted rig was read from"
+                )
     check_ending(place, ".yaml", ".yml", what="a rig file")
     written = parse_document(str(place), document.whole_text)
     rig_of(written)

@@ -857,6 +857,17 @@ def test_a_base_that_is_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
         load_rig(output)
 
 
+def test_what_a_fit_leaves_alone_is_that_of_the_base(tmp_path: Path) -> None:
+    """Only the terms of the uncertainty that a fit changed are written."""
+
+    def change(rig: Rig) -> Rig:
+        return replace(rig, uncertainty=replace(rig.uncertainty, gain=0.01))
+
+    _, after, output = fitted(tmp_path, FLOW, change)
+    assert "uncertainty: {gain: 0.01}" in output.read_text("utf-8")
+    assert load_rig(output).uncertainty == after.uncertainty
+
+
 def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
     """URL, channels and limits of the base hold; another plate or ERA needs another fit."""
     *_, output = fitted(tmp_path, FLOW, other_values)
@@ -884,7 +895,7 @@ def test_show_and_merge_of_what_a_fit_found(
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[0] == ["rig.yaml", "rig.fitted.yaml", "standard", "error"]
     assert ["eras.B.stiffness", "9000", "9901", "±", "123"] in rows
-    assert ["eras.A.damping_ratio", "0.1", "-"] in rows
+    assert ["eras.A.damping_ratio", "0.1", "left", "out"] in rows
     assert ["eras.A.gains", "[]", "2", "rows"] in rows
     assert run(["rig", "show", str(output), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
@@ -894,6 +905,9 @@ def test_show_and_merge_of_what_a_fit_found(
     whole = tmp_path / "whole.yaml"
     assert run(["rig", "merge", str(output), "-o", str(whole)]) == 0
     assert load_rig(whole) == load_rig(output)
+    for file in (output, tmp_path / "rig.yaml"):
+        with pytest.raises(InputError, match="must be another file than"):
+            save_rig(load_rig(output), file)
     assert run(["rig", "merge", str(whole), "-o", str(tmp_path / "again.yaml")]) == 2
     assert run(["rig", "show", str(whole)]) == 2
     assert run(["rig", "merge", str(output), "-o", str(tmp_path / "rig.yaml")]) == 2

@@ -22,14 +22,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from urllib.parse import parse_qsl
 
 from model.errors import InputError
-from model.structure.plate import Plate
 from registry import threads
 from registry.limits import MAX_CONTACTS
 from registry.plugins import PluginRegistry
+
+if TYPE_CHECKING:  # numpy is slow to import
+    from model.structure.plate import Plate
 
 LOG_INTERVAL = 1.0  # s
 
@@ -207,7 +209,9 @@ def turned(degrees: int = 0, *, mirror: str | None = None) -> TouchCalibration:
     return TouchCalibration((x_row, y_row))
 
 
-def fitted(touched: Sequence[Point], positions: Sequence[Point], plate: Plate) -> TouchCalibration:
+def fitted(
+    touched: Sequence[Point], positions: Sequence[Point], plate: "Plate"
+) -> TouchCalibration:
     """Fit a calibration by least squares to at least three points.
 
     touched: sensor coordinates 0..1; positions: on the plate [m] from its south-west corner, y
@@ -448,7 +452,7 @@ class ContactTracker:
     touch is rejected.
     """
 
-    def __init__(self, plate: Plate) -> None:
+    def __init__(self, plate: "Plate") -> None:
         self._plate = plate
         self._contacts: dict[ContactKey, Contact] = {}
         self._sources: dict[str, _Source] = {}
@@ -595,7 +599,9 @@ def _source_of(frame: TouchFrame) -> _Source:
     return _Source(frame.time, timeout, frame.time + timeout, origin)
 
 
-def _valid_touches(frame: TouchFrame, plate: Plate, rejected: list[str]) -> dict[ContactKey, Touch]:
+def _valid_touches(
+    frame: TouchFrame, plate: "Plate", rejected: list[str]
+) -> dict[ContactKey, Touch]:
     """Return the touches that can be contacts; add a reason for each of the others."""
     last: dict[int, Touch] = {}
     for touch in frame.touches:

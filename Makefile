@@ -55,6 +55,7 @@ nightly: .venv/installed-test
 # empty folder, conformance of the examples, an identified plate, the firmware on the plate; and those
 # cases of heavy tests that `make test` leaves out.
 test-long: .venv/installed-test
+	.ci/install caddy:caddy nginx:nginx openssl:openssl
 	$(BIN)/pytest -m 'long and not alone' --numprocesses auto
 	$(BIN)/pytest -m 'long and alone'
 

@@ -37,8 +37,8 @@ def gateway(
         Path | None,
         typer.Option(help="File (mode 600) with the token (default: a random one)."),
     ] = None,
-    certificate: Annotated[Path | None, typer.Option(help="TLS certificate chain, PEM.")] = None,
-    key: Annotated[Path | None, typer.Option(help="TLS key of the certificate, PEM.")] = None,
+    certificate: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    key: Annotated[Path | None, typer.Option(hidden=True)] = None,
     allow_host: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Further allowed host name."),
@@ -57,6 +57,11 @@ def gateway(
     from controller.gateway.gateway_settings import GatewaySettings, read_token, require_gateway
 
     require_gateway()
+    if certificate or key:
+        raise InputError(
+            "--certificate and --key must be left out: TLS is of a reverse proxy, such as Caddy or "
+            "nginx, before a gateway on 127.0.0.1; docs/how-to/deployment.md has the lines for both"
+        )
     from controller.api.link import find_socket
     from controller.gateway.app import serve
 
@@ -66,8 +71,6 @@ def gateway(
         socket=find_socket(socket),
         host=host,
         port=port,
-        certificate=certificate,
-        key=key,
         extra_hosts=tuple(allow_host or ()),
         origins=tuple(allow_origin or ()),
         is_token_user_supplied=token_file is not None,
@@ -75,9 +78,8 @@ def gateway(
     )
 
     def announce(port: int) -> None:
-        scheme = "https" if settings.certificate else "http"
         token = f"#token={settings.token}" if token_file is None else f" (token in {token_file})"
-        print(f"dashboard: {scheme}://{settings.shown_host}:{port}/{token}", flush=True)
+        print(f"dashboard: http://{settings.shown_host}:{port}/{token}", flush=True)
 
     asyncio.run(serve(settings, announce=announce))
     os._exit(0)  # Python would abort in the thread that draws the field

@@ -57,7 +57,7 @@ class Access:
         """Check a request or WebSocket before anything of its body; raises web.HTTPException."""
         headers = request.headers
         host, origin = (", ".join(headers.getall(name, [])) for name in ("Host", "Origin"))
-        own = sent_origin(f"{'https' if self._settings.certificate else 'http'}://{host}")
+        own = sent_origin(f"http://{host}")
         is_link = headers.get("Sec-Fetch-Mode") == "navigate"  # which the user followed
         is_embedded = headers.get("Sec-Fetch-Site") == "cross-site" and not (origin or is_link)
         for is_refused, error, text in (

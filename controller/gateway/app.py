@@ -12,11 +12,10 @@ import mimetypes
 import os
 import signal
 import socket
-import ssl
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from aiohttp import HttpVersion11, WSCloseCode, web
 from aiohttp.http import HttpProcessingError
@@ -37,23 +36,16 @@ from controller.api.jsonrpc import (
     request_line,
     unknown_method,
 )
-from controller.api.link import RESPONSE_TIMEOUT, Unreachable, read_line, result_of
+from controller.api.link import RESPONSE_TIMEOUT, Unreachable
 from controller.api.methods import METHODS, SILENCING, Method
 from controller.api.schema import API_VERSION, ApiMessage
 from controller.api.summaries import SUMMARIES
-from controller.gateway.access import SUBPROTOCOL, VERSIONS, Access
-from controller.gateway.connections import (
-    CLIENT_TIMEOUT,
-    CONNECTION,
-    CONTINUE,
-    ConnectionAcceptor,
-    bridge,
-)
+from controller.gateway.access import SUBPROTOCOL, Access
+from controller.gateway.connections import CLIENT_TIMEOUT, CONNECTION, ClientConnection, bridge
 from controller.gateway.field import DrawnField
 from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
 from controller.process.daemon_process import allow_many_descriptors
-from controller.process.log import RateLimiter, Rates
 from model.errors import InputError
 from registry.threads import no_long_collections
 
@@ -152,15 +144,10 @@ def _operation(name: str, method: Method, references: Any) -> dict[str, Any]:
 MAX_BODY = 1 << 16  # bytes; of a message as well
 MAX_REQUESTS = 256  # to the daemon at once
 MAX_SESSIONS = 24  # WebSockets; the daemon has 32 connections, and some for stops
-MAX_OPENING_RATE, OPENING_BURST = 10.0, 32.0  # 1/s; of a host's connections to the daemon, and in
-# a burst
-MAX_TOTAL_RATE, TOTAL_BURST = 16.0, 48.0  # the same of all hosts together: fewer than the daemon
-# accepts of one process, so that there are always some for the gateway's own
 _METRICS_TIME = 0.5  # s; for which the same metrics are given
 _MAX_DISARMS = 8  # at once; the daemon carries out as many of one client
 _HEARTBEAT = 10.0  # s; without a frame of a browser, after which it is asked for one
 _CLOSE_TIMEOUT = 0.3  # s; for a browser to close its side
-_MAX_FILES = 4  # in one turn of the event loop
 _PAGE = Path(__file__).parent / "page"
 
 
@@ -173,16 +160,14 @@ class Gateway:
         self._daemon = settings.socket
         self._sessions: set[web.WebSocketResponse] = set()
         self._places = asyncio.Semaphore(MAX_REQUESTS)
-        # Of connections to the daemon, by host.
-        self._rates = Rates(MAX_OPENING_RATE, burst=OPENING_BURST, clock=time.monotonic)
-        self._rate = RateLimiter(MAX_TOTAL_RATE, burst=TOTAL_BURST, clock=time.monotonic)
+        self._waiting: dict[ClientConnection, asyncio.TimerHandle] = {}
+        self._kept: dict[ClientConnection, AsyncClient] = {}
         # For what must not wait for a new connection, which the daemon may refuse.
         self._own = AsyncClient(settings.socket, name="gateway", timeout=RESPONSE_TIMEOUT)
         self._disarms = asyncio.Semaphore(_MAX_DISARMS)
         self._reading = asyncio.Lock()
         self._read_at = float("-inf")  # s; when the metrics were read
         self._exposition = b""
-        self._file_permits = asyncio.Semaphore(_MAX_FILES)
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
         self._files["openapi.json"] = json.dumps(openapi()).encode()
         self.app = web.Application(middlewares=[self._answer], client_max_size=MAX_BODY)
@@ -199,9 +184,9 @@ class Gateway:
         self.app.on_response_prepare.append(self._access.protect)
         self.app.on_shutdown.append(self._end_sessions)
 
-    def may_connect(self, host: str | None) -> bool:
-        """Whether a client's host may open a connection to the daemon; counts it."""
-        return self._rates.of(host).take() and self._rate.take()
+    def connection(self, server: asyncio.Protocol) -> ClientConnection:
+        """A connection that is served by the web server's protocol for it."""
+        return ClientConnection(server, self._daemon, self._waiting, self._kept)
 
     async def keep_connected(self) -> None:
         """Connect to the daemon again after every loss, so that no stop has to wait for it."""
@@ -211,38 +196,31 @@ class Gateway:
 
     @web.middleware
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Check a request and write its response; only then its connection is idle again.
+        """Check a request and answer it; its client has the time of the next one to read that.
 
         A client may have left meanwhile: its stop is carried out all the same.
         """
         connection = CONNECTION.get()
-        if request.version in VERSIONS:  # else it is answered as what is no HTTP
-            connection.start_response()
+        connection.stop_waiting()
         try:
             self._access.check(request)
-            response = await handler(request)
+            return await handler(request)
         except web.HTTPException as error:
-            response = web.json_response(
+            return web.json_response(
                 {"error": error.text},
                 status=403 if "Upgrade" in request.headers else error.status,
                 headers=[each for each in error.headers.items() if each[0] == "Allow"],
             )
-        connection.is_refused = not request.content.is_eof()
-        if connection.is_refused:
-            response.force_close()
-            connection.resume_reading()
-        await response.prepare(request)
-        await response.write_eof()
-        connection.end_response()
-        return response
+        finally:
+            if not request.content.is_eof():
+                connection.refuse_rest()
+            connection.wait()
 
     async def _file(self, request: web.Request) -> web.Response:
         """A file of the page, or the description."""
         name = request.match_info["file"] or "index.html"
         if name not in self._files:
             raise web.HTTPNotFound
-        async with self._file_permits:  # of many requests at once some go out in each turn
-            await asyncio.sleep(0)
         return web.Response(
             body=self._files[name], content_type=mimetypes.guess_type(name)[0], charset="utf-8"
         )
@@ -267,7 +245,7 @@ class Gateway:
             if self._places.locked():
                 raise web.HTTPServiceUnavailable(text="too many requests at once; try again later")
             async with self._places:
-                result = await self._request(request, method, await _body(request))
+                result = await self._request(method, await _body(request))
             return web.json_response(result)
         except (RpcError, Unreachable) as problem:
             error = (
@@ -281,34 +259,19 @@ class Gateway:
                 status=HTTP_STATUS[error.code],
             )
 
-    async def _request(self, request: web.Request, method: str, params: bytes) -> Any:
+    async def _request(self, method: str, body: bytes) -> Any:
         """The daemon's result, over the connection that the client's keeps.
 
-        Raises RpcError and Unreachable.
+        What silences goes over the own one, from any client. Raises RpcError and Unreachable.
         """
         connection = CONNECTION.get()
-        name = f"http {connection.address}"
-        if method in SILENCING:  # over the own connection, from any client
-            return await self._silence(name, method, params)
-        line = await connection.link.request(
-            self._daemon,
-            name,
-            method,
-            params,
-            may_open=lambda: self.may_connect(request.remote),
-        )
-        return result_of(read_line(line))
-
-    async def _silence(self, name: str, method: str, params: bytes) -> Any:
-        """The result of a stop or disarm of a client; raises RpcError and Unreachable."""
-        read = read_request(request_line(name, method, params))
-        given = read_params(METHODS[method].params, read).model_copy(
-            update={"client": read.params.get("client") or name}
-        )
+        request = read_request(request_line(None, method, body))
+        params = read_params(METHODS[method].params, request)
+        if method not in SILENCING:
+            return await connection.request(method, params)
+        caller = request.params.get("client") or f"http {connection.address}"
         async with contextlib.nullcontext() if method == "stop" else self._disarms:
-            return (await self._own.call(method, given, METHODS[method].result)).model_dump(
-                mode="json"
-            )
+            return await self._own.request(method, params.model_copy(update={"client": caller}))
 
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one browser."""
@@ -321,7 +284,7 @@ class Gateway:
             timeout=_CLOSE_TIMEOUT,
             autoclose=False,  # by the bridge
         )
-        if len(self._sessions) >= MAX_SESSIONS or not self.may_connect(request.remote):
+        if len(self._sessions) >= MAX_SESSIONS:
             raise web.HTTPForbidden(text="too many clients")
         if not (
             request.version == HttpVersion11
@@ -330,7 +293,6 @@ class Gateway:
             and request.headers.get("Sec-WebSocket-Key", "").isascii()
             and socket.can_prepare(request)
             and not request.can_read_body
-            and connection.upgrade()
         ):
             raise web.HTTPForbidden(text=f"it must be a WebSocket of {SUBPROTOCOL}")
         self._sessions.add(socket)  # before the first await, so that the limit holds
@@ -365,8 +327,6 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
-    if "Expect" in request.headers and request.version == HttpVersion11:
-        CONNECTION.get().write(CONTINUE)
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
             body = await request.read()
@@ -378,8 +338,6 @@ async def _body(request: web.Request) -> bytes:
 
 _MAX_LINE = 1 << 13  # bytes; of the head of a request
 _MAX_LINES = 64
-_SEND_BUFFER = 1 << 17  # bytes per connection in the system's buffer
-_RECEIVE_BUFFER = 1 << 16  # likewise; about what is received in one turn of the event loop
 _QUEUE = 512  # connections that wait to be accepted
 _NICENESS = 10  # added, so that the daemon's control loop has priority
 _SHUTDOWN_TIMEOUT = 0.3  # s; for requests to end by themselves
@@ -390,7 +348,6 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
     with contextlib.suppress(OSError):  # a service may be forbidden to
         os.nice(_NICENESS)
     allow_many_descriptors()
-    tls = load_certificate(settings)
     gateway = Gateway(settings)
     listening = listen(settings)
     failures = logging.getLogger(f"{__name__}.requests")
@@ -403,9 +360,9 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
         max_line_size=_MAX_LINE,
         max_field_size=_MAX_LINE,
         max_headers=_MAX_LINES,
-        lingering_time=0,  # the connections'
+        lingering_time=CLIENT_TIMEOUT,
         read_bufsize=1 << 12,  # bytes of a body that wait to be read
-        keepalive_timeout=2 * CLIENT_TIMEOUT,  # the acceptor's comes first
+        keepalive_timeout=2 * CLIENT_TIMEOUT,  # the connection's comes first
         shutdown_timeout=_SHUTDOWN_TIMEOUT,
     )
     await runner.setup()
@@ -414,16 +371,16 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, over.set)
     # It never ends by itself: a part that fails ends the process, which then says why.
-    own = asyncio.gather(
-        gateway.field.run(),
-        gateway.keep_connected(),
-        ConnectionAcceptor(runner.server, tls).run(listening),
-    )
+    own = asyncio.gather(gateway.field.run(), gateway.keep_connected())
     own.add_done_callback(lambda _: over.set())
+    make_server = runner.server
+    serving = await asyncio.get_running_loop().create_server(
+        lambda: cast(asyncio.Protocol, gateway.connection(make_server())), sock=listening
+    )
     announce(listening.getsockname()[1])
     with no_long_collections():  # of connections that a storm leaves, nothing else is visited
         await over.wait()
-    listening.close()
+    serving.close()
     await runner.cleanup()
     own.cancel()
     with contextlib.suppress(asyncio.CancelledError):
@@ -434,26 +391,6 @@ def _is_own_failure(record: logging.LogRecord) -> bool:
     """Whether it is not of a client, which has left or sends what is not HTTP."""
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, OSError | HttpProcessingError)
-
-
-def load_certificate(settings: GatewaySettings) -> ssl.SSLContext | None:
-    """Load certificate and key, None without; raises InputError unless they match."""
-    if settings.certificate is None:
-        return None
-    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    try:
-        tls.load_cert_chain(
-            settings.certificate,
-            settings.key,
-            password="",  # without it OpenSSL would prompt for one
-        )
-    except (OSError, ValueError) as error:
-        reason = str(getattr(error, "strerror", None) or error).partition(" (_ssl.c")[0]
-        raise InputError(
-            f"{settings.certificate} and {settings.key} cannot be used for TLS ({reason}); give a "
-            "certificate chain and its key, both PEM, the key without password"
-        ) from error
-    return tls
 
 
 def listen(settings: GatewaySettings) -> socket.socket:
@@ -472,8 +409,4 @@ def listen(settings: GatewaySettings) -> socket.socket:
             f"({os.strerror(error.errno or 0)}); stop the other program or give another port "
             "(--listen; of a daemon --dashboard, or dashboard in its file)"
         ) from error
-    # Inherited by accepted connections; the system's default limits are some megabytes.
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-    listening.setblocking(False)
     return listening

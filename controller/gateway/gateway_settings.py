@@ -35,9 +35,6 @@ class GatewaySettings:
     """Port to listen on; 0: any free one."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
     """Gives full access to the API; random by default."""
-    certificate: Path | None = None
-    """TLS certificate chain, PEM; None: no TLS."""
-    key: Path | None = None
     extra_hosts: tuple[str, ...] = ()
     """Allowed Hosts without port, besides those of the loopback."""
     origins: tuple[str, ...] = ()
@@ -60,20 +57,9 @@ class GatewaySettings:
                 "python -c 'import secrets; print(secrets.token_urlsafe(32))'",
             ),
             (
-                (self.certificate is None) != (self.key is None),
-                "TLS needs both --certificate and --key",
-            ),
-            *(
-                (
-                    path is not None and not path.is_file(),
-                    f"{path}: no such file; --certificate and --key must be PEM files",
-                )
-                for path in (self.certificate, self.key)
-            ),
-            (
-                not is_loopback and not (self.certificate and self.is_token_user_supplied),
-                f"listening on {self.host}, outside the loopback, needs TLS and your own token: "
-                "give --certificate, --key and --token-file, or listen on 127.0.0.1 behind a proxy",
+                not is_loopback and not self.is_token_user_supplied,
+                f"listening on {self.host}, outside the loopback, needs your own token: give "
+                "--token-file, or listen on 127.0.0.1 behind a reverse proxy with TLS",
             ),
             (
                 not is_loopback and not self.extra_hosts,

@@ -1,4 +1,4 @@
-"""Attacks on a gateway over TLS, and whether a stop of a fresh client gets through meanwhile.
+"""Attacks on a gateway, and whether a stop of a fresh client gets through meanwhile.
 
     python tests/support/gateway_attacks.py [--seconds S] [--only NAME ...] [--program ERA]
 
@@ -15,15 +15,13 @@ import logging
 import os
 import resource
 import socket
-import ssl
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,40 +37,21 @@ from gateway_bench import (
     upgrade,
     wait_for_daemon,
 )
-from typed_page import installed_program
 
 LIMIT = 0.5  # s; for a stop
 _INTERVAL = 0.2  # s; between stops
 _PATIENCE = 2.0  # s; for a stop, and for memory to settle
 _CONNECTING = 8.0  # s
-_HALF_HELLO = b"\x16\x03\x01\x02\x00\x01"
 _TOUCH = b'{"jsonrpc":"2.0","method":"touch","params":{"source":"p","touches":[]}}'
 _HELLO = b'{"jsonrpc":"2.0","id":1,"method":"hello","params":{"client":"me"}}'
-
-
-def make_certificate(folder: Path) -> tuple[Path, Path]:
-    """A self-signed certificate of localhost, and its key."""
-    certificate, key = folder / "panel.pem", folder / "panel.key"
-    subprocess.run(
-        [
-            *(installed_program("openssl", package="openssl"), "req", "-x509", "-newkey", "ec"),
-            *("-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "1"),
-            *("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
-            *("-keyout", str(key), "-out", str(certificate)),
-        ],
-        check=True,
-        capture_output=True,
-    )
-    return certificate, key
 
 
 class Attacker:
     """Attacks one gateway for a time [s]."""
 
-    def __init__(self, port: int, certificate: str, seconds: float) -> None:
+    def __init__(self, port: int, seconds: float) -> None:
         self.seconds = seconds
         self._port = port
-        self._tls = ssl.create_default_context(cafile=certificate)
         self._upgrade = upgrade(SimpleNamespace(host=f"localhost:{port}"))  # type: ignore[arg-type]
 
     async def many(self, count: int, attack: Callable[[int], Awaitable[str]]) -> str:
@@ -88,26 +67,6 @@ class Attacker:
         """Nothing, for comparison."""
         await asyncio.sleep(self.seconds)
         return ""
-
-    async def half_handshake(self, _: int) -> str:
-        """The first bytes of a handshake."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", self._port)
-        writer.write(_HALF_HELLO)
-        return await self._held(reader, writer)
-
-    async def thousands(self) -> str:
-        """Half handshakes, a thousand in a second, all held."""
-        held: list[socket.socket] = []
-        for number in range(4000):
-            made = self._connect()
-            held.append(made)
-            asyncio.get_running_loop().call_later(0.01, _send, made)
-            if number % 10 == 9:
-                await asyncio.sleep(0.01)
-        await asyncio.sleep(self.seconds / 3)
-        for made in held:
-            made.close()
-        return f"{len(held)} opened"
 
     async def storm(self) -> str:
         """Two thousand connections in a second, each closed after 20 ms."""
@@ -157,11 +116,6 @@ class Attacker:
             body += [b"10000\r\n" + b" " * 65536 + b"\r\n"] * 1526
         return await self._send_all([head.encode(), *body])
 
-    async def small_chunks(self, _: int) -> str:
-        """A chunked body of single bytes without end, without the token."""
-        head = b"POST /api/v1/arm HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
-        return await self._send_all([head, *[b"1\r\n \r\n" * 40_000] * 400])
-
     async def unread_pages(self, _: int) -> str:
         """Two hundred requests for the page, whose responses are not read."""
         _, writer = await self._open()
@@ -186,7 +140,7 @@ class Attacker:
                 writer.transport.pause_reading()  # type: ignore[attr-defined]
             discarding = asyncio.create_task(_discard(reader)) if reads else None
             writer.write(first)
-            with contextlib.suppress(TimeoutError, ConnectionError, ssl.SSLError):
+            with contextlib.suppressTimeoutError, ConnectionError:
                 async with asyncio.timeout(self.seconds):
                     while not writer.transport.is_closing():
                         writer.write(data)
@@ -200,7 +154,7 @@ class Attacker:
 
     async def _open(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         async with asyncio.timeout(_CONNECTING):
-            return await asyncio.open_connection("localhost", self._port, ssl=self._tls)
+            return await asyncio.open_connection("127.0.0.1", self._port)
 
     def _connect(self) -> socket.socket:
         made = socket.socket()
@@ -236,26 +190,21 @@ class Attacker:
     async def _send_all(self, parts: Sequence[bytes]) -> str:
         """The status of the response to a request in parts."""
         reader, writer = await self._open()
-        with contextlib.suppress(ConnectionError, ssl.SSLError):
+        with contextlib.suppressConnectionError:
             for part in parts:
                 writer.write(part)
                 await asyncio.wait_for(writer.drain(), self.seconds)
         try:
             async with asyncio.timeout(self.seconds):
                 return (await reader.read(4096))[9:12].decode() or "closed"
-        except (ConnectionError, ssl.SSLError):
+        except ConnectionError:
             return "closed"
         finally:
             writer.transport.abort()
 
 
-def _send(made: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        made.send(_HALF_HELLO)
-
-
 async def _discard(reader: asyncio.StreamReader) -> None:
-    with contextlib.suppress(ConnectionError, ssl.SSLError):
+    with contextlib.suppressConnectionError:
         while await reader.read(1 << 16):
             pass
 
@@ -268,23 +217,13 @@ def _end(writer: asyncio.StreamWriter, outcome: str = "") -> str:
 
 ATTACKS: dict[str, Callable[[Attacker], Awaitable[str]]] = {
     "none": lambda a: a.many(1, a.none),
-    "600 half handshakes": lambda a: a.many(600, a.half_handshake),
-    "4 000 half handshakes, 1 000/s": lambda a: a.thousands(),
     "2 000 connections/s": lambda a: a.storm(),
     "300 slow heads, a byte per 0.5 s": lambda a: a.many(300, a.slow_head),
     "200 slow bodies, half with the token": lambda a: a.many(200, a.slow_body),
     "400 connections idle after a request": lambda a: a.many(400, a.idle),
     "12 heads of 100 KB, or endless": lambda a: a.many(12, a.large_head),
     "8 bodies of 100 MB, sized or chunked": lambda a: a.many(8, a.large_body),
-    "32 bodies of chunks of one byte": lambda a: a.many(32, a.small_chunks),
     "200 connections, 200 pages each unread": lambda a: a.many(200, a.unread_pages),
-    "8 WebSockets, empty fragments": lambda a: a.many(
-        8, a.frames(frame(b"", first=0x00) * 5000, first=frame(b"", first=0x01))
-    ),
-    "8 WebSockets, pings, nothing read": lambda a: a.many(
-        8, a.frames(frame(b"x" * 100, first=0x89) * 1000)
-    ),
-    "8 WebSockets, pongs": lambda a: a.many(8, a.frames(frame(b"", first=0x8A) * 5000)),
     "20 WebSockets, replies unread": lambda a: a.many(20, a.frames(frame(_HELLO) * 500)),
     "8 WebSockets, texts of 2 bytes": lambda a: a.many(
         8, a.frames(frame(b"{}") * 5000, reads=True)
@@ -327,10 +266,10 @@ class Outcome:
         )
 
 
-def attack(gateway: GatewayProcess, name: str, certificate: Path, seconds: float) -> Outcome:
+def attack(gateway: GatewayProcess, name: str, seconds: float) -> Outcome:
     """Attack a gateway, and stop all the while."""
     outcome = Outcome([], _memory(gateway), _memory(gateway), "")
-    arguments = (name, str(gateway.port), str(certificate), str(seconds))
+    arguments = (name, str(gateway.port), str(seconds))
     attacking = subprocess.Popen(
         [sys.executable, __file__, "--attack", *arguments], stdout=subprocess.PIPE, text=True
     )
@@ -377,19 +316,6 @@ def _memory(gateway: GatewayProcess) -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-@contextmanager
-def attacked_gateway(
-    folder: Path, daemon: Path, program: Sequence[str | Path] = (ERA,)
-) -> Iterator[tuple[GatewayProcess, Path]]:
-    """A gateway over TLS, connected to its daemon, and its certificate."""
-    certificate, key = make_certificate(folder)
-    tls = ("--certificate", str(certificate), "--key", str(key))
-    with gateway_process(folder, daemon, *tls, program=program) as gateway:
-        gateway.trust(certificate)
-        wait_for_daemon(gateway)
-        yield gateway, certificate
-
-
 def main(arguments: Sequence[str]) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -401,16 +327,17 @@ def main(arguments: Sequence[str]) -> None:
     _print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, real_daemon(Path(folder)) as daemon:
         for name in given.only:
-            with attacked_gateway(Path(folder), daemon, (given.program,)) as (gateway, trusted):
-                _print(attack(gateway, name, trusted, given.seconds).row(name))
+            with gateway_process(Path(folder), daemon, program=(given.program,)) as gateway:
+                wait_for_daemon(gateway)
+                _print(attack(gateway, name, given.seconds).row(name))
 
 
-def _attack(name: str, port: str, certificate: str, seconds: str) -> None:
+def _attack(name: str, port: str, seconds: str) -> None:
     logging.disable()
     os.nice(10)  # as the gateway; attackers elsewhere would take none of its processor
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    attacker = Attacker(int(port), certificate, float(seconds))
+    attacker = Attacker(int(port), float(seconds))
 
     async def run() -> str:
         return await ATTACKS[name](attacker)

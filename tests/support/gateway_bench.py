@@ -11,13 +11,12 @@ import itertools
 import json
 import os
 import socket
-import ssl
 import subprocess
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -244,7 +243,6 @@ class GatewayProcess:
     url: str
     errors: Path
     token: str
-    context: ssl.SSLContext | None = field(default=None, repr=False)
 
     @property
     def host(self) -> str:
@@ -256,17 +254,10 @@ class GatewayProcess:
         """The port it listens on."""
         return int(self.host.rpartition(":")[2])
 
-    def trust(self, certificate: Path) -> None:
-        """Connect by TLS, and trust one certificate."""
-        self.context = ssl.create_default_context(cafile=certificate)
-
     def connect(self, timeout: float = PATIENCE) -> socket.socket:
-        """A TCP connection, or a TLS one."""
+        """A TCP connection."""
         name = self.host.rpartition(":")[0].strip("[]")
-        plain = socket.create_connection((name, self.port), timeout=timeout)
-        if self.context is None:
-            return plain
-        return self.context.wrap_socket(plain, server_hostname=name)
+        return socket.create_connection((name, self.port), timeout=timeout)
 
     def log(self) -> str:
         """Its standard error so far."""
@@ -526,22 +517,6 @@ class RawWebSocket:
 def frame(payload: bytes, *, first: int = 0x81) -> bytes:
     """A client's frame."""
     return Frame(Opcode(first & 0x0F), payload, fin=bool(first & 0x80)).serialize(mask=True)
-
-
-def has_ended(connection: socket.socket) -> bool:
-    """Whether the other side has closed, without reading."""
-    try:
-        connection.send(b"")
-        return bool(connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) or _is_reset(
-            connection
-        )
-    except OSError:
-        return True
-
-
-def _is_reset(connection: socket.socket) -> bool:
-    """By the kernel's state of the connection: 1 is established, see tcp_states.h of Linux."""
-    return connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] != 1
 
 
 UNCONFIRMED = {

@@ -88,13 +88,9 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
 
 async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
     """Nothing of the machine is told to a network without it."""
-    certificate = tmp_path / "panel.pem"
-    certificate.touch()
     settings = GatewaySettings(
         socket=tmp_path / "era.sock",
         host="192.0.2.7",
-        certificate=certificate,
-        key=certificate,
         is_token_user_supplied=True,
         extra_hosts=("panel.local",),
     )
@@ -354,7 +350,7 @@ def test_http_touches_belong_to_their_connection(
 def test_http_connections_leave_places_of_the_daemon_to_others(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """A ninth is refused until one of them closes; however often, it takes nothing of browsers."""
+    """A ninth is refused until one of them closes."""
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with contextlib.ExitStack() as stack:
         first, *kept, ninth = [
@@ -364,25 +360,11 @@ def test_http_connections_leave_places_of_the_daemon_to_others(
         for each in (first, *kept, first):
             assert each.post("api/v1/status").status_code == 200
         assert len({id(each) for each in daemon.callers}) == 8
-        refused = [
-            ninth.post("api/v1/status").status_code for _ in range(2 * round(app.OPENING_BURST))
-        ]
-        assert {*refused} == {429}
+        assert ninth.post("api/v1/status").status_code == 429
         with RawWebSocket(gateway):
             pass
         first.close()
         wait_for(lambda: ninth.post("api/v1/status").status_code == 200)
-
-
-def test_who_connects_without_pause_leaves_connections_to_other_hosts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """It is refused at its own rate, before the one of all hosts is used up."""
-    monkeypatch.setattr(app.time, "monotonic", lambda: 0.0)
-    gateway = app.Gateway(GatewaySettings(socket=tmp_path / "era.sock"))
-
-    assert [gateway.may_connect("192.0.2.1") for _ in range(40)] == [True] * 32 + [False] * 8
-    assert [gateway.may_connect("192.0.2.2") for _ in range(20)] == [True] * 16 + [False] * 4
 
 
 def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: ScriptedDaemon) -> None:

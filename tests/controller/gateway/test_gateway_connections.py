@@ -13,9 +13,9 @@ from controller.api import link
 from controller.api.client import AsyncClient
 from controller.api.jsonrpc import RpcError
 from controller.api.link import Unreachable
-from controller.api.schema import API_VERSION
+from controller.api.schema import API_VERSION, Empty
 from controller.gateway import connections
-from daemons import PATIENCE
+from daemons import PATIENCE, until
 from gateway_bench import (
     TOKEN,
     GatewayProcess,
@@ -23,6 +23,7 @@ from gateway_bench import (
     gateway_process,
     wait_for_daemon,
 )
+from virtual_lines import in_virtual_time
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def status(connection: socket.socket) -> int:
 def test_stops_are_passed_on_although_other_hosts_connect_often(
     gateway: GatewayProcess, daemon: ScriptedDaemon
 ) -> None:
-    """After the bursts of two hosts; the daemon accepts 64 connections at once of one process."""
+    """Whose requests have all places that the daemon has for them."""
     daemon.calls.clear()
     others = [sent(gateway, "status", f"127.0.0.{host}") for _ in range(45) for host in (2, 3)]
     stops = [sent(gateway, "stop", "127.0.0.4") for _ in range(70)]
@@ -99,27 +100,53 @@ async def test_stop_is_answered_although_the_daemon_hangs(
 
 
 async def test_clients_that_leave_while_the_daemon_hangs_keep_their_places(
-    full_queue: Path,
+    full_queue: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Until their connections have failed: else any number of them would wait for the daemon."""
-    kept: set[connections.KeptLink] = set()
+    monkeypatch.setattr(connections, "RESPONSE_TIMEOUT", 0.3)
+    kept: dict[connections.ClientConnection, AsyncClient] = {}
 
-    def request() -> "asyncio.Task[bytes]":
-        connection = connections.KeptLink(kept)
-        may_open = Mock(return_value=True)
-        call = connection.request(full_queue, "http", "status", b"{}", may_open=may_open)
-        task = asyncio.create_task(call)
-        asyncio.get_running_loop().call_soon(connection.close)
+    def request(*, leaves: bool = True) -> "asyncio.Task[object]":
+        made = connections.ClientConnection(Mock(), full_queue, {}, kept)
+        transport = Mock(is_closing=lambda: False, get_extra_info=lambda _: ("192.0.2.1", 1))
+        made.connection_made(transport)
+        task = asyncio.create_task(made.request("status", Empty()))
+        if leaves:
+            asyncio.get_running_loop().call_soon(made.connection_lost, None)
+        made.stop_waiting()
         return task
 
     waiting = [request() for _ in range(connections.MAX_KEPT)]
-    await asyncio.sleep(0)
+    await asyncio.sleep(0.01)
     with pytest.raises(RpcError, match="too many connections"):
-        await request()
-    for each in waiting:
-        each.cancel()
-    await asyncio.wait(waiting)
-    assert not kept
+        await request(leaves=False)
+    with pytest.raises(Unreachable):
+        await asyncio.gather(*waiting)
+    await until(lambda: not kept)
+
+
+@in_virtual_time
+async def test_connection_that_waits_is_closed(tmp_path: Path) -> None:
+    """The oldest beside 128 that wait, and after 5 s without a complete request, bytes or not."""
+    waiting: dict[connections.ClientConnection, asyncio.TimerHandle] = {}
+    made = [
+        connections.ClientConnection(Mock(), tmp_path, waiting, {})
+        for _ in range(connections.MAX_WAITING + 3)
+    ]
+    wires = [Mock(is_closing=lambda: False) for _ in made]
+    for each, wire in zip(made, wires, strict=True):
+        each.connection_made(wire)
+
+    def closed() -> list[int]:
+        return [number for number, wire in enumerate(wires) if wire.abort.called]
+
+    assert closed() == [0, 1, 2]
+    made[-2].stop_waiting()  # its request has come
+    await asyncio.sleep(4.9)
+    made[-1].data_received(b"G")
+    assert closed() == [0, 1, 2]
+    await asyncio.sleep(0.2)
+    assert closed() == [each for each in range(len(made)) if each != len(made) - 2]
 
 
 LEFT = WSMessage(WSMsgType.CLOSED, None, None)
@@ -151,7 +178,7 @@ class DeafBrowser:
         """Send none of the others: they wait."""
         await asyncio.Event().wait()
 
-    async def close(self, *, code: int, drain: bool) -> None:
+    async def close(self, *, code: int = 1000, drain: bool = True) -> None:
         """Answer that it has left."""
 
 

@@ -1,25 +1,32 @@
-"""`era gateway` as a process: start, refusals, TLS, end, and stops during attacks."""
+"""`era gateway` as a process: start, refusals, end, stops during attacks, and reverse proxies.
+
+The proxies serve TLS by the lines of the page on deployment.
+"""
 
 import asyncio
 import contextlib
 import errno
 import os
+import re
 import signal
 import socket
+import ssl
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 from unittest.mock import AsyncMock
 
 import pytest
-from aiohttp import web
 
+import controller
 from controller.demo.demonstration import check_page
-from controller.gateway.app import Gateway, listen, load_certificate, serve
-from controller.gateway.connections import MAX_HANDSHAKES, ConnectionAcceptor
+from controller.gateway.app import Gateway, listen, serve
 from controller.gateway.gateway_settings import GatewaySettings, read_token
-from daemons import PATIENCE, until
-from gateway_attacks import ATTACKS, LIMIT, attack, attacked_gateway, make_certificate
+from daemons import PATIENCE
+from gateway_attacks import ATTACKS, LIMIT, attack
 from gateway_bench import (
     TOKEN,
     GatewayProcess,
@@ -27,9 +34,7 @@ from gateway_bench import (
     ScriptedDaemon,
     frame,
     gateway_process,
-    has_ended,
     http,
-    raw,
     real_daemon,
     upgrade,
     wait_for,
@@ -38,17 +43,6 @@ from gateway_bench import (
 from long_form import shortly
 from model.errors import InputError
 from typed_page import installed_program
-
-
-def openssl() -> str:
-    """The program that makes certificates."""
-    return installed_program("openssl", package="openssl")
-
-
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A self-signed certificate of localhost, and its key."""
-    return make_certificate(tmp_path_factory.mktemp("tls"))
 
 
 def test_gateway_exits_at_sigint_with_open_connections(
@@ -81,51 +75,26 @@ def test_gateway_exits_at_sigint_with_open_connections(
         assert gateway.log() == ""
 
 
-STOP = (
-    b"POST /api/v1/stop HTTP/1.1\r\nHost: %s\r\nContent-Length: 0\r\nAuthorization: Bearer "
-    + TOKEN.encode()
-    + b"\r\n\r\n"
-)
-
-
-def test_gateway_serves_tls(
-    daemon: ScriptedDaemon, tmp_path: Path, pair: tuple[Path, Path]
+def test_gateway_serves_outside_the_loopback_by_its_key(
+    daemon: ScriptedDaemon, tmp_path: Path
 ) -> None:
-    """To a tablet: on all addresses, HTTP and WebSockets over a verified certificate, TLS alone."""
-    certificate, key = pair
-    tls = ("--certificate", str(certificate), "--key", str(key))
+    """On all addresses: HTTP and WebSockets of an allowed host, and metrics, with the key alone."""
     outside = ("--listen", "0.0.0.0:0", "--allow-host", "localhost")
-    with gateway_process(tmp_path, daemon.socket, *tls, *outside) as gateway:
-        assert gateway.url.startswith("https://localhost:")
-        plain = f"POST /api/v1/stop HTTP/1.1\r\nHost: {gateway.host}\r\n\r\n".encode()
-        assert raw(gateway, plain).status == 0
-        with contextlib.ExitStack() as stack:
-            half = [stack.enter_context(gateway.connect()) for _ in range(3 * MAX_HANDSHAKES)]
-            for each in half:
-                each.sendall(b"\x16\x03\x01\x02\x00\x01")  # the beginning of a handshake
-            wait_for(
-                lambda: sum(not has_ended(each) for each in half) <= MAX_HANDSHAKES,
-                timeout=PATIENCE / 6,
-            )
-        gateway.trust(certificate)
+    with gateway_process(tmp_path, daemon.socket, *outside) as gateway:
+        assert gateway.url.startswith("http://localhost:")
         wait_for_daemon(gateway)
-        assert http(gateway).status == 200
-        assert http(gateway, more=[f"Origin: https://{gateway.host}"]).status == 200
-        assert http(gateway, more=[f"Origin: http://{gateway.host}"]).status == 403
-        assert raw(gateway, upgrade(gateway, origin=f"http://{gateway.host}")).status == 403
-        daemon.calls.clear()
-        for _ in range(20):  # clients that leave at once, and politely by TLS
-            with gateway.connect() as connection:
-                connection.sendall(STOP % gateway.host.encode())
-        for _ in range(3):
-            with RawWebSocket(gateway) as ws:
-                waiting = frame(b" " * 60_000 + b"{}") + frame(b'{"jsonrpc":"2.0","method":"stop"}')
-                ws.connection.sendall(waiting)
-        wait_for(lambda: daemon.methods.count("stop") == 23)
-        with gateway.connect() as connection:
-            connection.sendall(upgrade(gateway, origin=f"https://{gateway.host}"))
-            assert connection.recv(1 << 16).startswith(b"HTTP/1.1 101 ")
-            assert gateway.terminate() == 0
+        for more, status in ((["Origin: http://evil.example"], 403), ([], 200)):
+            assert http(gateway, more=more).status == status
+        for token, status in (([], 401), ([TOKEN], 200)):
+            assert http(gateway, token=token).status == status
+            read = http(gateway, "/metrics", method="GET", body=b"", token=token)
+            assert read.status == status
+        with RawWebSocket(gateway) as ws:
+            daemon.calls.clear()
+            waiting = frame(b" " * 60_000 + b"{}") + frame(b'{"jsonrpc":"2.0","method":"stop"}')
+            ws.connection.sendall(waiting)
+        wait_for(lambda: daemon.methods == ["stop"])
+        assert gateway.terminate() == 0
 
 
 def test_gateway_prints_an_ipv6_url_with_a_random_token(
@@ -144,23 +113,6 @@ def test_gateway_prints_an_ipv6_url_with_a_random_token(
         assert len(gateway.token) == len(other) == 43  # 256 bits
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-async def test_accepted_connections_have_no_delay(host: str, tmp_path: Path) -> None:
-    """Without TCP_NODELAY a response's body waits 40 ms for the acknowledgement of its head."""
-    listening = listen(GatewaySettings(socket=tmp_path / "era.sock", host=host, port=0))
-    server = web.Server(AsyncMock())
-    accepting = asyncio.create_task(ConnectionAcceptor(server, None).run(listening))
-    _, ours = await asyncio.open_connection(host, listening.getsockname()[1])
-    await until(lambda: bool(server.connections))
-    theirs = server.connections[0].transport
-    assert theirs is not None
-    assert theirs.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-    accepting.cancel()
-    await server.shutdown()
-    ours.close()
-    listening.close()
-
-
 def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
     """With the port, the reason and the option; a demonstration with its own, at once."""
     with socket.create_server(("127.0.0.1", 0)) as other:
@@ -170,20 +122,6 @@ def test_gateway_refuses_a_port_in_use(tmp_path: Path) -> None:
         page = f"127.0.0.1:{port}"
         with pytest.raises(InputError, match=rf"{page} \(Address already in use\).*--dashboard "):
             check_page(page)
-
-
-def test_gateway_refuses_unusable_certificates(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    """The key of another certificate, a key with a password, and a file without a certificate."""
-    certificate, _ = pair
-    other, locked = tmp_path / "other.key", tmp_path / "locked.key"
-    new = (openssl(), "genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256")
-    for path, more in ((other, ()), (locked, ("-aes256", "-pass", "pass:secret"))):
-        subprocess.run([*new, *more, "-out", str(path)], check=True, capture_output=True)
-    text = tmp_path / "text"
-    text.write_text("no certificate")
-    for first, second in ((certificate, other), (certificate, locked), (text, text)):
-        with pytest.raises(InputError, match=f"{first} and {second}.*without password"):
-            load_certificate(GatewaySettings(socket=tmp_path, certificate=first, key=second))
 
 
 def test_read_token_refuses_unsafe_and_unreadable_files(tmp_path: Path) -> None:
@@ -220,23 +158,14 @@ def test_read_token_refuses_a_file_of_another_user(
         read_token(file)
 
 
-FILE = Path(__file__)
-TLS: dict[str, object] = {"host": "0.0.0.0", "certificate": FILE, "key": FILE}
 SETTINGS: dict[str, tuple[dict[str, object], str]] = {
     "port": ({"port": 65536}, "port .* 65536"),
     "name": ({"host": "localhost"}, "--allow-host"),
     "short token": ({"token": "secret"}, "token .*22 to 128"),
     "token with a space": ({"token": "a b" * 20}, "token .*22 to 128"),
-    "certificate alone": ({"certificate": Path("x")}, "--key"),
-    "missing certificate": ({"certificate": Path("x"), "key": Path("x")}, "^x: .*--certificate"),
-    "all addresses": ({"host": "0.0.0.0"}, "--certificate, --key and --token-file"),
-    "all IPv6 addresses": ({"host": "::"}, "--certificate, --key and --token-file"),
-    "only a token": (
-        {"host": "192.0.2.1", "is_token_user_supplied": True},
-        "--certificate, --key and",
-    ),
-    "TLS without a token": ({**TLS, "extra_hosts": ("panel.local",)}, "--token-file"),
-    "TLS without a host": ({**TLS, "is_token_user_supplied": True}, "--allow-host"),
+    "all addresses": ({"host": "0.0.0.0"}, "--token-file"),
+    "all IPv6 addresses": ({"host": "::"}, "--token-file"),
+    "no host": ({"host": "192.0.2.1", "is_token_user_supplied": True}, "--allow-host"),
     "any host": ({"extra_hosts": ("*",)}, "--allow-host"),
     "host with a port": ({"extra_hosts": ("panel.local:80",)}, "--allow-host .*without port"),
     "IPv6 host without brackets": ({"extra_hosts": ("2001:db8::7",)}, r"\[2001:db8::7\]"),
@@ -292,8 +221,11 @@ def test_settings_show_and_allow_the_address_listened_on() -> None:
     settings = GatewaySettings(socket=Path("era.sock"), host="127.0.0.2")
     assert settings.shown_host == "127.0.0.2"
     panel = GatewaySettings(
-        socket=Path("era.sock"), **TLS, is_token_user_supplied=True, extra_hosts=("panel.local",)
-    )  # type: ignore[arg-type]
+        socket=Path("era.sock"),
+        host="0.0.0.0",
+        is_token_user_supplied=True,
+        extra_hosts=("panel.local",),
+    )
     assert panel.shown_host == "panel.local"
     assert settings.allowed_names == {"localhost", "127.0.0.1", "[::1]", "127.0.0.2"}
 
@@ -310,7 +242,7 @@ async def test_gateway_starts_where_its_priority_cannot_be_lowered(
         raise InputError("reached")
 
     monkeypatch.setattr("os.nice", forbidden)
-    monkeypatch.setattr("controller.gateway.app.load_certificate", reached)
+    monkeypatch.setattr("controller.gateway.app.listen", reached)
     with pytest.raises(InputError, match="reached"):
         await serve(GatewaySettings(socket=Path("era.sock")), announce=lambda port: None)
 
@@ -340,8 +272,7 @@ def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:
 
 
 SHORT = ("8 WebSockets, texts of 2 bytes",)
-MAX_MEMORY = 150.0  # MB; with handshakes that never end
-MAX_GROWTH = 400.0  # MB; a storm of TLS connections is garbage for a while
+MAX_GROWTH = 400.0  # MB; of responses that are not read
 
 
 @pytest.fixture(scope="module")
@@ -352,27 +283,211 @@ def attacked_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def attacked(attacked_daemon: Path, tmp_path: Path) -> Iterator[tuple[GatewayProcess, Path]]:
-    """A gateway over TLS, which logs nothing, and its certificate."""
-    with attacked_gateway(tmp_path, attacked_daemon) as (gateway, certificate):
-        yield gateway, certificate
+def attacked(attacked_daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
+    """A gateway that logs nothing."""
+    with gateway_process(tmp_path, attacked_daemon) as gateway:
+        wait_for_daemon(gateway)
+        yield gateway
         assert gateway.log() == ""
 
 
 @pytest.mark.real_time
 @pytest.mark.alone
 @pytest.mark.parametrize("name", shortly(ATTACKS, SHORT))
-def test_stops_get_through_an_attack(attacked: tuple[GatewayProcess, Path], name: str) -> None:
+def test_stops_get_through_an_attack(attacked: GatewayProcess, name: str) -> None:
     """Each is carried out, and the gateway takes less than half a second of a processor meanwhile.
 
     Other programs do not lengthen that, unlike the duration on a busy machine.
     """
-    gateway, certificate = attacked
-    outcome = attack(gateway, name, certificate, seconds=6.0)
+    outcome = attack(attacked, name, seconds=6.0)
     print(outcome.row(name))  # noqa: T201 (with -s it is the table)
     assert len(outcome.stops) >= 5
     assert all(each.is_done for each in outcome.stops)
     assert max(each.processor for each in outcome.stops) < LIMIT
     grown = outcome.memory_most - outcome.memory_before
     assert grown < MAX_GROWTH
-    assert "handshake" not in name or outcome.memory_most < MAX_MEMORY
+
+
+PAGE = Path(controller.__file__).parents[1] / "docs" / "how-to" / "deployment.md"
+CADDY = "{{\n    admin off\n    auto_https disable_redirects\n}}\n{site}"
+NGINX = """daemon off;
+pid {folder}/nginx.pid;
+error_log {folder}/error.log;
+events {{}}
+http {{
+    access_log off;
+    client_body_temp_path {folder}/body;
+    proxy_temp_path {folder}/proxy;
+    fastcgi_temp_path {folder}/fastcgi;
+    uwsgi_temp_path {folder}/uwsgi;
+    scgi_temp_path {folder}/scgi;
+    {site}
+}}
+"""
+
+
+@dataclass
+class Proxy:
+    """A reverse proxy on a port of the loopback, as the helpers see a gateway."""
+
+    port: int
+    certificate: Path
+
+    @property
+    def host(self) -> str:
+        """Host and port, as in the Host header."""
+        return f"localhost:{self.port}"
+
+    @property
+    def url(self) -> str:
+        """The URL of the page."""
+        return f"https://{self.host}/"
+
+    def connect(self, timeout: float = PATIENCE) -> socket.socket:
+        """A connection by TLS that trusts its certificate alone."""
+        plain = socket.create_connection(("127.0.0.1", self.port), timeout=timeout)
+        trusting = ssl.create_default_context(cafile=self.certificate)
+        return trusting.wrap_socket(plain, server_hostname="localhost")
+
+
+def site(program: str) -> str:
+    """The lines of the page for a program."""
+    text = PAGE.read_text(encoding="utf-8")
+    begin = {"caddy": "panel.local:8443 {", "nginx": "server {"}[program]
+    (lines,) = re.findall(
+        rf"^    {re.escape(begin)}\n(?:^(?:     .*|    }})\n)+", text, re.MULTILINE
+    )
+    return lines
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Proxy:
+    """A place for a proxy, with a certificate and its key."""
+    certificate, key = tmp_path / "panel.pem", tmp_path / "panel.key"
+    make = (installed_program("openssl", package="openssl"), "req", "-x509", "-newkey", "ec")
+    make += (
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        "/CN=localhost",
+    )
+    make += (
+        "-addext",
+        "subjectAltName=DNS:localhost",
+        "-keyout",
+        str(key),
+        "-out",
+        str(certificate),
+    )
+    subprocess.run(make, check=True, capture_output=True)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return Proxy(free.getsockname()[1], certificate)
+
+
+@contextmanager
+def proxied(
+    program: str, proxy: Proxy, behind: GatewayProcess, *, without: str = "(?!)"
+) -> Iterator[GatewayProcess]:
+    """Run a proxy before a gateway by the lines of the page, but those that match a pattern."""
+    folder = proxy.certificate.parent
+    lines = "\n".join(line for line in site(program).splitlines() if not re.search(without, line))
+    lines = re.sub(r"/etc/\w+/panel", str(folder / "panel"), lines)
+    lines = lines.replace("8138", str(behind.port)).replace("8443", str(proxy.port))
+    config = folder / program
+    wrapped = {"caddy": CADDY, "nginx": NGINX}[program].format(folder=folder, site=lines)
+    config.write_text(wrapped.replace("panel.local", "localhost"), encoding="utf-8")
+    arguments = {
+        "caddy": ("run", "--adapter", "caddyfile", "--config", str(config)),
+        "nginx": ("-p", str(folder), "-c", str(config), "-e", str(folder / "error.log")),
+    }[program]
+    environment = {"HOME": str(folder), "PATH": "/usr/bin:/bin"}
+    with subprocess.Popen(
+        [installed_program(program), *arguments], env=environment, stderr=subprocess.PIPE
+    ) as process:
+        try:
+
+            def is_open() -> bool:
+                assert process.poll() is None, process.stderr and process.stderr.read()
+                with contextlib.suppress(OSError):
+                    proxy.connect().close()
+                    return True
+                return False
+
+            wait_for(is_open)
+            yield cast(GatewayProcess, proxy)
+        finally:
+            process.terminate()
+
+
+@pytest.fixture
+def behind(daemon: ScriptedDaemon, tmp_path: Path, proxy: Proxy) -> Iterator[GatewayProcess]:
+    """A gateway for the pages of the proxy."""
+    allowed = ("--allow-host", "localhost", "--allow-origin", proxy.url.removesuffix("/"))
+    with gateway_process(tmp_path, daemon.socket, *allowed) as made:
+        wait_for_daemon(made)
+        yield made
+
+
+def status(panel: GatewayProcess, request: bytes) -> bytes:
+    """The status of the response, after which a proxy keeps the connection."""
+    with panel.connect() as connection:
+        connection.sendall(request)
+        return connection.recv(1 << 16)[9:12]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("program", ["caddy", "nginx"])
+def test_gateway_is_used_through_a_proxy(
+    daemon: ScriptedDaemon, proxy: Proxy, behind: GatewayProcess, program: str
+) -> None:
+    """Page, methods and WebSocket with the key; none without it, or for foreign pages or hosts."""
+    with proxied(program, proxy, behind) as panel:
+        own = [f"Origin: {proxy.url.removesuffix('/')}"]
+        assert b"<!doctype html>" in http(panel, "/", method="GET", body=b"").body.lower()
+        assert http(panel, more=own).status == 200
+        assert http(panel, token=[], more=own).status == 401
+        with RawWebSocket(panel) as browser:
+            browser.call("stop", {})
+            assert browser.response()["result"]
+        assert status(panel, upgrade(panel, protocols=["era-haptics.v1"])) == b"403"
+        daemon.calls.clear()
+        assert http(panel, more=["Origin: https://evil.example"]).status == 403
+        assert b"lease" not in http(panel, host=["evil.example"]).body
+        assert daemon.calls == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", ["Upgrade", "Connection", "proxy_http_version"])
+def test_page_without_a_header_of_nginx_has_no_websocket(
+    proxy: Proxy, behind: GatewayProcess, line: str
+) -> None:
+    """The page and the methods are there all the same."""
+    with proxied("nginx", proxy, behind, without=line) as panel:
+        assert http(panel).status == 200
+        assert status(panel, upgrade(panel)) == b"403"
+
+
+@pytest.mark.long
+def test_page_without_host_of_nginx_is_served_to_foreign_hosts(
+    proxy: Proxy, behind: GatewayProcess
+) -> None:
+    """The gateway sees the name by which nginx calls it."""
+    for without, expected in (("(?!)", 421), ("Host", 200)):
+        with proxied("nginx", proxy, behind, without=without) as panel:
+            assert http(panel, host=["evil.example"]).status == expected
+
+
+@pytest.mark.long
+def test_page_of_a_proxy_is_foreign_unless_it_is_allowed(
+    daemon: ScriptedDaemon, tmp_path: Path, proxy: Proxy
+) -> None:
+    """Its origin has another scheme than the gateway's own."""
+    with (
+        gateway_process(tmp_path, daemon.socket, "--allow-host", "localhost") as behind,
+        proxied("caddy", proxy, behind) as panel,
+    ):
+        wait_for_daemon(behind)
+        assert http(panel, more=[f"Origin: {proxy.url.removesuffix('/')}"]).status == 403

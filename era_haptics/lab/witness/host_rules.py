@@ -475,10 +475,8 @@ class HostRules:
                 layers = staged if token == request.values["token"] else None
         if request.name in FEEDING:
             self._check_feeding(session, time, request)
-        if request.name == "Arm" and session.is_identified is False:
-            session.report_always(
-                "identified", time, f"{session.name} armed without identification"
-            )
+        if request.name == "Arm":
+            self._check_arm(session, time)
         if request.name == "Set" and layers is not None:
             check_set(session, time, request.values["token"], layers)
             if is_vibrating(*layers):
@@ -558,6 +556,12 @@ class HostRules:
                 "heartbeat", time, f"{session.name}: no heartbeat since {last:.4f} s"
             )
 
+    def _check_arm(self, session: AmplifierSession, time: float) -> None:
+        if session.is_identified is False:
+            session.report_always(
+                "identified", time, f"{session.name} armed without identification"
+            )
+
     def _check_vibrating(
         self, session: AmplifierSession, time: float, layers: Sequence[LayerSet]
     ) -> None:
@@ -598,14 +602,18 @@ class HostRules:
                 session.session, session.last_set = values["session"], None
                 session.silence_sent(time)
             case "Commit" | "Set" if layers is not None and (name == "Commit" or values["now"]):
-                token = values["token"]
-                is_new = token not in session.committed_tokens
-                session.committed_tokens.append(token)
-                session.played.commit(layers, token, time)
-                if is_new:
-                    self._expect_commits(session, time, token)
-                if not session.vibrates(time):
-                    session.last_silenced = time
+                self._note_playing(session, time, values["token"], layers)
+
+    def _note_playing(
+        self, session: AmplifierSession, time: float, token: int, layers: Sequence[LayerSet]
+    ) -> None:
+        is_new = token not in session.committed_tokens
+        session.committed_tokens.append(token)
+        session.played.commit(layers, token, time)
+        if is_new:
+            self._expect_commits(session, time, token)
+        if not session.vibrates(time):
+            session.last_silenced = time
 
     # deadlines
 

@@ -329,11 +329,12 @@ class ApiService:
             )
         contact = self._nearest(params)
         if not effect.is_prepared(effect.level_db_sl if level is None else level):
+            epoch = self._supervisor.operation.epoch  # before, so that a stop meanwhile is seen
             made = effect.for_table(self._table.frequencies)  # its renditions are its own
             work = partial(made.prepare, made.level_db_sl if level is None else level)
             async with self._preparing:
                 await in_thread(work, name="content")
-            epoch, effect = self._supervisor.operation.epoch, made
+            effect = made
             contact = self._nearest(params)
             if self._supervisor.operation.epoch != epoch:
                 raise RpcError(

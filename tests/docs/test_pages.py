@@ -325,7 +325,8 @@ def test_page_lists_every_command_with_its_options() -> None:
         )
         assert set(also) <= common, name
         named = {*own, *also}
-        names = {max(option.opts, key=len) for option in command.params}
+        shown = [each for each in command.params if not getattr(each, "hidden", False)]
+        names = {max(option.opts, key=len) for option in shown}
         options = {name for name in names if name.startswith("--")}
         assert named == options - {"--help"}, name
 

@@ -421,7 +421,8 @@ def test_commands_say_so_and_write_no_rig(
     monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, turned, weekend)
-    typed = command.format(rig=FOLDER / "rig.yaml", file=file, made=made)
+    shutil.copy(FOLDER / "rig.yaml", tmp_path / "rig.yaml")
+    typed = command.format(rig=tmp_path / "rig.yaml", file=file, made=made)
     assert run(typed.split()) != 0
     assert "plate.grain must be width, got length" in "".join(capsys.readouterr())
     assert not made.exists()

@@ -478,7 +478,6 @@ def test_plate_of_another_length_is_refused_by_its_length(
     monkeypatch.setattr(findings, "_SIZES", (0.82, 1.21))
     monkeypatch.setattr(findings, "_FITTED", 3)
     monkeypatch.setattr(findings, "_REFINED", 1)
-    monkeypatch.setattr(findings, "_REFINEMENTS", 3)
     found = measured_by_plates(
         perturbed(larger(consistency_rig, 1.2), frequencies=FREQUENCIES), frequencies=FREQUENCIES
     )

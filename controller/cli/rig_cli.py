@@ -46,7 +46,7 @@ def identify(
             "--output",
             "-o",
             metavar="RIG.fitted.yaml",
-            help="File of the fitted rig, in the folder of RIG or above.",
+            help="File of the fitted rig, best in the folder of RIG.",
         ),
     ],
     url: Annotated[
@@ -135,7 +135,6 @@ def identify(
     from model.estimate.identify import identify as fit
     from model.estimate.measurement import DeviceSettings, measure_by_device
     from model.estimate.rig_check import check_meaning
-    from model.rig.rig_writing import check_beside
     from model.structure.modal_elasticity import check_measurable
 
     settings: DeviceSettings | None = None
@@ -165,7 +164,6 @@ def identify(
         assert rig.document is not None  # noqa: S101  it was read from a file
         source = Path(rig.document.source)
         check_rig_output(output, rig_file, source)
-        check_beside(output, rig)
         if measured_file is None:
             require_untouched(is_known=untouched, has_terminal=not as_json)
         if measured_file is not None:

@@ -119,7 +119,7 @@ def calibrate(
             "--output",
             "-o",
             metavar="RIG.fitted.yaml",
-            help="File of the fitted rig, in the folder of RIG or above.",
+            help="File of the fitted rig, best in the folder of RIG.",
         ),
     ],
     mesh: MeshOption = None,
@@ -147,13 +147,11 @@ def calibrate(
     from model.estimate.measurement import LEAST_SENSORS, read_measured, responses_of
     from model.estimate.rig_check import check_consistency
     from model.rig.rig_file import load_rig
-    from model.rig.rig_writing import check_beside
 
     check_rig_output(output, rig_file, measured_file)
     if picture is not None:
         check_picture(picture)
     rig = load_rig(rig_file, mesh=mesh)
-    check_beside(output, rig)
     responses = responses_of(read_measured(measured_file), rig)
     with Stopwatch() as timed, progress_bar("fits") as progress:
         screened = check_consistency(rig, responses)

@@ -54,19 +54,20 @@ def save_beside(
     """Write the keys of a rig that a command found beside its file, which stays as it is.
 
     document: that the rig was made of; of a fitted one the keys stay where these say nothing else.
-    errors: standard errors by the path of their key. Returns the rig as it reads back. Raises
-    InputError for an output that cannot name the rig's file, OSError if it cannot be written.
+    errors: standard errors by the path of their key. An output that is neither in the folder of the
+    rig's file nor above it cannot name that file: there the whole rig is written. Returns the rig
+    as it reads back. Raises OSError if it cannot be written.
     """
     over = document.over
     base = Path(document.source) if over is None else base_path(over)
     own = {} if over is None else {k: v for k, v in over.data.items() if k not in BASE_KEYS}
     fingerprint = base_fingerprint(document) if over is None else over.data["base_fingerprint"]
-    data = {
-        "base": _beside(output, base),
-        "base_fingerprint": fingerprint,
-        **merged_keys(own, {**keys}, is_final=False),
-    }
-    if errors:
+    name = _beside(output, base)
+    data = merged_keys(document.data, {**keys})
+    if name is not None:
+        changed = merged_keys(own, {**keys}, is_final=False)
+        data = {"base": name, "base_fingerprint": fingerprint, **changed}
+    if errors and name is not None:
         data["standard_errors"] = _nested({path: float(f"{e:.3g}") for path, e in errors.items()})
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{data_text(data)}"
@@ -99,12 +100,6 @@ def save_fitted(
             f"{document.source}: values read back must be those written; write plate and ERAs as "
             "`era config init` does, and try again"
         )
-
-
-def check_beside(output: Path, rig: Rig) -> None:
-    """Raise InputError unless a file at this path can name that of a rig as its base."""
-    document = _document_of(rig)
-    _beside(output, Path(document.source) if document.over is None else base_path(document.over))
 
 
 def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
@@ -173,16 +168,11 @@ def _leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
         yield from _leaves(each, (*path, key))
 
 
-def _beside(output: Path, base: Path) -> str:
-    """The name by which a file at a path names another one in its folder or below it."""
+def _beside(output: Path, base: Path) -> str | None:
+    """The name by which a file names another one in its folder or below it; None elsewhere."""
     folder = output.absolute().parent
-    try:
-        return base.absolute().relative_to(folder).as_posix()
-    except ValueError:
-        raise InputError(
-            f"--output must be in the folder of {base}, which it names, or above it, got {output}; "
-            f"write it to {base.with_name(output.name)}"
-        ) from None
+    place = base.absolute()
+    return place.relative_to(folder).as_posix() if place.is_relative_to(folder) else None
 
 
 def _document_of(rig: Rig) -> Document:

@@ -37,7 +37,7 @@ from model.errors import InputError
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
-from model.rig.rig_writing import check_beside, save_beside
+from model.rig.rig_writing import save_beside
 from registry.plugins import did_you_mean
 
 TONE = 160.0
@@ -227,7 +227,6 @@ def find_outputs(
     rig = load_rig(rig_file)
     if output is not None:
         check_rig_output(output, rig_file)
-        check_beside(output, rig)
     desk = Desk(rig, ())
     desk.check(level)
     count = count or desk.output - 1

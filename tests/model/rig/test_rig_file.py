@@ -27,7 +27,6 @@ from model.rig.rig_file import load_rig, parse_mesh, parse_rig
 from model.rig.rig_summary import RIG as RIG_SUMMARY_RIG
 from model.rig.rig_summary import gain_notes
 from model.rig.rig_writing import (
-    check_beside,
     fitted_keys,
     save_beside,
     save_fitted,
@@ -915,13 +914,13 @@ def test_show_and_merge_of_what_a_fit_found(
     assert after.eras != load_rig(tmp_path / "rig.yaml").eras
 
 
-def test_output_elsewhere_says_where_it_may_be(tmp_path: Path) -> None:
-    """A fitted rig names the file of the rig, which must be beside it or below."""
-    (tmp_path / "out").mkdir()
-    (tmp_path / "in").mkdir()
+def test_an_output_elsewhere_is_a_whole_rig(tmp_path: Path) -> None:
+    """A fitted rig names a file beside it or below; in another folder it has all keys itself."""
+    for name in ("out", "in"):
+        (tmp_path / name).mkdir()
     (tmp_path / "in" / "rig.yaml").write_text(FLOW, "utf-8")
     rig = load_rig(tmp_path / "in" / "rig.yaml")
-    with pytest.raises(InputError, match=r"write it to .*/in/new\.yaml$"):
-        check_beside(tmp_path / "out" / "new.yaml", rig)
-    save_fitted(tmp_path / "new.yaml", rig, other_values(rig), comment="above")
-    assert load_rig(tmp_path / "new.yaml").eras[0].x == 0.00123
+    for place in (tmp_path / "new.yaml", tmp_path / "out" / "new.yaml"):
+        save_fitted(place, rig, other_values(rig), comment="new", errors={("plate", "x"): 1.0})
+        assert load_rig(place).eras[0].x == 0.00123
+        assert ("base: in/rig.yaml" in place.read_text("utf-8")) == (place.parent == tmp_path)

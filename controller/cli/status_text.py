@@ -1,7 +1,6 @@
 """Status and events of the daemon, as commands show them to people."""
 
 from datetime import datetime
-from typing import TYPE_CHECKING
 
 from controller.api.link import Notification
 from controller.api.methods import StatusResult
@@ -15,9 +14,6 @@ from controller.api.schema import (
 from drivers.by_hand.cli import in_words
 from drivers.protocol.definition import READINGS
 from model.quantities import counted
-
-if TYPE_CHECKING:
-    pass
 
 
 def show_event(event: Notification, *, ahead: float) -> str:

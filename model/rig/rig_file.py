@@ -321,7 +321,7 @@ def _given(
     }
 
 
-BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
+_BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
 """Keys of a fitted rig beside those of a rig: they say what it differs from, and how surely."""
 
 _NAMED = ("eras", "supports", "amplifiers")  # sections whose entries a fit takes from the base
@@ -359,7 +359,7 @@ def with_base(document: Document) -> Document:
             f"{name} must have the plate, ERAs, masses and supports, as written, that it had when "
             "they were fitted; undo what was changed there, or fit anew"
         )
-    over = {key: value for key, value in document.data.items() if key not in BASE_KEYS}
+    over = own_keys(document)
     for kind in _NAMED:
         known, given = (each.get(kind) for each in (base.data, over))
         for each in given if isinstance(given, dict) else ():
@@ -372,6 +372,11 @@ def with_base(document: Document) -> Document:
 def base_path(document: Document) -> Path:
     """The rig file that a fitted one names as its base."""
     return Path(document.source).parent / str(document.data["base"])
+
+
+def own_keys(document: Document) -> dict[str, Value]:
+    """The keys of a rig that a fitted file states itself, beside its base."""
+    return {key: value for key, value in document.data.items() if key not in _BASE_KEYS}
 
 
 def base_fingerprint(base: Document) -> str:

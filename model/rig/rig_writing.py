@@ -30,10 +30,10 @@ from model.files.output_paths import check_ending
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig
 from model.rig.rig_file import (
-    BASE_KEYS,
     base_fingerprint,
     base_path,
     merged_keys,
+    own_keys,
     rig_of,
 )
 from model.rig.sections import PlateSection, RigSection
@@ -50,28 +50,38 @@ def save_beside(
     *,
     comment: str,
     errors: Mapping[KeyPath, float] | None = None,
+    expected: Rig | None = None,
 ) -> Rig:
     """Write the keys of a rig that a command found beside its file, which stays as it is.
 
     document: that the rig was made of; of a fitted one the keys stay where these say nothing else.
-    errors: standard errors by the path of their key. An output that is neither in the folder of the
-    rig's file nor above it cannot name that file: there the whole rig is written. Returns the rig
-    as it reads back. Raises OSError if it cannot be written.
+    errors: standard errors by the path of their key. expected: the rig that is to be read back. An
+    output that is neither in the folder of the rig's file nor above it cannot name that file: there
+    the whole rig is written. Returns the rig as it reads back. Raises InputError, before anything
+    is written, where that is another one than expected; OSError if it cannot be written.
     """
     over = document.over
     base = Path(document.source) if over is None else base_path(over)
-    own = {} if over is None else {k: v for k, v in over.data.items() if k not in BASE_KEYS}
-    fingerprint = base_fingerprint(document) if over is None else over.data["base_fingerprint"]
     name = _beside(output, base)
-    data = merged_keys(document.data, {**keys})
-    if name is not None:
+    if name is None:
+        data = merged_keys(document.data, {**keys})
+    else:
+        own = {} if over is None else own_keys(over)
+        known = base_fingerprint(document) if over is None else over.data["base_fingerprint"]
         changed = merged_keys(own, {**keys}, is_final=False)
-        data = {"base": name, "base_fingerprint": fingerprint, **changed}
-    if errors and name is not None:
-        data["standard_errors"] = _nested({path: float(f"{e:.3g}") for path, e in errors.items()})
+        data = {"base": name, "base_fingerprint": known, **changed}
+        if errors:
+            rounded = {path: float(f"{error:.3g}") for path, error in errors.items()}
+            data["standard_errors"] = _nested(rounded)
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
     text = f"{lines}\n{data_text(data)}"
     rig = rig_of(parse_document(str(output), text))
+    section = Validation(document, RigSection).finish()
+    if expected is not None and not _is_same(rig, expected, section):
+        raise InputError(
+            f"{document.source}: values read back must be those written; write plate and ERAs as "
+            "`era config init` does, and try again"
+        )
     with whole_or_nothing(output) as stream:
         stream.write(text.encode())
     return rig
@@ -90,16 +100,9 @@ def save_fitted(
     Written are plate, ERAs, feet, uncertainty and masses that differ. Raises InputError where the
     file reads back with other values.
     """
-    document = _document_of(before)
     keys = fitted_keys(before, after)
-    section = Validation(document, RigSection).finish()
-    back = save_beside(output, document, keys, comment=comment, errors=errors)
-    if not _is_same(back, after, section):
-        output.unlink()
-        raise InputError(
-            f"{document.source}: values read back must be those written; write plate and ERAs as "
-            "`era config init` does, and try again"
-        )
+    document = _document_of(before)
+    save_beside(output, document, keys, comment=comment, errors=errors, expected=after)
 
 
 def fitted_keys(before: Rig, after: Rig) -> dict[str, Any]:
@@ -152,9 +155,7 @@ def fitted_rows(rig: Rig) -> list[tuple[str, Any, Any, float | None]]:
     errors = dict(_leaves(document.over.data.get("standard_errors") or {}))
     return [
         (key_name(path), written.get(path), value, errors.get(path))
-        for path, value in _leaves(
-            {k: v for k, v in document.over.data.items() if k not in BASE_KEYS}
-        )
+        for path, value in _leaves(own_keys(document.over))
         if value != written.get(path)
     ]
 

@@ -351,15 +351,13 @@ class AsyncClient:
         Returns its result as parsed JSON, with the keys of a later daemon.
         """
 
+        is_once = method in METHODS and not METHODS[method].is_repeated
+
         async def attempt() -> Any:
-            return await self._exchange(await self._connected(), method, params)
+            link = await (self._repeated(self._connected) if is_once else self._connected())
+            return await self._exchange(link, method, params)
 
-        async def once() -> Any:
-            return await self._exchange(await self._repeated(self._connected), method, params)
-
-        if method in METHODS and not METHODS[method].is_repeated:
-            return await self._within_timeout(once())
-        after = Unreachable if method == "stop" else ConnectionLost
+        after = () if is_once else Unreachable if method == "stop" else ConnectionLost
         return await self._within_timeout(self._repeated(attempt, after=after))
 
     async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:

@@ -7,7 +7,7 @@ number of keys are bounded before anything is parsed.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -23,6 +23,7 @@ _MAX_ERROR_TEXT = 600  # characters of an error's message
 
 Id: TypeAlias = int | str | None
 _MessageT = TypeVar("_MessageT", bound=ApiMessage)
+_ModelT = TypeVar("_ModelT", bound=BaseModel)
 
 
 class ErrorCode(IntEnum):
@@ -131,32 +132,49 @@ class Request(BaseModel):
 def read_request(line: bytes) -> Request:
     """Read one line; raises InvalidRequest."""
     document = parse_json(line)
-    unknown = _first_unknown(Request, document) if isinstance(document, dict) else None
-    try:
-        return Request.model_validate(document if unknown is None else {unknown: None})
-    except ValidationError as error:
-        raise InvalidRequest(
+    return _validated(
+        Request,
+        document,
+        lambda _, problem: InvalidRequest(
             ErrorCode.INVALID_REQUEST,
-            f"not a JSON-RPC 2.0 request: {_first_problem(error, key=unknown)[1]}",
+            f"not a JSON-RPC 2.0 request: {problem}",
             remedy='send {"jsonrpc": "2.0", "id": 1, "method": ..., "params": {...}}; no batches',
             id=_readable_id(document),
-        ) from error
+        ),
+    )
 
 
 def read_params(model: type[_MessageT], request: Request) -> _MessageT:
     """Validate the parameters of a request; raises RpcError."""
-    unknown = _first_unknown(model, request.params)
-    try:
-        params = request.params if unknown is None else {unknown: None}
-        return model.model_validate(params)
-    except ValidationError as error:
-        key, problem = _first_problem(error, key=unknown)
-        raise RpcError(
+    return _validated(
+        model,
+        request.params,
+        lambda key, problem: RpcError(
             ErrorCode.INVALID_PARAMS,
             f"{request.method}: {problem}",
             where=key,
             remedy="see the method in docs/reference/api.md",
-        ) from error
+        ),
+    )
+
+
+def _validated(
+    model: type[_ModelT], content: Any, refusal: Callable[[str | None, str], RpcError]
+) -> _ModelT:
+    """Validate a message, or raise its refusal by key and description of the first problem.
+
+    Of many unknown keys the first alone is described, in bounded time; no input is quoted.
+    """
+    keys = content if isinstance(content, dict) else ()
+    unknown = [key for key in keys if key not in model.model_fields][:1]
+    try:
+        return model.model_validate(dict.fromkeys(unknown) if unknown else content)
+    except ValidationError as error:
+        problems = error.errors(include_url=False, include_context=False, include_input=False)
+        problem = next((each for each in problems if each["loc"] == (*unknown,)), problems[0])
+        name = _printable(".".join(str(part) for part in problem["loc"]))
+        text = reworded(problem["msg"])
+        raise refusal(name or None, f"{name}: {text}" if name else text) from error
 
 
 def unknown_method(method: str, known: Iterable[str]) -> RpcError:
@@ -254,26 +272,12 @@ def parse_json(line: bytes) -> Any:
     return document
 
 
-def _first_unknown(model: type[BaseModel], content: Mapping[str, Any]) -> str | None:
-    """The first unknown key, so that of many one is described, in bounded time; or None."""
-    return next((key for key in content if key not in model.model_fields), None)
-
-
 def _readable_id(document: object) -> Id:
     """The id of a document that is not a request, if it has one."""
     try:
         return _REQUEST_ID.validate_python(document["id"] if isinstance(document, dict) else None)
     except (KeyError, ValidationError):
         return None
-
-
-def _first_problem(error: ValidationError, *, key: str | None = None) -> tuple[str | None, str]:
-    """Key and description of the first problem (of a key), without quoting the input."""
-    problems = error.errors(include_url=False, include_context=False, include_input=False)
-    problem = next((each for each in problems if each["loc"] == (key,)), problems[0])
-    name = _printable(".".join(str(part) for part in problem["loc"]))
-    text = reworded(problem["msg"])
-    return name or None, f"{name}: {text}" if name else text
 
 
 def _printable(name: str) -> str:

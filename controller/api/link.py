@@ -15,8 +15,8 @@ import pwd
 import socket
 import struct
 import tempfile
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
@@ -79,28 +79,52 @@ class Notification:
     data: Mapping[str, Any]
 
 
+@contextmanager
+def _expected() -> Iterator[None]:
+    """Raise Unreachable where what the daemon has sent is of another form than expected."""
+    try:
+        yield
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise Unreachable(
+            "the daemon sent a line that this program does not understand; update the older of the "
+            "two"
+        ) from error
+
+
+@_expected()
 def read_line(line: bytes) -> Mapping[str, Any] | Notification:
     """Read a line of a daemon, a response or an event; raises Unreachable for what is neither."""
-    try:
-        content: dict[str, Any] = json.loads(line)
-        if content.get("method") != "event":
-            content["id"]  # None: of a request that could not be read
-            return content
-        params = content["params"]
-        return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
-    except (ValueError, AttributeError, KeyError, TypeError) as error:
-        raise _not_understood() from error
+    content: dict[str, Any] = json.loads(line)
+    if content.get("method") != "event":
+        content["id"]  # None: of a request that could not be read
+        return content
+    params = content["params"]
+    return Notification(params["topic"], params["time_s"], params["lost"], params["data"])
 
 
+@_expected()
 def result_of(response: Any) -> Any:
     """The result of a response; raises the RpcError that it holds instead."""
-    try:
-        if "error" not in response:
-            return response["result"]
-        error = read_error(response["error"])
-    except (AttributeError, KeyError, TypeError, ValueError) as problem:
-        raise _not_understood() from problem
-    raise error
+    if "error" in response:
+        raise read_error(response["error"])
+    return response["result"]
+
+
+@_expected()
+def read_result(result: object, model: type[_MessageT]) -> _MessageT:
+    """Validate a result, ignoring unknown keys; raises Unreachable."""
+    return model.model_validate_json(json.dumps(result), extra="ignore")
+
+
+@_expected()
+def check_version(hello: Any, path: Path) -> None:
+    """Check the daemon's major version in the result of `hello`; raises Unreachable."""
+    version: str = hello["api_version"]
+    if version.partition(".")[0] != API_VERSION.partition(".")[0]:
+        raise Unreachable(
+            f"the daemon at {path} speaks version {version:.20} of the API, this program "
+            f"{API_VERSION}; update the older of the two"
+        )
 
 
 def make_params(method: str, **values: object) -> ApiMessage:
@@ -119,8 +143,10 @@ def touches_at(positions: Iterable[tuple[float, float]]) -> list[TouchPoint]:
         raise InputError(
             f"touch: positions must be a list of x, y in metres, got {shown(positions)}"
         )
-    points = [as_position(position) for position in positions]
-    return [TouchPoint(id=id, x_m=x, y_m=y) for id, (x, y) in enumerate(points, start=1)]
+    return [
+        TouchPoint(id=id, x_m=x, y_m=y)
+        for id, (x, y) in enumerate(map(as_position, positions), start=1)
+    ]
 
 
 def as_position(position: object) -> tuple[float, float]:
@@ -134,32 +160,6 @@ def as_position(position: object) -> tuple[float, float]:
     raise InputError(
         "a finger's position must be x, y in metres from the plate's south-west corner, such as "
         f"(0.10, 0.05), got {got}"
-    )
-
-
-def read_result(result: object, model: type[_MessageT]) -> _MessageT:
-    """Validate a result, ignoring unknown keys; raises Unreachable."""
-    try:
-        return model.model_validate_json(json.dumps(result), extra="ignore")
-    except ValidationError as error:
-        raise _not_understood() from error
-
-
-def check_version(hello: object, path: Path) -> None:
-    """Check the daemon's major version in the result of `hello`; raises Unreachable."""
-    version = hello.get("api_version") if isinstance(hello, dict) else None
-    if not isinstance(version, str):
-        raise _not_understood()
-    if version.partition(".")[0] != API_VERSION.partition(".")[0]:
-        raise Unreachable(
-            f"the daemon at {path} speaks version {version:.20} of the API, this program "
-            f"{API_VERSION}; update the older of the two"
-        )
-
-
-def _not_understood() -> Unreachable:
-    return Unreachable(
-        "the daemon sent a line that this program does not understand; update the older of the two"
     )
 
 
@@ -223,10 +223,13 @@ def check_peer(
     credentials = credentials_of(connected)
     if credentials is not None:
         owners["process"] = credentials[1]
-    trusted = {0, os.geteuid(), _uid(service)}
+    trusted = {0, os.geteuid(), getattr(_account(pwd.getpwnam, service), "pw_uid", None)}
     if len(set(owners.values())) == 1 and set(owners.values()) <= trusted:
         return
-    found = ", ".join(f"its {what} belongs to {_name(uid)}" for what, uid in owners.items())
+    found = ", ".join(
+        f"its {what} belongs to {getattr(_account(pwd.getpwuid, uid), 'pw_name', f'user {uid}')}"
+        for what, uid in owners.items()
+    )
     raise Unreachable(
         f"{path} must belong, with its folder and process, to root, to you, or to the service's "
         f"user {service}, but {found}; give another socket, or name the service's user in "
@@ -244,19 +247,12 @@ def credentials_of(connected: socket.socket) -> tuple[int, int] | None:
     return process, user
 
 
-def _uid(user: str) -> int | None:
-    """The id of a user by name, or None."""
+def _account(find: Callable[[Any], pwd.struct_passwd], user: str | int) -> Any:
+    """The account of a user by name or id, or None."""
     try:
-        return pwd.getpwnam(user).pw_uid
+        return find(user)
     except KeyError:
         return None
-
-
-def _name(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"user {uid}"
 
 
 _QUEUE_INTERVAL = 0.002  # s
@@ -286,18 +282,25 @@ class DaemonLink:
         Raises InputError for the name, RpcError and Unreachable.
         """
         params = make_params("hello", client=name).model_dump_json()
+        connecting = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        connecting.setblocking(False)
         link: Self | None = None
         try:
             async with asyncio.timeout(RESPONSE_TIMEOUT):  # the daemon's queue may be full
-                connected = await connected_socket(path)
-                link = cls(path, *await asyncio.open_unix_connection(sock=connected))
+                while True:  # asyncio would take a full queue for a connection in progress
+                    try:
+                        connecting.connect(str(path))
+                        break
+                    except BlockingIOError:
+                        await asyncio.sleep(_QUEUE_INTERVAL)
+                check_peer(path, connecting)
+                link = cls(path, *await asyncio.open_unix_connection(sock=connecting))
                 link.write(request_line(name, "hello", params.encode()))
                 link.hello = await link.next_line()
             check_version(result_of(read_line(link.hello)), path)
         except BaseException as error:
-            if link is not None:
-                link.abort()
-            if isinstance(error, TimeoutError):
+            connecting.close() if link is None else link.abort()
+            if isinstance(error, OSError) and not isinstance(error, Unreachable):
                 raise Unreachable.at(path, error) from error
             raise
         return link
@@ -345,26 +348,3 @@ class DaemonLink:
         """Close at once; the daemon lifts this client's fingers."""
         self._is_closed = True
         self._writer.transport.abort()
-
-
-async def connected_socket(path: Path) -> socket.socket:
-    """Connect to a daemon that is to be believed, however full its queue; raises Unreachable.
-
-    asyncio would take a full queue for a connection in progress.
-    """
-    connecting = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connecting.setblocking(False)
-    try:
-        while True:
-            try:
-                connecting.connect(str(path))
-            except BlockingIOError:
-                await asyncio.sleep(_QUEUE_INTERVAL)
-            else:
-                check_peer(path, connecting)
-                return connecting
-    except BaseException as error:
-        connecting.close()
-        if isinstance(error, OSError) and not isinstance(error, Unreachable):
-            raise Unreachable.at(path, error) from error
-        raise

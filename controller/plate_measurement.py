@@ -34,7 +34,7 @@ from model.arrays import ComplexArray, FloatArray, best_first, best_of
 from model.ensemble.draws import MAX_HELD
 from model.errors import InputError
 from model.estimate.forward import Sensor
-from model.estimate.measurement import MeasuredPlate, Measurement, Repeat, Responses
+from model.estimate.measurement import Measurement, Repeat
 from model.processes import Progress, unseen
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Channel, Rig
@@ -54,6 +54,23 @@ _SETTLING = (0.2, 1.0)  # s, least and most
 
 Step = tuple[tuple[int, float], ...]
 """Number of each ERA that plays, and its frequency [Hz]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPlate:
+    """A measurement and the circumstances in which it was made."""
+
+    measurement: Measurement
+    level: float | None
+    """Level of what was played, 0..1 of full stroke, None if unknown."""
+    duration: float | None
+    """Duration [s], None if unknown."""
+    sensors: tuple[Mapping[str, object], ...]
+    """The sensors used, for programs."""
+    notes: tuple[str, ...]
+    """Lines for people."""
+    details: Mapping[str, object]
+    """Further keys and values for programs."""
 
 
 @dataclass(frozen=True)
@@ -491,7 +508,7 @@ class PlateSelfMeasurement:
             for era in np.flatnonzero(np.isfinite(each.frequencies)):
                 row = np.searchsorted(frequencies, each.frequencies[era])
                 values[row, :, era] = each.responses[:, era]
-        measurement = Measurement.of([each.place for each in sensors], frequencies, values)
+        measurement = Measurement([each.place for each in sensors], frequencies, values)
         loudest, at_half = half
         return replace(
             measurement,
@@ -553,18 +570,17 @@ def checked_level(rig: Rig, level: float | None) -> float:
     return level
 
 
-def observation_of(measurement: Measurement, rig: Rig) -> Responses:
-    """Responses to the channels of a rig one by one, from those to interleaved tones.
+def observation_of(measurement: Measurement, rig: Rig) -> Measurement:
+    """A measurement by interleaved tones as a rig check takes it, with all sensors at points.
 
     Raises InputError for a plate that was not linear or has changed meanwhile.
     """
     measurement.check()
-    sensors = measurement.sensors
-    places = [rig.era(each.era) if each.era else each for each in sensors]
-    return Responses(
-        tuple(each.name for each in sensors),
-        np.array([(each.x, each.y) for each in places]),
-        measurement.frequencies,
-        measurement.values.swapaxes(1, 2),
+    eras = [rig.era(each.era) if each.era else each for each in measurement.sensors]
+    places = zip(measurement.sensors, eras, strict=True)
+    return replace(
+        measurement,
+        sensors=tuple(replace(each, era="", x=at.x, y=at.y) for each, at in places),
+        errors=None,
         has_phases=not measurement.drives_lag,
     )

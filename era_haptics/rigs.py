@@ -11,7 +11,7 @@ from era_haptics.drive import Played, expect_rig, layers_of
 from model.errors import InputError, expect_path, shown
 from model.estimate.calibrate import Calibration
 from model.estimate.calibrate import calibrate as fit
-from model.estimate.measurement import read_measured, responses_of
+from model.estimate.measurement import measurement_of, read_measured
 from model.estimate.rig_check import check_consistency
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
@@ -122,6 +122,6 @@ def calibrate(
     """
     expect_rig(rig)
     check_progress(progress)
-    responses = responses_of(read_measured(expect_path(measured, what="measured")), rig)
+    responses = measurement_of(read_measured(expect_path(measured, what="measured")), rig)
     screened = check_consistency(rig, responses)
     return fit(rig, responses, screened, all_scales=all_scales, progress=progress)

@@ -16,7 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from model.arrays import FloatArray
-from model.estimate.measurement import Responses, write_responses_csv, write_responses_uff
+from model.estimate.measurement import (
+    Measurement,
+    sensors_at,
+    write_responses_csv,
+    write_responses_uff,
+)
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -83,7 +88,7 @@ def scanning_grid(plate: Plate, nx: int, ny: int, *, like: Accelerometer) -> lis
 
 def record_responses(
     rig: Rig, sensors: Sequence[Accelerometer], frequencies: FloatArray, *, seed: int = 0
-) -> Responses:
+) -> Measurement:
     """Measure a rig's plate in time: each ERA at each frequency [Hz], once it has settled.
 
     Structural damping is the viscous equivalent of `model.reduction.reduced_plate`.
@@ -97,7 +102,7 @@ def record_responses(
     shapes = reduced.at(positions(sensors))
     plant = Plant(reduced, rig.eras, loads=rig.masses)
     rng = np.random.default_rng(seed)
-    values = np.empty((len(frequencies), len(rig.eras), len(sensors)), dtype=complex)
+    values = np.empty((len(frequencies), len(sensors), len(rig.eras)), dtype=complex)
     for number, era in enumerate(rig.eras):
         for row, frequency in enumerate(frequencies.tolist()):
             start, omega, base = plant.time, 2 * math.pi * frequency, 0.1 * era.stroke
@@ -107,10 +112,11 @@ def record_responses(
             plant.skip(start + SETTLE)
             times, truth = plant.advance(start + SETTLE + RECORD, sample_rate=RATE, shapes=shapes)
             read = readings(sensors, truth, sample_rate=RATE, rng=rng)
-            values[row, number] = fit_tones(times, read, [frequency], with_offset=True)[0] / base
+            values[row, :, number] = fit_tones(times, read, [frequency], with_offset=True)[0] / base
         plant.set_input(number, [])
     names = tuple(sensor.name for sensor in sensors)
-    return Responses(names, positions(sensors), np.asarray(frequencies, dtype=float), values)
+    places = sensors_at(positions(sensors), names)
+    return Measurement(places, np.asarray(frequencies, dtype=float), values)
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from benchmarks.setting import RIG
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.fit import gains_of as best_gains
 from model.estimate.fit import row_rms, sensed_plate
-from model.estimate.measurement import Responses, write_responses_csv
+from model.estimate.measurement import Measurement, sensors_at, write_responses_csv
 from model.fem import ELEMENTS, Mesh, PlateMatrices, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -156,7 +156,7 @@ def measure(
     frequencies: FloatArray = FREQUENCIES,
     noise: float = 0.01,
     count: int = 12,
-) -> Responses:
+) -> Measurement:
     """Measure with sensors where the rig's owner believes them; noise of each row's rms.
 
     count: of the sensors that are used, far from each other.
@@ -168,7 +168,8 @@ def measure(
     white = rng.standard_normal(values.shape) + 1j * rng.standard_normal(values.shape)
     names = tuple(f"P{number + 1}" for number in some)
     points = sensors[some] * [rig.plate.length, rig.plate.width]
-    return Responses(names, points, frequencies, values + noise * size * white / np.sqrt(2))
+    heard = values + noise * size * white / np.sqrt(2)
+    return Measurement(sensors_at(points, names), frequencies, heard.swapaxes(1, 2))
 
 
 def true_values(rig: Rig) -> list[float]:
@@ -199,7 +200,8 @@ def field_deviations(rig: Rig, true: ComplexArray) -> FloatArray:
     points = FIELD_POINTS * [rig.plate.length, rig.plate.width]
     frequencies = np.array([row[0] for row in rig.eras[0].gains])
     true = true.swapaxes(1, 2)
-    fields = gains_of(rig)[:, None] * sensed_plate(rig, points, frequencies).responses()
+    plate = sensed_plate(rig, sensors_at(points), frequencies)
+    fields = gains_of(rig)[:, None] * plate.responses()
     gains = best_gains(fields, true)
     left = true - gains[:, None] * fields
     off, known = np.log(gains), rig.uncertainty

@@ -19,7 +19,7 @@ from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.measurement import Responses, read_measured, responses_of
+from model.estimate.measurement import Measurement, measurement_of, read_measured
 from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -29,7 +29,7 @@ _NORMAL = 1.645  # standard errors either side: 90 %
 
 
 def deviations(
-    rig: Rig, responses: Responses, truth: dict[str, list[float]]
+    rig: Rig, responses: Measurement, truth: dict[str, list[float]]
 ) -> dict[str, tuple[FloatArray, float]]:
     """Errors in standard errors by kind of value, and the standard error, relative."""
     found = calibrate(rig, responses, check_consistency(rig, responses))
@@ -67,7 +67,7 @@ def main(count: int, share: float) -> None:
                 measured = read_measured(Path(name) / f"{seed}.csv")
                 truth = json.loads((Path(name) / f"{seed}.json").read_text())
                 try:
-                    found = deviations(rig, responses_of(measured, rig), truth)
+                    found = deviations(rig, measurement_of(measured, rig), truth)
                 except InputError as error:
                     refused += 1
                     print(f"plate {seed} refused: {error}", flush=True)

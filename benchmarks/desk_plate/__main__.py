@@ -78,7 +78,7 @@ def desk_plate(
     from benchmarks.desk_plate.jack_plate import JackPlate
     from benchmarks.desk_plate.sensing import Converters
     from benchmarks.desk_plate.truth import MESH, as_built, draw_truth
-    from model.estimate.measurement import read_sensors
+    from era_haptics.lab.measuring.sound_card import read_sensors
     from model.rig.rig_file import load_rig
     from sim.soft_amp.jack import JackClient
 

@@ -9,10 +9,9 @@ from benchmarks.desk_plate.lifted_blocks import SAMPLES, LiftedBlocks, sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
-from era_haptics.lab.measuring.sound_card import Desk
+from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, are_places
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.measurement import WiredSensor, are_places
 from model.finger import fingertips_on
 from model.structure.attachments import FingertipLoad, fingertip_loads
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from era_haptics.lab.measuring.sound_card import WiredSensor
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.measurement import WiredSensor
 
 _ORDER = 4
 _CORNER = 0.42  # of the sample rate; anti-aliasing filters of converters pass all of the audio band

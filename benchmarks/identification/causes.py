@@ -19,7 +19,7 @@ from benchmarks.identification.tables import PAGE
 from benchmarks.identification.thin_plate import Complexes
 from benchmarks.page import write_parts
 from benchmarks.setting import RIG, use_one_thread
-from model.estimate.measurement import Responses
+from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.rig_check import Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -91,7 +91,7 @@ FAULTS = {
 """Faults by name."""
 
 
-def measured(fault: Fault, seed: int) -> Responses:
+def measured(fault: Fault, seed: int) -> Measurement:
     """Responses of a hidden plate with a fault."""
     rng = np.random.default_rng([seed, 93])
     mounted, size = draw(fault.kind, seed).mounted, np.array([LENGTH, WIDTH])
@@ -116,7 +116,7 @@ def measured(fault: Fault, seed: int) -> Responses:
     white = rng.standard_normal((2, *values.shape))
     values = values + NOISE * rms * (white[0] + 1j * white[1]) / np.sqrt(2)
     names = tuple(f"P{number}" for number in range(1, 1 + len(SENSORS)))
-    return Responses(names, SENSORS, FREQUENCIES, values)
+    return Measurement(sensors_at(SENSORS, names), FREQUENCIES, values.swapaxes(1, 2))
 
 
 def verdict_on(rig: Rig, name: str, seed: int) -> Verdict:

@@ -23,7 +23,7 @@ from benchmarks.page import write_parts
 from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
-from model.estimate.measurement import Responses
+from model.estimate.measurement import Measurement
 from model.estimate.rig_check import SENSORS, Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -70,7 +70,7 @@ def in_contact(own: Any, share: float) -> HalfGlued:
 class Mistake:
     """A mistake: what it does, and whether a verdict says so; both by the number of an exciter.
 
-    mount: of an exciter, by the board's seed; change: of the values (f, e, s).
+    mount: of an exciter, by the board's seed; change: of the values (f, s, e).
     """
 
     is_named: Callable[[Verdict, int], bool]
@@ -93,14 +93,14 @@ def _acts_less(verdict: Verdict, exciter: int) -> bool:
 
 def _negated(values: ComplexArray, *, exciter: int | slice, place: int | slice) -> ComplexArray:
     changed = values.copy()
-    changed[:, exciter, place] *= -1
+    changed[:, place, exciter] *= -1
     return changed
 
 
 def _swapped(values: ComplexArray, exciter: int) -> ComplexArray:
-    order = [*range(values.shape[1])]
+    order = [*range(values.shape[2])]
     order[exciter], order[exciter - 1] = order[exciter - 1], order[exciter]
-    return values[:, order]
+    return values[:, :, order]
 
 
 def _mistakes() -> Iterator[tuple[str, Mistake]]:
@@ -145,7 +145,7 @@ def _mistakes() -> Iterator[tuple[str, Mistake]]:
 MISTAKES = dict(_mistakes())
 
 
-def measured(rig: Rig, mistake: Mistake, seed: int) -> Responses:
+def measured(rig: Rig, mistake: Mistake, seed: int) -> Measurement:
     """What the sensor reads of a board with a mistake."""
     built, who = BuiltBoard.drawn(rig, seed), seed % len(rig.eras)
     eras = [*built.rig.eras]

@@ -120,7 +120,7 @@ def _measurement(hidden: Hidden, rig: Rig, seed: int, rounds: int, count: int) -
     played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(len(rig.eras))) % 4 < rounds
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     sensors += [Sensor(f"inside {n}", x=x, y=y) for n, (x, y) in enumerate(INSIDE.tolist())]
-    return Measurement.of(sensors[:count], FREQUENCIES, np.where(played[:, None], values, np.nan))
+    return Measurement(sensors[:count], FREQUENCIES, np.where(played[:, None], values, np.nan))
 
 
 def _felt(

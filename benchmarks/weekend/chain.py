@@ -28,11 +28,12 @@ from benchmarks.calibration.hidden_plates import FORM
 from benchmarks.page import write_parts
 from benchmarks.setting import random_contacts, use_one_thread
 from benchmarks.weekend.boards import EDGE, LEVEL_DB_SL, PAGE, ROOT, SEED, sensed
+from era_haptics.lab.measuring.sound_card import WiredSensor, read_sensors
 from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.calibrate import calibrate
-from model.estimate.measurement import Responses, WiredSensor, read_sensors, write_responses
+from model.estimate.measurement import Measurement, write_responses
 from model.estimate.rig_check import check_consistency
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -86,7 +87,7 @@ class BuiltBoard:
         masses = [*self.rig.masses, *loads]
         return self.free.acceleration(self.rig.eras, frequencies, points, loads=masses)
 
-    def measured(self, frequencies: FloatArray, seed: int) -> Responses:
+    def measured(self, frequencies: FloatArray, seed: int) -> Measurement:
         """Responses by one sensor that is moved, with its noise."""
         places = sensor_places(self.rig)
         found = np.concatenate(
@@ -102,13 +103,8 @@ class BuiltBoard:
         found /= np.array([each.full_level for each in self.rig.eras])[:, None]
         rms = np.sqrt((np.abs(found) ** 2).mean(axis=(0, 1)))
         real, imaginary = np.random.default_rng([SEED, seed, 1]).standard_normal((2, *found.shape))
-        return Responses(
-            tuple(at.name for at in places),
-            np.array([[at.x, at.y] for at in places]),
-            frequencies,
-            found + NOISE * rms * (real + 1j * imaginary),
-            masses=np.array([at.mass for at in places]),
-        )
+        heard = found + NOISE * rms * (real + 1j * imaginary)
+        return Measurement([at.place for at in places], frequencies, heard.swapaxes(1, 2))
 
     @property
     def exactly_known(self) -> Rig:
@@ -163,7 +159,7 @@ class Touch:
     exact: float
 
 
-def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Responses]:
+def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Measurement]:
     """Build a board and measure it."""
     built = BuiltBoard.drawn(rig, seed)
     lines = np.arange(rig.limits.frequency_min + 1, rig.limits.frequency_max, 10.0)

@@ -47,8 +47,8 @@ from benchmarks.weekend.chain import (
 from controller.api.client import Client
 from controller.api.link import LeaseLost
 from controller.api.methods import StatusResult
+from era_haptics.lab.measuring.sound_card import WiredSensor
 from model.arrays import FloatArray
-from model.estimate.measurement import WiredSensor
 from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_writing import save_rig

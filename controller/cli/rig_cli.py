@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
@@ -21,8 +22,12 @@ from model.errors import InputError
 from model.quantities import counted
 
 if TYPE_CHECKING:
-    from model.estimate.measurement import MeasuredPlate, Responses
+    from controller.plate_measurement import MeasuredPlate
+    from model.estimate.measurement import Measurement
     from model.rig.rig import Rig
+
+_BY_CARD = "era_haptics.lab.measuring.measure:measure_plate"
+"""Named, not imported: the controller does not depend on the lab."""
 
 _NOT_EXPLAINED = (
     "chi² must be at most 2 for a plate that the model explains; no rig is written. Check that "
@@ -133,11 +138,9 @@ def identify(
     from model.estimate import identify as identification_report
     from model.estimate.identify import expected_contrast, standard_errors
     from model.estimate.identify import identify as fit
-    from model.estimate.measurement import DeviceSettings, measure_by_device
     from model.estimate.rig_check import check_meaning
     from model.structure.modal_elasticity import check_measurable
 
-    settings: DeviceSettings | None = None
     if measured_file is not None:
         played = {"--url": url, "--level": level, "--quick": quick or None, "--device": device}
         _refuse(played, rule="plays; leave it out beside --measured")
@@ -151,14 +154,7 @@ def identify(
         )
         if sensors_file is None:
             raise InputError("--device needs --sensors, a file of the accelerometers")
-        settings = DeviceSettings(
-            device,
-            sensors_file,
-            parse_frequencies(frequencies) if frequencies else None,
-            level,
-            periods or 2,
-            seed,
-        )
+    tones = parse_frequencies(frequencies) if frequencies else None
     with rig_of_file(rig_file) as rig:
         check_measurable(rig.plate)
         assert rig.document is not None  # noqa: S101  it was read from a file
@@ -168,9 +164,18 @@ def identify(
             require_untouched(is_known=untouched, has_terminal=not as_json)
         if measured_file is not None:
             measured = _measured_before(measured_file, rig)
-        elif settings is not None:
+        elif device is not None:
             with progress_bar("runs") as progress:
-                measured = measure_by_device(rig, settings, progress=progress)
+                measured = resolve_name(_BY_CARD)(
+                    rig,
+                    device,
+                    sensors_file,
+                    frequencies=tones,
+                    level=level,
+                    periods=periods or 2,
+                    seed=seed,
+                    progress=progress,
+                )
         else:
             measured = measured_by_amplifiers(rig, url or [], level=level, is_quick=quick)
     started = time.perf_counter()
@@ -218,20 +223,23 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     """Responses of a file, where they are what they claim to be; raises InputError."""
     import numpy as np
 
-    from model.estimate.measurement import MeasuredPlate, read_measured, responses_of
+    from controller.plate_measurement import MeasuredPlate
+    from model.estimate.measurement import measurement_of, read_measured
     from model.estimate.rig_check import check_consistency
 
-    responses = responses_of(read_measured(path), rig)
-    screened = check_consistency(rig, responses)
-    dead = [*compress(responses.sensors, screened.dead_sensors)]
-    live = responses.without(screened.dead_sensors)
-    live = replace(live, values=np.where(screened.dead_eras[:, None], np.nan, live.values))
-    places = zip(live.sensors, live.points.tolist(), live.sensor_masses.tolist(), strict=True)
+    measured = measurement_of(read_measured(path), rig)
+    screened = check_consistency(rig, measured)
+    dead = [*compress(measured.names, screened.dead_sensors)]
+    live = measured.without(screened.dead_sensors)
+    live = replace(live, values=np.where(screened.dead_eras, np.nan, live.values))
     return MeasuredPlate(
-        live.as_measurement(),
+        live,
         None,
         None,
-        tuple({"sensor": n, "x_m": x, "y_m": y, "mass_g": 1e3 * m} for n, (x, y), m in places),
+        tuple(
+            {"sensor": each.name, "x_m": each.x, "y_m": each.y, "mass_g": 1e3 * each.mass}
+            for each in live.sensors
+        ),
         tuple(f"{name} has no signal, left out" for name in dead),
         {"values_beyond_limits": live.skipped},
     )
@@ -514,7 +522,7 @@ def check(
 
 def _measured(
     rig_file: Path, urls: list[str], *, level: float | None, is_untouched: bool, has_terminal: bool
-) -> "tuple[Rig, MeasuredPlate, Responses]":
+) -> "tuple[Rig, MeasuredPlate, Measurement]":
     """Measure the plate by the sensors of its amplifiers."""
     from controller.plate_measurement import observation_of
     from model.structure.modal_elasticity import check_measurable
@@ -526,10 +534,10 @@ def _measured(
     return rig, plate, observation_of(plate.measurement, rig)
 
 
-def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Responses]":
+def _read(measured: Path, rig_file: Path, *, mesh: str | None) -> "tuple[Rig, Measurement]":
     """Read what was measured from a file."""
-    from model.estimate.measurement import read_measured, responses_of
+    from model.estimate.measurement import measurement_of, read_measured
     from model.rig.rig_file import load_rig
 
     rig = load_rig(rig_file, mesh=mesh)
-    return rig, responses_of(read_measured(measured), rig)
+    return rig, measurement_of(read_measured(measured), rig)

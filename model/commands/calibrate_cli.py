@@ -144,7 +144,7 @@ def calibrate(
         gain_rows,
         standard_errors,
     )
-    from model.estimate.measurement import LEAST_SENSORS, read_measured, responses_of
+    from model.estimate.measurement import LEAST_SENSORS, measurement_of, read_measured
     from model.estimate.rig_check import check_consistency
     from model.rig.rig_file import load_rig
 
@@ -152,10 +152,10 @@ def calibrate(
     if picture is not None:
         check_picture(picture)
     rig = load_rig(rig_file, mesh=mesh)
-    responses = responses_of(read_measured(measured_file), rig)
+    measurement = measurement_of(read_measured(measured_file), rig)
     with Stopwatch() as timed, progress_bar("fits") as progress:
-        screened = check_consistency(rig, responses)
-        calibration = fit(rig, responses, screened, all_scales=all_scales, progress=progress)
+        screened = check_consistency(rig, measurement)
+        calibration = fit(rig, measurement, screened, all_scales=all_scales, progress=progress)
     rows = change_rows(calibration)
     notes = [*finding_rows(calibration), *check_rows(calibration)]
     refusal = None
@@ -177,12 +177,12 @@ def calibrate(
         save_figure(calibration_figure(calibration), picture)
         files.append(str(picture))
     heading = (
-        f"{measured_file}: {counted(len(responses.sensors), 'sensor')}, "
-        f"{counted(len(responses.frequencies), 'frequency', plural='frequencies')} "
-        f"from {responses.frequencies[0]:g} to {responses.frequencies[-1]:g} Hz, "
-        f"{counted(responses.count, 'value')}"
+        f"{measured_file}: {counted(len(measurement.sensors), 'sensor')}, "
+        f"{counted(len(measurement.frequencies), 'frequency', plural='frequencies')} "
+        f"from {measurement.frequencies[0]:g} to {measurement.frequencies[-1]:g} Hz, "
+        f"{counted(measurement.count, 'value')}"
     )
-    report = calibration_json(calibration, rig) | {"values_beyond_limits": responses.skipped}
+    report = calibration_json(calibration, rig) | {"values_beyond_limits": measurement.skipped}
     finish(
         [heading, "", *rows, *gain_rows(calibration), "", *notes],
         report if as_json else None,

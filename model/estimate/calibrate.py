@@ -40,7 +40,7 @@ from model.estimate.fit import (
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
     LEAST_SENSORS,
-    Responses,
+    Measurement,
     Screening,
     check_enough_sensors,
 )
@@ -245,7 +245,7 @@ class Calibration:
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors with a signal (s,)."""
-        return tuple(sensor.name for sensor in self.fit.measurement.sensors)
+        return self.fit.measurement.names
 
     @property
     def frequencies(self) -> FloatArray:
@@ -546,7 +546,7 @@ class Calibration:
 
 def calibrate(
     rig: Rig,
-    responses: Responses,
+    measured: Measurement,
     screened: Screening,
     *,
     all_scales: bool = False,
@@ -559,7 +559,7 @@ def calibrate(
     of another size, for gains that no drive has, and for suspensions or feet at a bound.
     """
     # All scales are unknown at first, so that a wrong one does not bias the fit.
-    found = _fitted_with_scales(rig, responses, screened)
+    found = _fitted_with_scales(rig, measured, screened)
     progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
     scales, space = found.sensor_scales, found.plate.model.space
     is_unknown = np.ones(len(scales), dtype=bool)
@@ -587,25 +587,25 @@ def calibrate(
     return found
 
 
-def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> Calibration:
+def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) -> Calibration:
     """Fit with unknown scales of all sensors; leave out those of which most values are outliers."""
     dead = screened.dead_sensors.copy()
     while True:
-        check_enough_sensors(~dead, responses)
-        live = responses.without(dead)
-        live.values[:, screened.dead_eras] = np.nan
+        check_enough_sensors(~dead, measured)
+        live = measured.without(dead)
+        live = replace(live, values=np.where(screened.dead_eras, np.nan, live.values))
         plate = plate_of(rig, live, has_form=True)
         space = plate.model.space
         start = np.zeros(space.size)
         start[plate.numbers] = screened.start
-        measurement = replace(live.as_measurement(), free_gains=True)
+        measurement = replace(live, free_gains=True)
         std, scales = without_outliers(measurement.values, plate.responses(start))
-        measured = np.isfinite(measurement.values)
-        heard = np.isfinite(std).sum(axis=(0, 2)) > measured.sum(axis=(0, 2)) / 2
+        count = np.isfinite(measurement.values).sum(axis=(0, 2))
+        heard = np.isfinite(std).sum(axis=(0, 2)) > count / 2
         if heard.all():
             break
         dead[~dead] = ~heard  # elsewhere, or loose
-    measurement = replace(measurement, std=std)
+    measurement = replace(measurement, errors=std)
     start[space.groups["sensor_scale"]] = (scales - 1) / KINDS["sensor_scale"].std
     prior = _prior(plate, start, np.ones(len(scales), dtype=bool))
     searched = space.uncertain & ~space.of("gain")
@@ -618,7 +618,7 @@ def _fitted_with_scales(rig: Rig, responses: Responses, screened: Screening) -> 
         plate,
         found,
         prior,
-        tuple(compress(responses.sensors, dead)),
+        tuple(compress(measured.names, dead)),
         tuple(compress((era.name for era in rig.eras), screened.dead_eras)),
     )
 

@@ -47,7 +47,7 @@ from model.estimate.fit import (
     without_outliers,
 )
 from model.estimate.identify import solved_for
-from model.estimate.measurement import Measurement, Responses, typical
+from model.estimate.measurement import Measurement, typical
 from model.finger import Grid
 from model.quantities import in_display_unit, percent
 from model.rig.rig import Rig
@@ -227,7 +227,7 @@ class Match:
     shares: FloatArray
     """Residuals relative to the rms of their row (m,)."""
     predicted: ComplexArray
-    """Responses of the ERAs that the channels drive, with gains (f, s, n)."""
+    """Measurement of the ERAs that the channels drive, with gains (f, s, n)."""
     outliers: NDArray[np.bool_]
     """Mask of values that no error counts (f, s, n)."""
 
@@ -243,7 +243,7 @@ class Match:
 
     @cached_property
     def responses(self) -> ComplexArray:
-        """Responses of the ERAs, without gains (f, s, n)."""
+        """Measurement of the ERAs, without gains (f, s, n)."""
         model = self.plate.model
         return model.at(np.where(model.space.of("gain"), 0.0, self.fit.x)).responses
 
@@ -305,7 +305,7 @@ def match_plate(
         scaled = values / np.exp(beside)
         errors = model_error * np.broadcast_to(row_rms(scaled), scaled.shape)
         measured = Measurement(
-            tuple(model.sensors),
+            model.sensors,
             model.frequencies,
             scaled,
             errors,
@@ -321,7 +321,7 @@ def match_plate(
     errors = np.broadcast_to(row_rms(kept), kept.shape)
     none = np.zeros((*kept.shape, 0))
     left = best_gains(
-        predicted, none, replace(best.measurement, values=kept, std=model_error * errors)
+        predicted, none, replace(best.measurement, values=kept, errors=model_error * errors)
     )[2]
     return Match(
         plate,
@@ -451,8 +451,8 @@ def best_wiring(
 
 
 def reversed_axes(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses, *, may_be_plugs: bool
-) -> tuple[Finding, Rig, Responses] | None:
+    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement, *, may_be_plugs: bool
+) -> tuple[Finding, Rig, Measurement] | None:
     """Find the axes along which a measurement is noted the wrong way round, and note it right.
 
     Channels drive the ERAs of the rig. shapes: match of the observation with the rig's plate;
@@ -466,8 +466,8 @@ def reversed_axes(
         size = np.array([rig.plate.length, rig.plate.width])
         points = np.abs(size * [axis in axes for axis in "xy"] - observation.points)
         values = observation.values[:: -1 if axes == ("frequency",) else 1]
-        right = replace(observation, points=points, values=values)
-        found = match_shapes(plate_of(rig, right), values.swapaxes(1, 2))
+        right = replace(observation.moved(points), values=values)
+        found = match_shapes(plate_of(rig, right), values)
         tried.append((found.error(range(len(found.mac[0]))), axes, right))
     error, axes, right = best_by(tried, lambda each: -each[0])
     are_plugs = shapes.error(shapes.nearest) * _CLEARLY_LESS < error
@@ -486,8 +486,8 @@ def reversed_axes(
 
 
 def exchanged_sensors(
-    observation: Responses, model: ComplexArray, values: ComplexArray
-) -> tuple[Finding, Responses] | None:
+    observation: Measurement, model: ComplexArray, values: ComplexArray
+) -> tuple[Finding, Measurement] | None:
     """Find sensors whose values (f, s, n) are those of a model at another's place."""
     known, size = np.isfinite(values), row_rms(values)
     measured = np.where(known, values, 0) / size
@@ -496,7 +496,7 @@ def exchanged_sensors(
     own = (np.abs(measured) ** 2).sum(axis=(0, 2))
     other = np.einsum("fsn,fpn->sp", known.astype(float), np.abs(predicted) ** 2)
     coherence = inner / np.sqrt(np.maximum(own[:, None] * other, 1e-300))
-    at_own, names, points = np.diag(coherence), observation.sensors, observation.points.copy()
+    at_own, names, points = np.diag(coherence), observation.names, observation.points.copy()
     pairs = {}
     for sensor, place in zip(*linear_sum_assignment(-(coherence**2)), strict=True):
         # Both must be wrong: else two sensors are at one place, which is no exchange.
@@ -508,11 +508,11 @@ def exchanged_sensors(
         return None
     said = ", ".join(f"{name} at that of {place}" for name, place in pairs.items())
     found = Finding("exchanged", said, details={"json": {"exchanged_sensors": pairs}})
-    return found, replace(observation, points=points)
+    return found, observation.moved(points)
 
 
 def other_meaning(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
 ) -> tuple[Finding, Rig] | None:
     """Find a value that the rig of a plate has the wrong way round, the grain first.
 
@@ -523,7 +523,7 @@ def other_meaning(
 
 
 def turned_grain(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
 ) -> tuple[Finding, Rig] | None:
     """Find the board with the grain along the other side, if that clearly explains more."""
     rig = plate.rig
@@ -531,7 +531,7 @@ def turned_grain(
         return None
     turned = replace(rig, plate=replace(rig.plate, material=rig.plate.material.turned()))
     turned = replace(turned, mesh=solved_for(turned, rig.limits.frequency_max).mesh)
-    tried = match_shapes(plate_of(turned, observation), observation.values.swapaxes(1, 2))
+    tried = match_shapes(plate_of(turned, observation), observation.values)
     error, as_written = (each.error(each.nearest) for each in (tried, shapes))
     if error > min(_MAX_COARSE_ERROR, _CLEARLY_LESS * as_written):
         return None
@@ -549,7 +549,7 @@ def turned_grain(
 
 
 def misread_resonance(
-    plate: SensedPlate, shapes: ShapeMatch, observation: Responses
+    plate: SensedPlate, shapes: ShapeMatch, observation: Measurement
 ) -> tuple[Finding, Rig] | None:
     """Find exciters whose other resonance clearly explains the observation better.
 
@@ -560,7 +560,7 @@ def misread_resonance(
     left by a coarse fit vary over frequency by 0.15 to 0.43 (standard deviation of their
     logarithms) with the right meaning, and by 1.2 or more with the other.
     """
-    rig, values = plate.rig, observation.values.swapaxes(1, 2)
+    rig, values = plate.rig, observation.values
     written = {
         name: str(section.values["resonance_is"])
         for name, section in sections_of(rig).items()
@@ -678,7 +678,7 @@ def _varied(rig: Rig, key: str, factor: float) -> Rig:
 
 def compared(
     plate: SensedPlate,
-    observation: Responses,
+    observation: Measurement,
     values: ComplexArray,
     *,
     drives: Sequence[int],
@@ -700,7 +700,7 @@ def compared(
             return plate.of(other)
         # A sensor that would be off the plate counts as at its edge.
         points = np.clip(observation.points, 0, [other.plate.length, other.plate.width])
-        return sensed_plate(other, points, observation.frequencies, masses=plate.masses)
+        return sensed_plate(other, observation.moved(points).sensors, observation.frequencies)
 
     def matched(key: str, factor: float) -> Match | None:
         if other := solved(key, factor):
@@ -794,7 +794,7 @@ def plate_finding(match: Match, hypotheses: Sequence[Hypothesis]) -> Finding:
 
 
 def match_with_form(
-    plate: SensedPlate, observation: Responses, values: ComplexArray, drives: Sequence[int]
+    plate: SensedPlate, observation: Measurement, values: ComplexArray, drives: Sequence[int]
 ) -> tuple[Match, list[Finding]]:
     """Match values (f, s, n) of channels with a plate with form errors and loads.
 
@@ -885,7 +885,7 @@ def _loads(
     model, rig = match.plate.model, match.plate.rig
     kept = np.where(match.outliers, np.nan, values)
     errors = np.broadcast_to(noise * row_rms(kept), kept.shape)
-    measured = replace(match.fit.measurement, values=kept, std=errors, gain_std=math.inf)
+    measured = replace(match.fit.measurement, values=kept, errors=errors, gain_std=math.inf)
     searched = model.space.uncertain & ~model.space.of("gain")
     linearised = fit(model, measured, searched=searched, start=match.fit.x, evaluations=1)
     points, tip = _LOAD_GRID.centres(rig.plate), rig.fingertip or Fingertip()

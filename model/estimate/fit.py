@@ -25,7 +25,7 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray, best_by, best_first
 from model.estimate.forward import ForwardModel, PlateAt, Sensor, by_mass_at, jacobian
-from model.estimate.measurement import Measurement, Responses
+from model.estimate.measurement import Measurement
 from model.estimate.space import (
     KINDS,
     MAX_GUESSED,
@@ -329,7 +329,7 @@ def fit_to_noise(
         left[before.known] -= found.leverage
         std = noise_of(before.part(before.known).values, raw, left)
         kept = raw < _MAX_DEVIATION * np.sqrt(2) * std
-        now = replace(measurement, std=np.where(kept, std, np.inf))
+        now = replace(measurement, errors=np.where(kept, std, np.inf))
         found = fit(model, now, searched=searched, start=found.x, prior=prior)
         if (before.known == now.known).all() and np.allclose(
             before.std[now.known], now.std[now.known], rtol=_SETTLED
@@ -573,11 +573,6 @@ class SensedPlate:
         exciters = {era.name for era in self.rig.eras if "force_factor" in era.fields}
         return tuple(row for row in self.rows if row.era in exciters)
 
-    @property
-    def masses(self) -> FloatArray:
-        """Mass of the sensor at each point while it measures there, (s,) [kg]."""
-        return np.array([sensor.mass for sensor in self.model.sensors])
-
     @cached_property
     def numbers(self) -> IntArray:
         """Number of each fitted value in the space (n,)."""
@@ -669,37 +664,20 @@ class SensedPlate:
 
 
 def sensed_plate(
-    rig: Rig,
-    points: FloatArray,
-    frequencies: FloatArray,
-    *,
-    masses: FloatArray | None = None,
-    has_form: bool = False,
+    rig: Rig, sensors: Sequence[Sensor], frequencies: FloatArray, *, has_form: bool = False
 ) -> SensedPlate:
-    """Solve a rig's free plate once, for sensors at points (s, 2) [m] and frequencies (f,) [Hz].
+    """Solve a rig's free plate once, for sensors at points of it and frequencies (f,) [Hz].
 
-    masses (s,) [kg]: of a sensor that is moved, as `Sensor.mass`, None for none; has_form: whether
-    the plate may have form errors. Raises InputError for frequencies too high for its
-    mesh.
+    has_form: whether the plate may have form errors. Raises InputError for frequencies too high for
+    its mesh.
     """
     rig.mesh.check_frequencies(rig.plate, frequencies)
-    loads = np.zeros(len(points)) if masses is None else masses
-    sensors = [
-        Sensor(f"sensor {n}", x=x, y=y, mass=mass)
-        for n, ((x, y), mass) in enumerate(zip(points.tolist(), loads.tolist(), strict=True))
-    ]
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=float(max(frequencies.max(), 200.0)))
     form = reduced_modes(rig, free) if has_form else None
     space = space_by_sheets(rig, (), None)
     return SensedPlate(rig, ForwardModel(rig, sensors, frequencies, space, free, form=form)).of(rig)
 
 
-def plate_of(rig: Rig, observation: Responses, *, has_form: bool = False) -> SensedPlate:
+def plate_of(rig: Rig, observation: Measurement, *, has_form: bool = False) -> SensedPlate:
     """The plate of a rig at the sensors and frequencies of a measurement, as `sensed_plate`."""
-    return sensed_plate(
-        rig,
-        observation.points,
-        observation.frequencies,
-        masses=observation.masses,
-        has_form=has_form,
-    )
+    return sensed_plate(rig, observation.sensors, observation.frequencies, has_form=has_form)

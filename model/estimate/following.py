@@ -188,7 +188,7 @@ def update(
         last_places={},
     )
     measurement = Measurement(
-        tuple(model.sensors),
+        model.sensors,
         np.arange(len(patterns), dtype=float),
         np.array([each.values for each in patterns])[..., None],
         np.array([each.std for each in patterns])[..., None],

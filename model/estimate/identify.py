@@ -418,7 +418,7 @@ def fit_in_stages(rig: Rig, measurement: Measurement) -> Fit:
     """Find the most likely parameters of a measurement."""
     free = solved_for(rig, float(measurement.frequencies[-1]))
     std = np.hypot(measurement.std, _EXTRA_NOISE * measurement.tone_rms)
-    rough, model = replace(measurement, std=std), model_of(rig, free, measurement, masses=1)
+    rough, model = replace(measurement, errors=std), model_of(rig, free, measurement, masses=1)
     located = _with_mass(model, rough, _simple(model, rough).x, number=0)
     found = _in_full(located, measurement)
     if found.chi2 > _MORE_MASS_BEYOND:

@@ -8,9 +8,8 @@ general data type (1) and the unit V. The mass of a sensor that is moved and the
 measurement are in columns of their own, or in the second line of free text of a function:
 `sensor_mass_g=2 setting=level 0.1`.
 
-The file of accelerometers is CSV too: a place, an input of the sound card and a sensitivity a line.
-Columns of `OPTIONAL` may be left out, and all but `PLACES` where only places are read. Where all
-lines name one input, they are places of one sensor that is moved.
+The places of sensors are read of the file of the accelerometers, whose other columns are those of
+their inputs (`era_haptics.lab.measuring.sound_card`).
 """
 
 import logging
@@ -21,7 +20,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Self
 
 import numpy as np
@@ -44,7 +42,6 @@ from model.files.uff import (
     text_of,
     write_universal,
 )
-from model.processes import Progress
 from model.rig.rig import Rig
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
@@ -87,9 +84,8 @@ _FREQUENCY_UNITS = {
 }
 _SPELLED = {ord("²"): "2", ord("µ"): "u", ord("μ"): "u", **dict.fromkeys(map(ord, "^*()[]{}·.' "))}
 
-PLACES = ("sensor", "x_m", "y_m")
-SENSOR_COLUMNS = (*PLACES, "input", "mv_per_m_s2")
-OPTIONAL = {"gain": 1.0, "full_scale_v": 1.0, "mass_g": 0.0}
+PLACE_COLUMNS = ("sensor", "x_m", "y_m")
+INPUT_COLUMNS = ("input", "mv_per_m_s2", "gain", "full_scale_v", "mass_g")
 
 
 NONLINEAR = 0.02
@@ -98,10 +94,9 @@ NONLINEAR = 0.02
 DRIFTED = 0.01
 """Relative difference of the first tone, played last again, beyond which a plate has changed."""
 
+# Of readings: their usual error, relative, and its floor,
+_NOISE = 0.01
 _FLOOR = 0.1  # of a sensor's rms: below it an error no longer falls with the response
-
-_MEASURER = "era_haptics.lab.measuring.measure:measure_plate"
-"""Named, not imported: the model does not depend on the lab."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,25 +115,31 @@ class Repeat:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Responses of s sensors to n ERAs, at some of their paths and frequencies."""
+    """Responses of a plate at s sensors to n ERAs, at some of their paths and frequencies."""
 
-    sensors: tuple[Sensor, ...]
+    sensors: Sequence[Sensor]
     frequencies: FloatArray
     """Ascending (f,) [Hz]."""
     values: ComplexArray
-    """Acceleration per base displacement at full gain (f, s, n) [1/s²], phases as
-    exp(+i omega t), NaN where not measured."""
-    std: FloatArray
-    """Standard error of the real and of the imaginary part (f, s, n), infinite of outliers."""
+    """Acceleration per base displacement at full gain (f, s, n) [1/s²], of an exciter per volt
+    [m/s²/V], phases as exp(+i omega t), NaN where not measured."""
+    errors: FloatArray | None = None
+    """Standard error of the real and of the imaginary part (f, s, n), infinite of outliers; None
+    for the usual one of readings, as `std`."""
     half_level: tuple[Repeat, ...] = ()
     """Loud tones repeated at half the level, per base displacement as well."""
     at_end: tuple[Repeat, ...] = ()
     """The first tones, as far as they are loud, played last again."""
+    has_phases: bool = True
+    """Whether phases are relative to the drive; otherwise only phases between sensors are known,
+    and no polarity."""
     drives_lag: bool = False
     """Whether bases follow what is played with an unknown lag, as behind voltage amplifiers."""
     clock_errors: Mapping[str, float] = field(default_factory=dict)
     """Errors of the clocks of the amplifiers that played and heard, rms [s], by name, as they and
     their lines state; empty where all have one clock."""
+    skipped: int = 0
+    """Number of values that were read beyond the rig's limits of frequency."""
     free_gains: bool = False
     """Whether each drive has a gain of its own at every frequency, which nothing states."""
     gain_std: float = math.inf
@@ -150,39 +151,43 @@ class Measurement:
     by itself."""
 
     def __post_init__(self) -> None:
-        """Raise InputError for unordered frequencies, missing values or values without an error."""
+        """Raise InputError for unordered frequencies."""
         if not (np.diff(self.frequencies) > 0).all():
             raise InputError("measurement: frequencies must ascend, each once")
-        if not self.known.any():
-            raise InputError("a measurement must have values, got none")
-        std = self.std[self.known]
-        if not (std > 0).all():
-            raise InputError(f"measurement: std must be above zero, got {std.min():g}")
 
-    @classmethod
-    def of(
-        cls,
-        sensors: Sequence[Sensor],
-        frequencies: FloatArray,
-        values: ComplexArray,
-        *,
-        noise: float = 0.01,
-    ) -> Self:
-        """Make a measurement of responses (f, s, n) [1/s²], NaN where not measured.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sensors (s,)."""
+        return tuple(each.name for each in self.sensors)
 
-        noise: error of each part, relative to a response and to a tenth of its sensor's root mean
-        square together: never relative alone, since a response may vanish.
+    @property
+    def points(self) -> FloatArray:
+        """Places of the sensors (s, 2) [m]."""
+        return np.array([(each.x, each.y) for each in self.sensors]).reshape(-1, 2)
+
+    @cached_property
+    def std(self) -> FloatArray:
+        """Standard error of the real and of the imaginary part (f, s, n), infinite of outliers.
+
+        The usual one is 1 % of a response and of a tenth of its sensor's root mean square together:
+        never relative alone, since a response may vanish. Raises InputError for one of zero.
         """
-        squares = np.where(np.isfinite(values), np.abs(values), 0.0) ** 2
-        count = np.isfinite(values).sum(axis=(0, 2))[:, None]
-        rms2 = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
-        std = noise * np.sqrt(squares + _FLOOR**2 * rms2)
-        return cls(tuple(sensors), np.asarray(frequencies), np.asarray(values), std)
+        found = self.errors
+        if found is None:
+            measured = np.isfinite(self.values)
+            squares = np.where(measured, np.abs(self.values), 0.0) ** 2
+            count = measured.sum(axis=(0, 2))[:, None]
+            rms2 = squares.sum(axis=(0, 2))[:, None] / np.maximum(count, 1)
+            found = _NOISE * np.sqrt(squares + _FLOOR**2 * rms2)
+        least = np.where(np.isfinite(self.values), found, np.inf).min(initial=np.inf)
+        if not least > 0:
+            raise InputError(f"measurement: std must be above zero, got {least:g}")
+        return found
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
         """Mask (f, s, n) of the responses that were measured and are no outliers."""
-        return np.isfinite(self.values) & np.isfinite(self.std)
+        return np.isfinite(self.values) & (self.errors is None or np.isfinite(self.std))
 
     @cached_property
     def weight(self) -> FloatArray:
@@ -214,8 +219,22 @@ class Measurement:
         return np.asarray(np.sqrt(squares.sum(axis=(1, 2), keepdims=True) / np.maximum(count, 1)))
 
     def part(self, kept: NDArray[np.bool_]) -> Self:
-        """Keep the values of a mask (f, s, n)."""
-        return replace(self, values=np.where(kept, self.values, np.nan))
+        """Keep the values of a mask (f, s, n), with the errors that they have."""
+        return replace(self, values=np.where(kept, self.values, np.nan), errors=self.std)
+
+    def without(self, sensors: NDArray[np.bool_]) -> Self:
+        """Remove some of the sensors (s,)."""
+        return replace(
+            self,
+            sensors=tuple(compress(self.sensors, ~sensors)),
+            values=self.values[:, ~sensors],
+            errors=None if self.errors is None else self.errors[:, ~sensors],
+        )
+
+    def moved(self, points: FloatArray) -> Self:
+        """The same with the sensors at other places (s, 2) [m]."""
+        places = zip(self.sensors, points.tolist(), strict=True)
+        return replace(self, sensors=tuple(replace(each, x=x, y=y) for each, (x, y) in places))
 
     def check(self) -> None:
         """Raise InputError for a plate that was not linear or has changed meanwhile."""
@@ -233,45 +252,13 @@ class Measurement:
                     )
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredPlate:
-    """A measurement and the circumstances in which it was made."""
-
-    measurement: Measurement
-    level: float | None
-    """Level of what was played, 0..1 of full stroke, None if unknown."""
-    duration: float | None
-    """Duration [s], None if unknown."""
-    sensors: tuple[Mapping[str, object], ...]
-    """The sensors used, for programs."""
-    notes: tuple[str, ...]
-    """Lines for people."""
-    details: Mapping[str, object]
-    """Further keys and values for programs."""
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceSettings:
-    """Settings of `era rig identify --device`."""
-
-    device: str
-    """Sound card that plays and records."""
-    sensors_file: Path
-    """File of the accelerometers."""
-    frequencies: FloatArray | None
-    """Tones (f,) [Hz], None for the usual ones."""
-    level: float | None
-    """Level of the tones, None for the usual one."""
-    periods: int
-    """Seconds of each run that count."""
-    seed: int
-    """Seed of the phases."""
-
-
-def measure_by_device(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
-    """Measure a plate by a sound card; raises InputError, LinkError."""
-    found: MeasuredPlate = resolve_name(_MEASURER)(rig, settings, progress=progress)
-    return found
+def sensors_at(
+    points: FloatArray, names: Sequence[str] = (), *, mass: float = 0.0
+) -> tuple[Sensor, ...]:
+    """Sensors at points (s, 2) [m] of the plate, by default numbered; mass: as `Sensor.mass`."""
+    called = names or [f"sensor {number}" for number in range(len(points))]
+    at = zip(called, np.asarray(points).tolist(), strict=True)
+    return tuple(Sensor(name, x=x, y=y, mass=mass) for name, (x, y) in at)
 
 
 @dataclass(frozen=True)
@@ -295,74 +282,15 @@ class MeasuredValue:
     place: str
     """File and line, for errors."""
     sensor_mass: float = 0.0
-    """Mass of a sensor that is moved [kg], as `Responses.masses`."""
+    """Mass of a sensor that is moved [kg], as `Sensor.mass`."""
     setting: str = ""
     """Setting of the measurement in words, "" if unknown."""
     is_per_volt: bool = False
     """Whether it is per volt at an exciter."""
 
 
-@dataclass(frozen=True, eq=False)
-class Responses:
-    """Measured responses of a rig's plate, NaN where not measured."""
-
-    sensors: tuple[str, ...]
-    """Names of the sensors (s,)."""
-    points: FloatArray
-    """Places of the sensors (s, 2) [m]."""
-    frequencies: FloatArray
-    """Frequencies (f,) [Hz]."""
-    values: ComplexArray
-    """Responses (f, eras, s) [1/s²]."""
-    has_phases: bool = True
-    """Whether phases are relative to the drive; otherwise only phases between sensors are known,
-    and no polarity."""
-    skipped: int = 0
-    """Number of values beyond the rig's limits of frequency."""
-    masses: FloatArray | None = None
-    """Masses (s,) [kg] of a sensor that is moved, as `Sensor.mass`; None for none."""
-
-    def __post_init__(self) -> None:
-        """Keep masses only where one is above 0."""
-        if self.masses is not None and not self.masses.any():
-            object.__setattr__(self, "masses", None)
-
-    @property
-    def count(self) -> int:
-        """Number of measured values."""
-        return int(np.isfinite(self.values).sum())
-
-    @property
-    def measured(self) -> NDArray[np.bool_]:
-        """Mask of the ERAs that were driven (e,)."""
-        return np.asarray(np.isfinite(self.values).any(axis=(0, 2)))
-
-    @property
-    def sensor_masses(self) -> FloatArray:
-        """Mass of the sensor at each place while it measures there, (s,) [kg]."""
-        return np.zeros(len(self.sensors)) if self.masses is None else self.masses
-
-    def as_measurement(self) -> Measurement:
-        """Convert for an identification, of drives that lag as actuators behind a card do."""
-        places = zip(self.sensors, self.points.tolist(), self.sensor_masses.tolist(), strict=True)
-        sensors = [Sensor(name, x=x, y=y, mass=mass) for name, (x, y), mass in places]
-        values = self.values.swapaxes(1, 2)
-        return replace(Measurement.of(sensors, self.frequencies, values), drives_lag=True)
-
-    def without(self, sensors: NDArray[np.bool_]) -> "Responses":
-        """Remove some of the sensors (s,)."""
-        kept = ~sensors
-        return replace(
-            self,
-            sensors=tuple(compress(self.sensors, kept)),
-            points=self.points[kept],
-            values=self.values[:, :, kept],
-            masses=None if self.masses is None else self.masses[kept],
-        )
-
-
-def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
-    """Join values into responses of a rig's plate.
+def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
+    """Join values into a measurement of a rig's plate, of drives that lag as behind a card.
 
     Values beyond the rig's limits of frequency, as a spectrum's line of 0 Hz, are skipped. Raises
     InputError, with file and line, for points off the plate, unknown ERAs or positions, a response
@@ -410,19 +338,19 @@ def responses_of(measured: Sequence[MeasuredValue], rig: Rig) -> Responses:
             )
         found[each.frequency, number, each.sensor] = each.value
     frequencies = np.unique([each.frequency for each in within])
-    values = np.full((len(frequencies), len(rig.eras), len(sensors)), np.nan, dtype=complex)
+    values = np.full((len(frequencies), len(sensors), len(rig.eras)), np.nan, dtype=complex)
     column = {name: number for number, name in enumerate(sensors)}
     for (frequency, number, sensor), value in found.items():
-        values[np.searchsorted(frequencies, frequency), number, column[sensor]] = value
+        values[np.searchsorted(frequencies, frequency), column[sensor], number] = value
     # A point at the edge may have been rounded off the plate.
     points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    return Responses(
-        tuple(sensors),
-        points,
+    at = zip(masses.items(), points.tolist(), strict=True)
+    return Measurement(
+        tuple(Sensor(name, x=x, y=y, mass=mass) for (name, mass), (x, y) in at),
         frequencies,
         values,
+        drives_lag=True,
         skipped=skipped,
-        masses=np.array([*masses.values()]),
     )
 
 
@@ -484,19 +412,19 @@ class Screening:
     """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
 
 
-def silent_sensors(responses: Responses) -> NDArray[np.bool_]:
+def silent_sensors(measurement: Measurement) -> NDArray[np.bool_]:
     """Mask of sensors without a response to any ERA (s,)."""
-    size = np.abs(responses.values)
-    loudest = np.where(np.isfinite(size), size, 0).max(axis=2, keepdims=True)
+    size = np.abs(measurement.values)
+    loudest = np.where(np.isfinite(size), size, 0).max(axis=1, keepdims=True)
     share = size / np.where(loudest > 0, loudest, np.nan)
-    heard = [typical(share[:, :, s]) for s in range(size.shape[2])]
+    heard = [typical(share[:, s]) for s in range(size.shape[1])]
     return ~(np.array(heard) >= _SILENT_SENSOR)
 
 
-def check_enough_sensors(alive: NDArray[np.bool_], responses: Responses) -> None:
+def check_enough_sensors(alive: NDArray[np.bool_], measurement: Measurement) -> None:
     """Raise InputError unless enough sensors (s,) have a signal."""
     if alive.sum() < LEAST_SENSORS:
-        dead = ", ".join(compress(responses.sensors, ~alive))
+        dead = ", ".join(compress(measurement.names, ~alive))
         without = f" ({dead} without a signal)" if dead else ""
         raise InputError(
             f"at least {LEAST_SENSORS} sensors must have a signal, better eight or more, got "
@@ -520,16 +448,18 @@ def read_measured(path: Path) -> list[MeasuredValue]:
     raise InputError(f"{path}: name of measured responses must end in .csv, .uff or .unv")
 
 
-def write_responses(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+def write_responses(path: Path, measurement: Measurement, rig: Rig, *, setting: str = "") -> None:
     """Write responses as CSV or UFF by the name's ending; setting: as `MeasuredValue`.
 
     Raises OSError.
     """
     write = write_responses_csv if path.suffix.lower() == ".csv" else write_responses_uff
-    write(path, responses, rig, setting=setting)
+    write(path, measurement, rig, setting=setting)
 
 
-def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+def write_responses_csv(
+    path: Path, measurement: Measurement, rig: Rig, *, setting: str = ""
+) -> None:
     """Write responses as CSV with all digits.
 
     Raises OSError; InputError for ERAs beside exciters, whose units differ.
@@ -538,11 +468,13 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
     if len(units) > 1:
         raise InputError(f"{path}: ERAs and exciters need a .uff file, whose functions have units")
     real, imaginary = _PER_VOLT if "V" in units else COLUMNS[-2:]
-    f, e, s = np.nonzero(np.isfinite(responses.values))
-    values = responses.values[f, e, s]
+    measured = measurement.values.swapaxes(1, 2)
+    f, e, s = np.nonzero(np.isfinite(measured))
+    values, points = measured[f, e, s], measurement.points
+    masses = np.array([each.mass for each in measurement.sensors])
     further: dict[str, Column] = {}
-    if responses.masses is not None:
-        further[MASS] = 1e3 * responses.masses[s]
+    if masses.any():
+        further[MASS] = 1e3 * masses[s]
     if setting:
         further[SETTING] = [setting] * len(s)
     write_columns(
@@ -551,10 +483,10 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
             "era": [rig.eras[number].name for number in e],
             "era_x_m": [rig.eras[number].x for number in e],
             "era_y_m": [rig.eras[number].y for number in e],
-            "sensor": [responses.sensors[number] for number in s],
-            "x_m": responses.points[s, 0],
-            "y_m": responses.points[s, 1],
-            "frequency_hz": responses.frequencies[f],
+            "sensor": [measurement.names[number] for number in s],
+            "x_m": points[s, 0],
+            "y_m": points[s, 1],
+            "frequency_hz": measurement.frequencies[f],
             real: values.real,
             imaginary: values.imag,
             **further,
@@ -562,17 +494,20 @@ def write_responses_csv(path: Path, responses: Responses, rig: Rig, *, setting: 
     )
 
 
-def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: str = "") -> None:
+def write_responses_uff(
+    path: Path, measurement: Measurement, rig: Rig, *, setting: str = ""
+) -> None:
     """Write responses as UFF 58: nodes 1.. are the sensors, 1001.. the ERAs; raises OSError."""
-    masses = responses.sensor_masses
-    notes = [f"{MASS}={1e3 * mass:.10g} {SETTING}={setting}" for mass in masses]
-    positions = [*responses.points.tolist(), *([era.x, era.y] for era in rig.eras)]
-    numbers = [*range(1, len(responses.sensors) + 1), *range(1001, 1001 + len(rig.eras))]
+    sensors = measurement.sensors
+    positions = [*((each.x, each.y) for each in sensors), *((era.x, era.y) for era in rig.eras)]
+    numbers = [*range(1, len(sensors) + 1), *range(1001, 1001 + len(rig.eras))]
     functions = []
     for e, era in enumerate(rig.eras):
         reference = (DISPLACEMENT if era.UNIT == "m" else _GENERAL, era.UNIT)
-        for s, sensor in enumerate(responses.sensors):
-            measured = np.isfinite(responses.values[:, e, s])
+        for s, sensor in enumerate(sensors):
+            values = measurement.values[:, s, e]
+            measured = np.isfinite(values)
+            note = f"{MASS}={1e3 * sensor.mass:.10g} {SETTING}={setting}"
             if measured.any():
                 functions.append(
                     Function(
@@ -580,13 +515,13 @@ def write_responses_uff(path: Path, responses: Responses, rig: Rig, *, setting: 
                         FREQUENCY_RESPONSE,
                         s + 1,
                         1001 + e,
-                        (sensor, era.name),
+                        (sensor.name, era.name),
                         (_UP, _UP),
-                        responses.frequencies[measured],
-                        responses.values[measured, e, s],
+                        measurement.frequencies[measured],
+                        values[measured],
                         (FREQUENCY, ACCELERATION, reference[0]),
                         ("m/s^2", reference[1]),
-                        note=notes[s] if setting or masses[s] else "",
+                        note=note if setting or sensor.mass else "",
                     )
                 )
     nodes = {n: (x, y, 0.0) for n, (x, y) in zip(numbers, positions, strict=True)}
@@ -725,57 +660,16 @@ def sensor_mass(place: str, grams: float, *, column: str = MASS) -> float:
     return grams / 1e3
 
 
-@dataclass(frozen=True)
-class WiredSensor:
-    """An accelerometer at x, y [m] on an input of a sound card."""
-
-    name: str
-    x: float
-    y: float
-    input: int
-    """Number of the input, from 1."""
-    sensitivity: float
-    """Samples, in full scale, by acceleration [1/(m/s²)]."""
-    mass: float = 0.0
-    """Mass [kg] of one that is moved, as `model.estimate.forward.Sensor.mass`."""
-
-
 def read_places(path: Path, plate: Plate) -> dict[str, Point]:
     """Read places [m] of sensors on a plate by name; raises InputError with file and line."""
     places: dict[str, Point] = {}
-    for line in read_lines(path, PLACES, optional=(*SENSOR_COLUMNS[len(PLACES) :], *OPTIONAL)):
-        name, at = _place(line, places, plate)
+    for line in read_lines(path, PLACE_COLUMNS, optional=INPUT_COLUMNS):
+        name, at = named_place(line, places, plate)
         places[name] = at
     return places
 
 
-def read_sensors(
-    path: Path, plate: Plate, *, mass: float | None = None, may_move: bool = False
-) -> tuple[WiredSensor, ...]:
-    """Read the accelerometers of a plate, or the places of one that is moved.
-
-    mass [g]: of the sensor, in place of the file's; may_move: whether one that is moved will do.
-    Raises InputError with file and line.
-    """
-    sensors: list[WiredSensor] = []
-    lines = read_lines(path, SENSOR_COLUMNS, optional=tuple(OPTIONAL))
-    moves = may_move and len(lines) > 1 and len({line.number("input") for line in lines}) == 1
-    for line in lines:
-        sensors.append(_sensor(line, sensors, plate, mass=mass, moves=moves))
-    if not moves and len(sensors) > 1 and any(sensor.mass for sensor in sensors):
-        raise InputError(
-            f"{path}: mass_g must be of one sensor that is moved, got several sensors, which weigh "
-            "on the plate together; leave it out, and give them in the rig as masses"
-        )
-    return tuple(sensors)
-
-
-def are_places(sensors: Sequence[WiredSensor]) -> bool:
-    """Whether the sensors are places of one that is moved."""
-    return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
-
-
-def _place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
+def named_place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, Point]:
     """Name and place of a sensor; raises InputError for a name that one before has."""
     name = line.cells["sensor"]
     if not name or name in before:
@@ -783,31 +677,3 @@ def _place(line: CsvLine, before: Collection[str], plate: Plate) -> tuple[str, P
     at = line.number("x_m"), line.number("y_m")
     check_on_plate(f"{line.place}: sensor {name}", [at], plate)
     return name, at
-
-
-def _sensor(
-    line: CsvLine, before: Sequence[WiredSensor], plate: Plate, *, mass: float | None, moves: bool
-) -> WiredSensor:
-    place = line.place
-    name, (x, y) = _place(line, [other.name for other in before], plate)
-    channel, sensitivity = map(line.number, ("input", "mv_per_m_s2"))
-    is_taken = not moves and any(channel == other.input for other in before)
-    if channel != int(channel) or channel < 1 or is_taken:
-        raise InputError(
-            f"{place}: input must be a number from 1 that no other sensor has, got {channel:g}; "
-            "one that is moved from place to place is for era measure, alone in its file"
-        )
-    gain, full_scale, own = (line.number(column, default) for column, default in OPTIONAL.items())
-    for column, value in (("gain", gain), ("full_scale_v", full_scale)):
-        if value <= 0:
-            raise InputError(f"{place}: {column} must be above zero, got {value:g}")
-    weight = sensor_mass(place, own if mass is None else mass, column="mass_g")
-    if sensitivity == 0:
-        raise InputError(f"{place}: mv_per_m_s2 must not be zero, got 0; negative: upside down")
-    found = WiredSensor(name, x, y, int(channel), 1e-3 * sensitivity * gain / full_scale, weight)
-    if moves and before and replace(before[0], name=name, x=x, y=y) != found:
-        raise InputError(
-            f"{place}: one sensor that is moved must have one sensitivity, gain, full scale and "
-            f"mass, got others than sensor {before[0].name}; make the columns the same in all lines"
-        )
-    return found

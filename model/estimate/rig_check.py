@@ -45,7 +45,7 @@ from model.estimate.findings import (
 from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
 from model.estimate.measurement import (
     LEAST_SENSORS,
-    Responses,
+    Measurement,
     Screening,
     check_enough_sensors,
     silent_sensors,
@@ -191,7 +191,7 @@ class Verdict:
 
 def diagnose(
     rig: Rig,
-    observation: Responses,
+    observation: Measurement,
     *,
     false_alarm: float = FALSE_ALARM,
     has_form: bool = False,
@@ -206,26 +206,26 @@ def diagnose(
     error; skipped: findings of sensors that were left out before. Raises InputError for fewer than
     three usable sensors or four frequencies.
     """
-    if not observation.measured.any():
+    if not np.isfinite(observation.values).any():
         raise InputError("no channel was driven; drive each in turn and measure again")
-    check_enough_sensors(np.ones(len(observation.sensors), dtype=bool), observation)
+    check_enough_sensors(np.ones(len(observation.names), dtype=bool), observation)
     if len(observation.frequencies) < _LEAST_FREQUENCIES:
         raise InputError(
             f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
             f"{len(observation.frequencies)}"
         )
     plate = plate_of(rig, observation)
-    dead = _dead_channels(plate, observation.values.swapaxes(1, 2))
-    alive = observation.values[:, ~dead]
+    dead = _dead_channels(plate, observation.values)
+    alive = observation.values[:, :, ~dead]
     if np.isfinite(alive).any():
         silent = silent_sensors(replace(observation, values=alive))
         check_enough_sensors(~silent, observation)
-        skipped += tuple(Finding("silent", n) for n in compress(observation.sensors, silent))
+        skipped += tuple(Finding("silent", n) for n in compress(observation.names, silent))
         if silent.any():
             observation = observation.without(silent)
             plate = plate_of(rig, observation)
 
-    def again(correction: Finding, rig: Rig, observation: Responses, has_form: bool) -> Verdict:
+    def again(correction: Finding, rig: Rig, observation: Measurement, has_form: bool) -> Verdict:
         if refuses:
             raise InputError(correction.rows[0].partition(": ")[2])
         found = diagnose(
@@ -233,8 +233,8 @@ def diagnose(
         )
         return replace(found, findings=(correction, *found.findings))
 
-    live = replace(observation, values=np.where(dead[:, None], np.nan, observation.values))
-    of_live = match_shapes(plate, live.values.swapaxes(1, 2))
+    live = replace(observation, values=np.where(dead, np.nan, observation.values))
+    of_live = match_shapes(plate, live.values)
     if found := reversed_axes(plate, of_live, live, may_be_plugs=refuses):
         return again(*found, has_form)
     if other := other_meaning(plate, of_live, live):
@@ -242,7 +242,7 @@ def diagnose(
         # The board of the file is corrected first.
         kept = tuple(each for each in verdict.findings if each.kind not in ("plate", "outliers"))
         return replace(verdict, findings=kept, plate_matches=False, changes=None)
-    values = observation.values.swapaxes(1, 2)
+    values = observation.values
     shapes = match_shapes(plate, values) if dead.any() else of_live
     if refuses:
         _check_quantity(plate, shapes, values)
@@ -252,7 +252,7 @@ def diagnose(
     if not np.isfinite(values).any():
         channels = tuple(_without_response(rig, n, is_dead=bool(dead[n])) for n in range(len(dead)))
         found_dead = (*_channel_findings(channels), *skipped)
-        return Verdict(channels, found_dead, observation.sensors, observation.frequencies)
+        return Verdict(channels, found_dead, observation.names, observation.frequencies)
     shapes = replace(shapes, mac=np.where(dead[:, None], np.nan, shapes.mac))
     match, drives = best_wiring(plate, values, shapes)
     if exchanged := exchanged_sensors(observation, match.responses[..., drives], values):
@@ -261,9 +261,9 @@ def diagnose(
     error = float(np.clip(1.2 * match.median_error, MODEL_ERROR, 0.3))
     if error > MODEL_ERROR:
         match = match_plate(plate, values, drives=drives, model_error=error, starts=shapes.starts)
-    off = _off_scale(observation.sensors, values, match)
-    if off and len(observation.sensors) - len(off) >= LEAST_SENSORS:
-        wrong = np.isin(observation.sensors, [each.of for each in off])
+    off = _off_scale(observation.names, values, match)
+    if off and len(observation.names) - len(off) >= LEAST_SENSORS:
+        wrong = np.isin(observation.names, [each.of for each in off])
         return diagnose(
             rig,
             observation.without(wrong),
@@ -295,12 +295,12 @@ def diagnose(
     elif match.outliers.any():
         by_sensor = match.outliers.sum(axis=(0, 2))
         worst, count = best_of(by_sensor), counted(int(by_sensor.sum()), "value")
-        name = observation.sensors[worst]
+        name = observation.names[worst]
         findings.append(Finding("outliers", name, int(by_sensor[worst]), details={"count": count}))
     return Verdict(
         channels,
         (*findings, *(beyond if matches else ())),
-        observation.sensors,
+        observation.names,
         observation.frequencies,
         matches,
         match,
@@ -345,7 +345,7 @@ def _off_scale(sensors: Sequence[str], values: ComplexArray, match: Match) -> li
 
 def _channels(
     rig: Rig,
-    observation: Responses,
+    observation: Measurement,
     values: ComplexArray,
     drives: Sequence[int],
     match: Match,
@@ -555,17 +555,15 @@ def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
     return replace(verdict, promise_margins=margins, findings=(*verdict.findings, *found))
 
 
-def check_meaning(rig: Rig, observation: Responses) -> None:
+def check_meaning(rig: Rig, observation: Measurement) -> None:
     """Raise InputError for a rig whose grain or resonances are clearly the wrong ones."""
     plate = plate_of(rig, observation)
-    found = other_meaning(
-        plate, match_shapes(plate, observation.values.swapaxes(1, 2)), observation
-    )
+    found = other_meaning(plate, match_shapes(plate, observation.values), observation)
     if found:
         raise InputError(found[0].rows[0].partition(": ")[2])
 
 
-def check_consistency(rig: Rig, responses: Responses) -> Screening:
+def check_consistency(rig: Rig, responses: Measurement) -> Screening:
     """Check that responses are what they claim to be, and screen them for a fit.
 
     A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped
@@ -579,7 +577,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     observation = replace(
         responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
     )
-    if observation.measured.any() and not (np.abs(observation.values) > 0).any():
+    if observation.count and not (np.abs(observation.values) > 0).any():
         raise InputError("measured responses must not all be zero; check that ERAs were driven")
     # Values of the plate that are off are what a calibration is for.
     verdict = diagnose(rig, observation, false_alarm=0.0, refuses=True)
@@ -590,7 +588,7 @@ def check_consistency(rig: Rig, responses: Responses) -> Screening:
     assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
     return Screening(
         np.array(["dead" in channel.states for channel in verdict.channels]),
-        np.isin(responses.sensors, [each.of for each in verdict.of_kinds("silent", "mute")]),
+        np.isin(responses.names, [each.of for each in verdict.of_kinds("silent", "mute")]),
         verdict.match.fit.x[verdict.match.plate.numbers],
     )
 

@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.direct_plate import direct_responder
 from controller.plate_measurement import (
+    MeasuredPlate,
     PlateSelfMeasurement,
     PlateSensor,
     TonePlayer,
@@ -25,7 +26,6 @@ from model.answer.stimulus import Placement
 from model.errors import InputError
 from model.estimate.forward import Sensor
 from model.estimate.identify import identify
-from model.estimate.measurement import MeasuredPlate
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

@@ -31,7 +31,7 @@ from drivers.errors import CommandError
 from era_haptics.lab.design.problem import area_of
 from era_haptics.lab.measuring.impedance import read_impedance
 from era_haptics.lab.measuring.loopback import read_stepped
-from era_haptics.lab.measuring.sound_card import Desk
+from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, read_sensors
 from era_haptics.lab.witness import capture
 from error_cases import PAGE, Case, Quotation, cases, filled, provoke, quotations
 from error_cases import RIG as CASE_RIG
@@ -40,7 +40,7 @@ from long_form import shortly
 from model.errors import InputError
 from model.estimate import calibrate
 from model.estimate.following import load_learned
-from model.estimate.measurement import WiredSensor, read_measured, read_places, read_sensors
+from model.estimate.measurement import read_measured, read_places
 from model.files.array_file import UNREADABLE, read_arrays
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import load_table

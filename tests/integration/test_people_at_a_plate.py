@@ -73,7 +73,7 @@ from gateway_bench import TOKEN, gateway_process, real_daemon, wait_for
 from long_form import shortly
 from model.cli import app
 from model.errors import InputError
-from model.estimate.measurement import read_measured, responses_of, write_responses_csv
+from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.table.table_file import build_table
@@ -686,9 +686,9 @@ def test_measured_plate_is_the_one_on_the_desk(plate: Desk, device: str, late: i
     )  # fmt: skip
     assert told["latency_s"] * 48_000 == pytest.approx((73 + BLOCK + late) % 800, abs=0.5)
     rig = load_rig(plate.folder / "rig.yaml")
-    found = responses_of(read_measured(plate.folder / "measured.csv"), rig)
+    found = measurement_of(read_measured(plate.folder / "measured.csv"), rig)
     model = DeskModel(draw_truth(rig, seed=SEED, mesh=DESK_MESH), found.points).under()
-    exact = model.response(found.frequencies).swapaxes(1, 2) / rig.eras[0].stroke
+    exact = model.response(found.frequencies) / rig.eras[0].stroke
     loud = np.abs(exact) > 0.2 * np.abs(exact).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(found.values[loud], exact[loud], rtol=0.03)
 

@@ -28,7 +28,7 @@ from controller.api.client import Client
 from controller.api.jsonrpc import RpcError
 from controller.cli.main import run
 from gateway_bench import real_daemon, wait_for
-from model.estimate.measurement import read_measured, responses_of, write_responses_csv
+from model.estimate.measurement import measurement_of, read_measured, write_responses_csv
 from model.rig.rig_file import example_rig_path, load_rig
 from plates import DISTORTIONS, every
 from yaml_files import read_yaml
@@ -224,7 +224,7 @@ _BEFORE: dict[str, Callable[[contextlib.ExitStack, io.StringIO], None]] = {
 def _write_distorted(shelf: Path) -> None:
     """Put measured responses on the shelf that are not what they claim, such as g.csv."""
     rig = load_rig(example_rig_path())
-    measured = responses_of(read_measured(ROOT / "examples" / "measured.csv"), rig)
+    measured = measurement_of(read_measured(ROOT / "examples" / "measured.csv"), rig)
     few = every(measured, 2, up_to=300.0)
     for name in ("g", "conjugated", "swapped_channels", "swapped_sensors"):
         write_responses_csv(shelf / f"{name}.csv", DISTORTIONS[name](few), rig)

@@ -33,7 +33,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.drive_modes import Drive, Forms
 from model.estimate.following import SettledPattern
 from model.estimate.forward import RestingFinger
-from model.estimate.measurement import Responses
+from model.estimate.measurement import Measurement, sensors_at
 from model.fem import ELEMENTS, Mesh, assemble
 from model.finger import Grid
 from model.reduction.reduced_plate import modal_matrices, reduce_plate
@@ -255,7 +255,7 @@ def measured(
     noise: float = 0.01,
     scales: Mapping[str, float] | None = None,
     seed: int = 2,
-) -> Responses:
+) -> Measurement:
     """Responses by one sparse solve a frequency, noise relative to each row's rms over sensors."""
     rng = np.random.default_rng(seed)
     matrices = assemble(truth.plate, truth.mesh)
@@ -266,45 +266,40 @@ def measured(
     heard = noise_like(values, noise, rng)
     for name, scale in (scales or {}).items():
         values[:, :, NAMES.index(name)] *= scale
-    return Responses(NAMES, POINTS, frequencies, values + heard)
+    return Measurement(sensors_at(POINTS, NAMES), frequencies, (values + heard).swapaxes(1, 2))
 
 
 G = 9.80665  # m/s², standard gravity
 
 
-def _exchanged(responses: Responses, axis: int, first: int, second: int) -> Responses:
+def _exchanged(responses: Measurement, axis: int, first: int, second: int) -> Measurement:
     values = np.moveaxis(responses.values, axis, 0).copy()
     values[[first, second]] = values[[second, first]]
     return replace(responses, values=np.moveaxis(values, 0, axis))
 
 
-def _times(factor: Callable[[np.ndarray], np.ndarray]) -> Callable[[Responses], Responses]:
-    def change(responses: Responses) -> Responses:
+def _times(factor: Callable[[np.ndarray], np.ndarray]) -> Callable[[Measurement], Measurement]:
+    def change(responses: Measurement) -> Measurement:
         omega = 2 * np.pi * responses.frequencies[:, None, None]
         return replace(responses, values=responses.values * factor(omega))
 
     return change
 
 
-DISTORTIONS: dict[str, Callable[[Responses], Responses]] = {
+DISTORTIONS: dict[str, Callable[[Measurement], Measurement]] = {
     "g": _times(lambda omega: 1 / G + 0 * omega),
     "velocity": _times(lambda omega: 1 / (1j * omega)),
     "displacement": _times(lambda omega: -1 / omega**2),
     "opposite": _times(lambda omega: -1 + 0 * omega),
     "conjugated": lambda responses: replace(responses, values=responses.values.conj()),
-    "swapped_channels": lambda responses: _exchanged(responses, 1, 0, 1),
-    "swapped_sensors": lambda responses: _exchanged(responses, 2, 0, 5),
-    "two_sensors": lambda responses: replace(
-        responses,
-        sensors=responses.sensors[:2],
-        points=responses.points[:2],
-        values=responses.values[:, :, :2],
-    ),
+    "swapped_channels": lambda responses: _exchanged(responses, 2, 0, 1),
+    "swapped_sensors": lambda responses: _exchanged(responses, 1, 0, 5),
+    "two_sensors": lambda responses: responses.without(np.arange(len(responses.sensors)) > 1),
 }
 """By name, what is done to the responses."""
 
 
-def every(responses: Responses, step: int, *, up_to: float) -> Responses:
+def every(responses: Measurement, step: int, *, up_to: float) -> Measurement:
     """Every so many frequencies, up to one [Hz]."""
     rows = np.flatnonzero(responses.frequencies <= up_to)[::step]
     return replace(

@@ -28,15 +28,20 @@ import numpy as np
 from scipy import signal
 
 from drivers.errors import LinkError
-from era_haptics.lab.measuring.sound_card import PERIOD, Desk, Multisine, ResponseEstimate
+from era_haptics.lab.measuring.sound_card import (
+    PERIOD,
+    Desk,
+    Multisine,
+    ResponseEstimate,
+    WiredSensor,
+    are_places,
+)
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
 from model.estimate.measurement import (
     MeasuredValue,
-    Responses,
-    WiredSensor,
-    are_places,
-    responses_of,
+    Measurement,
+    measurement_of,
     write_responses,
 )
 from model.files.csv_file import read_lines
@@ -395,16 +400,16 @@ def measured_from(
     source: Path, desk: Desk, output: Path
 ) -> tuple[list[str | None], dict[str, Any]]:
     """Read files of a stepped sine, write responses, and return the report; raises InputError."""
-    found = responses_of(read_stepped(source, desk), desk.rig)
+    found = measurement_of(read_stepped(source, desk), desk.rig)
     return written(found, desk, output, source=str(source))
 
 
 def written(
-    found: Responses, desk: Desk, output: Path, *, source: str
+    found: Measurement, desk: Desk, output: Path, *, source: str
 ) -> tuple[list[str | None], dict[str, Any]]:
     """Write responses that have a source; return the report. Raises InputError."""
     write_responses(output, found, desk.rig)
-    absent = [each.name for each in desk.sensors if each.name not in found.sensors]
+    absent = [each.name for each in desk.sensors if each.name not in found.names]
     lines = found.frequencies
     count = found.values.size - found.count
     rows = [
@@ -417,7 +422,7 @@ def written(
     ]
     return rows, {
         "frequencies_hz": lines.tolist(),
-        "sensors": [*found.sensors],
+        "sensors": [*found.names],
         "without": absent,
         "values": found.count,
         "values_missing": count,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from controller.plate_measurement import MeasuredPlate
 from era_haptics.lab.measuring.loopback import (
     check_clocks,
     check_coherence,
@@ -31,27 +32,19 @@ from era_haptics.lab.measuring.sound_card import (
     Multisine,
     Run,
     SoundCard,
+    WiredSensor,
+    are_places,
     converters,
     default_frequencies,
     estimate,
     open_card,
     play,
+    read_sensors,
     run_time,
 )
 from model.arrays import ComplexArray, FloatArray, best_first
 from model.commands.options import Stopwatch, progress_bar
-from model.estimate.forward import Sensor
-from model.estimate.measurement import (
-    DeviceSettings,
-    MeasuredPlate,
-    Measurement,
-    Repeat,
-    Responses,
-    WiredSensor,
-    are_places,
-    read_sensors,
-    write_responses,
-)
+from model.estimate.measurement import Measurement, Repeat, write_responses
 from model.processes import Progress
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -183,7 +176,7 @@ class MeasuredResponses:
     blocks were lost; looped (f,): response of the loop-back.
     """
 
-    responses: Responses
+    responses: Measurement
     coherence: FloatArray
     std: FloatArray
     latency: float
@@ -356,7 +349,7 @@ def measure_at_once(
         "frequencies_hz": found.responses.frequencies.tolist(),
         "latency_s": found.latency,
         "repeated_runs": found.repeated,
-        "sensors": {name: found.quality(n) for n, name in enumerate(found.responses.sensors)},
+        "sensors": {name: found.quality(n) for n, name in enumerate(found.responses.names)},
         "stepped": check,
         "measure_time_s": timed.elapsed,
         "files": [str(output)],
@@ -372,7 +365,7 @@ def _rows(found: MeasuredResponses, check: dict[str, Any] | None, *, rate: float
         f"{found.repeated} runs repeated for lost blocks"
     )
     yield "sensor      coherence   lowest   noise    square law"
-    for n, name in enumerate(found.responses.sensors):
+    for n, name in enumerate(found.responses.names):
         yield (
             f"{name:10s} {np.median(found.coherence[:, n]):10.4f} "
             f"{found.coherence[:, n].min():8.4f} {100 * np.median(found.std[:, n]):6.2f} % "
@@ -389,20 +382,25 @@ _REPEATED = 1  # the run: phases differ between ERAs, so that modes of every sym
 _COMPARED = 2  # lines of it
 
 
-def measure_plate(rig: Rig, settings: DeviceSettings, *, progress: Progress) -> MeasuredPlate:
+def measure_plate(
+    rig: Rig,
+    device: str,
+    sensors_file: Path,
+    *,
+    level: float | None,
+    frequencies: FloatArray | None,
+    periods: int,
+    seed: int,
+    progress: Progress,
+) -> MeasuredPlate:
     """Measure through a sound card, which plays and records.
 
-    Raises InputError, LinkError, as `era measure` does.
+    level, frequencies, seed: as of `open_desk`; periods: of each run that count. Raises InputError,
+    LinkError, as `era measure` does.
     """
-    desk = Desk(rig, read_sensors(settings.sensors_file, rig.plate))
-    with open_desk(
-        desk,
-        settings.device,
-        level=settings.level,
-        frequencies=settings.frequencies,
-        seed=settings.seed,
-    ) as (card, multisine):
-        return measure_through(desk, card, multisine, periods=settings.periods, progress=progress)
+    desk = Desk(rig, read_sensors(sensors_file, rig.plate))
+    with open_desk(desk, device, level=level, frequencies=frequencies, seed=seed) as opened:
+        return measure_through(desk, *opened, periods=periods, progress=progress)
 
 
 def measure_through(
@@ -427,20 +425,11 @@ def measure_through(
         repeats.append(_repeats(desk, found, again, run.whole))
         progress(runs + number, runs + 2)
     # Responses with the usual error of readings, and the noise beside it.
-    responses = found.responses
-    values = responses.values.swapaxes(1, 2)  # (f, sensors, eras)
-    plain = Measurement.of(
-        [Sensor(each.name, x=each.x, y=each.y, mass=each.mass) for each in desk.sensors],
-        responses.frequencies,
-        values,
-    )
-    rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 2)))
+    plain = found.responses
+    rms = np.sqrt((np.abs(plain.values) ** 2).mean(axis=(0, 2)))
     noise = (found.std * rms)[:, :, None] / np.sqrt(2)  # of each part
     measurement = replace(
-        replace(plain, std=np.hypot(plain.std, noise)),
-        half_level=repeats[0],
-        at_end=repeats[1],
-        drives_lag=True,
+        plain, errors=np.hypot(plain.std, noise), half_level=repeats[0], at_end=repeats[1]
     )
     return MeasuredPlate(
         measurement,
@@ -467,7 +456,7 @@ def _repeats(
     """The loudest lines of a run and what the responses make of them, all ERAs together."""
     full = [*desk.rig.full_levels.values()]
     bases = multisine.played(_REPEATED)[:, : len(full)] * full  # (f, eras)
-    first = np.einsum("fes,fe->fs", found.responses.values, bases)
+    first = np.einsum("fse,fe->fs", found.responses.values, bases)
     heard = multisine.found(recorded)[:, desk.columns] / desk.sensitivities
     again = heard / converters(found.looped)[:, None]
     size = np.linalg.norm(bases, axis=1, keepdims=True)
@@ -511,11 +500,12 @@ def measured_by_simulation(
         for point, weight in zip(points, weights, strict=True)
     ]
     drives = drawn.factors(rig) / np.array([*rig.full_levels.values()])
-    values = np.concatenate(found, axis=2) * drives[:, None]
+    values = np.concatenate(found, axis=2) * drives[:, None]  # (f, eras, sensors)
     parts = np.random.default_rng(seed).standard_normal((2, *values.shape))
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 1)))
     values += NOISE * rms * (parts[0] + 1j * parts[1])
-    names = tuple(each.name for each in sensors)
-    masses = np.array([each.mass for each in sensors]) if are_places(sensors) else None
-    responses = Responses(names, points, frequencies, values, masses=masses)
-    return written(responses, desk, output, source="simulated plate")
+    places = [each.place for each in sensors]
+    if not are_places(sensors):
+        places = [replace(each, mass=0.0) for each in places]
+    measured = Measurement(places, frequencies, values.swapaxes(1, 2))
+    return written(measured, desk, output, source="simulated plate")

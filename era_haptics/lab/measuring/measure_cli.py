@@ -113,9 +113,8 @@ def measure(
     calibrate, and for era rig identify --measured.
     """
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
-    from era_haptics.lab.measuring.sound_card import Desk
+    from era_haptics.lab.measuring.sound_card import Desk, are_places, read_sensors
     from model.config.units import parse_frequencies
-    from model.estimate.measurement import are_places, read_sensors
     from model.files.output_paths import check_ending, check_place
     from model.rig.rig_file import load_rig
 

@@ -17,17 +17,11 @@ import numpy as np
 
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.measure import MeasuredResponses, measure
-from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard
+from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard, WiredSensor
 from model.arrays import ComplexArray, FloatArray
 from model.commands.options import Stopwatch
 from model.errors import InputError
-from model.estimate.measurement import (
-    Responses,
-    WiredSensor,
-    read_measured,
-    responses_of,
-    write_responses,
-)
+from model.estimate.measurement import Measurement, measurement_of, read_measured, write_responses
 
 _SAME = 0.02  # of the response, or so many times its noise:
 _OF_NOISE = 3.0
@@ -66,24 +60,22 @@ class PositionsFile:
         settings = {each.setting for each in measured} - {self.setting}
         if settings:
             raise self._other("setting", self.setting, " and ".join(settings) or "none")
-        found = responses_of(measured, self.desk.rig)
+        found = measurement_of(measured, self.desk.rig)
         if found.skipped or not np.array_equal(found.frequencies.round(6), played.round(6)):
             raise self._other("frequencies", _span(played), _span(found.frequencies))
-        for at, values in zip(found.points.tolist(), found.values.transpose(2, 0, 1), strict=True):
+        for at, values in zip(found.points.tolist(), found.values.swapaxes(0, 1), strict=True):
             self.values[self._place_at(at).name] = values
 
     def keep(self, place: WiredSensor, found: MeasuredResponses) -> None:
         """Write the file with another place; raises OSError."""
-        self.values[place.name] = found.responses.values[:, :, 0]
+        self.values[place.name] = found.responses.values[:, 0]
         places = [place for place in self.desk.sensors if place.name in self.values]
-        responses = Responses(
-            tuple(place.name for place in places),
-            np.array([[place.x, place.y] for place in places]),
+        measured = Measurement(
+            tuple(place.place for place in places),
             self.multisine.frequencies,
-            np.stack([self.values[place.name] for place in places], axis=2),
-            masses=np.array([place.mass for place in places]),
+            np.stack([self.values[place.name] for place in places], axis=1),
         )
-        write_responses(self.path, responses, self.desk.rig, setting=self.setting)
+        write_responses(self.path, measured, self.desk.rig, setting=self.setting)
 
     def _place_at(self, at: Sequence[float]) -> WiredSensor:
         for place in self.desk.sensors:
@@ -218,7 +210,7 @@ def measure_positions(
 
 def _check_moved(file: PositionsFile, place: WiredSensor, found: MeasuredResponses) -> None:
     """Raise InputError for a response that is that of another place."""
-    own = found.responses.values[:, :, 0]
+    own = found.responses.values[:, 0]
     limit = max(_SAME, _OF_NOISE * float(np.median(found.std)))
     for other in file.desk.sensors:
         is_near = math.dist((place.x, place.y), (other.x, other.y)) < _APART

@@ -15,18 +15,28 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from drivers.errors import LinkError
 from model.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from model.errors import InputError
-from model.estimate.measurement import Responses, WiredSensor
+from model.estimate.forward import Sensor
+from model.estimate.measurement import (
+    INPUT_COLUMNS,
+    PLACE_COLUMNS,
+    Measurement,
+    named_place,
+    sensor_mass,
+)
+from model.files.csv_file import CsvLine, read_lines
 from model.reduction.reduced_plate import reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import footprints_of
+from model.structure.plate import Plate
 from model.transients.time_response import plate_in_time
 from sim.soft_amp.engine import address_of
 from sim.soft_amp.jack import IS_INPUT, IS_OUTPUT, JackClient, jack_name, libjack
@@ -421,6 +431,84 @@ def converters(response: ComplexArray) -> ComplexArray:
 
 
 @dataclass(frozen=True)
+class WiredSensor:
+    """An accelerometer at x, y [m] on an input of a sound card."""
+
+    name: str
+    x: float
+    y: float
+    input: int
+    """Number of the input, from 1."""
+    sensitivity: float
+    """Samples, in full scale, by acceleration [1/(m/s²)]."""
+    mass: float = 0.0
+    """Mass [kg] of one that is moved, as `model.estimate.forward.Sensor.mass`."""
+
+    @property
+    def place(self) -> Sensor:
+        """The sensor on the plate, whatever it is wired to."""
+        return Sensor(self.name, x=self.x, y=self.y, mass=self.mass)
+
+
+def read_sensors(
+    path: Path, plate: Plate, *, mass: float | None = None, may_move: bool = False
+) -> tuple[WiredSensor, ...]:
+    """Read the accelerometers of a plate, or the places of one that is moved.
+
+    mass [g]: of the sensor, in place of the file's; may_move: whether one that is moved will do.
+    Raises InputError with file and line.
+    """
+    sensors: list[WiredSensor] = []
+    columns = (*PLACE_COLUMNS, *INPUT_COLUMNS[:2])
+    lines = read_lines(path, columns, optional=tuple(_OPTIONAL))
+    moves = may_move and len(lines) > 1 and len({line.number("input") for line in lines}) == 1
+    for line in lines:
+        sensors.append(_sensor(line, sensors, plate, mass=mass, moves=moves))
+    if not moves and len(sensors) > 1 and any(sensor.mass for sensor in sensors):
+        raise InputError(
+            f"{path}: mass_g must be of one sensor that is moved, got several sensors, which weigh "
+            "on the plate together; leave it out, and give them in the rig as masses"
+        )
+    return tuple(sensors)
+
+
+def are_places(sensors: Sequence[WiredSensor]) -> bool:
+    """Whether the sensors are places of one that is moved."""
+    return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
+
+
+def _sensor(
+    line: CsvLine, before: Sequence[WiredSensor], plate: Plate, *, mass: float | None, moves: bool
+) -> WiredSensor:
+    place = line.place
+    name, (x, y) = named_place(line, [other.name for other in before], plate)
+    channel, sensitivity = map(line.number, ("input", "mv_per_m_s2"))
+    is_taken = not moves and any(channel == other.input for other in before)
+    if channel != int(channel) or channel < 1 or is_taken:
+        raise InputError(
+            f"{place}: input must be a number from 1 that no other sensor has, got {channel:g}; "
+            "one that is moved from place to place is for era measure, alone in its file"
+        )
+    gain, full_scale, own = (line.number(column, default) for column, default in _OPTIONAL.items())
+    for column, value in (("gain", gain), ("full_scale_v", full_scale)):
+        if value <= 0:
+            raise InputError(f"{place}: {column} must be above zero, got {value:g}")
+    weight = sensor_mass(place, own if mass is None else mass, column="mass_g")
+    if sensitivity == 0:
+        raise InputError(f"{place}: mv_per_m_s2 must not be zero, got 0; negative: upside down")
+    found = WiredSensor(name, x, y, int(channel), 1e-3 * sensitivity * gain / full_scale, weight)
+    if moves and before and replace(before[0], name=name, x=x, y=y) != found:
+        raise InputError(
+            f"{place}: one sensor that is moved must have one sensitivity, gain, full scale and "
+            f"mass, got others than sensor {before[0].name}; make the columns the same in all lines"
+        )
+    return found
+
+
+_OPTIONAL = dict(zip(INPUT_COLUMNS[2:], (1.0, 1.0, 0.0), strict=True))
+
+
+@dataclass(frozen=True)
 class Desk:
     """How a rig is wired to a sound card: its ERAs by their channels, counted from 1; a loop-back.
 
@@ -476,19 +564,18 @@ class Desk:
 
     def responses(
         self, frequencies: FloatArray, values: ComplexArray, looped: ComplexArray
-    ) -> Responses:
+    ) -> Measurement:
         """Accelerations per base displacement [1/s²] from those of samples (f, inputs, sources).
 
         looped (f,): of the loop-back.
         """
         full = np.array([*self.rig.full_levels.values()])
         plain = values[:, self.columns, : len(self.eras)] / converters(looped)[:, None, None]
-        return Responses(
-            tuple(sensor.name for sensor in self.sensors),
-            np.array([[sensor.x, sensor.y] for sensor in self.sensors]),
+        return Measurement(
+            tuple(each.place for each in self.sensors),
             frequencies,
-            plain.transpose(0, 2, 1) / full[:, None] / self.sensitivities,
-            masses=np.array([sensor.mass for sensor in self.sensors]),
+            plain / full / self.sensitivities[:, None],
+            drives_lag=True,
         )
 
     def on_outputs(self, sources: FloatArray) -> FloatArray:

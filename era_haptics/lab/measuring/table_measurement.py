@@ -10,9 +10,16 @@ from drivers.by_hand.actions import BlockingAmplifier
 from drivers.errors import DriverError
 from drivers.playing import AmplifierLayer, AmplifierTone
 from era_haptics.lab.measuring.loopback import check_levels, is_whole
-from era_haptics.lab.measuring.sound_card import Desk, Run, SoundCard, open_card, play, ramped
+from era_haptics.lab.measuring.sound_card import (
+    Desk,
+    Run,
+    SoundCard,
+    open_card,
+    play,
+    ramped,
+    read_sensors,
+)
 from model.answer.answer import Layer
-from model.estimate.measurement import read_sensors
 from model.processes import Progress
 from model.rig.rig import Rig
 from model.study.promise_at_sensors import (

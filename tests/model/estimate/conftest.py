@@ -24,7 +24,7 @@ def found(hidden: Hidden) -> Identification:
     rig = load_rig(example_rig_path())
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
-    return identify(rig, Measurement.of(sensors, SETTLED_PATTERNS_FREQUENCIES, values))
+    return identify(rig, Measurement(sensors, SETTLED_PATTERNS_FREQUENCIES, values))
 
 
 @pytest.fixture(scope="session")

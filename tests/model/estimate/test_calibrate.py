@@ -24,12 +24,12 @@ from model.estimate.calibrate import (
     change_rows,
     finding_rows,
 )
-from model.estimate.measurement import Responses
+from model.estimate.measurement import Measurement
 from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad
-from plates import NAMES, POINTS, make_paper_rig, perturbed
+from plates import NAMES, make_paper_rig, perturbed
 from plates import measured as plates_measured
 
 FREQUENCIES = np.arange(40.0, 321.0, 40.0)
@@ -148,7 +148,7 @@ def fitted(rig: Rig, truth: Rig) -> Calibration:
     return calibrated(rig, measured(truth, scales={"P3": 1.25, "P8": 0.0}))
 
 
-def calibrated(rig: Rig, responses: Responses, *, all_scales: bool = False) -> Calibration:
+def calibrated(rig: Rig, responses: Measurement, *, all_scales: bool = False) -> Calibration:
     """As `era calibrate` does it."""
     return calibrate(rig, responses, check_consistency(rig, responses), all_scales=all_scales)
 
@@ -300,7 +300,7 @@ def test_calibrate_estimates_all_scales_when_requested(rig, truth):
 def test_calibrate_refuses_too_few_sensors_and_silence(rig, truth):
     """Two live sensors, and silence."""
     full = measured(truth)
-    two = Responses(NAMES[:2], POINTS[:2], full.frequencies, full.values[:, :, :2])
+    two = full.without(np.arange(len(NAMES)) > 1)
     with pytest.raises(InputError, match="got 2"):
         calibrated(rig, two)
     with pytest.raises(InputError, match="zero"):

@@ -26,7 +26,7 @@ from model.arrays import ComplexArray, FloatArray
 from model.estimate import findings
 from model.estimate.calibrate import calibrate
 from model.estimate.fit import SensedPlate, fit, sensed_plate
-from model.estimate.measurement import Responses
+from model.estimate.measurement import Measurement, sensors_at
 from model.estimate.rig_check import check_consistency
 from model.estimate.space import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
@@ -44,7 +44,7 @@ FREQUENCIES = np.array([70.0, 130.0, 260.0, 410.0])
 def measured(rig: Rig) -> ComplexArray:
     """Responses (f, e, s) of the rig with other gains, noise, and one value left out."""
     rng = np.random.default_rng(3)
-    values = sensed_plate(rig, POINTS, FREQUENCIES).responses().swapaxes(1, 2)
+    values = sensed_plate(rig, sensors_at(POINTS), FREQUENCIES).responses().swapaxes(1, 2)
     values = values * rng.uniform(0.8, 1.2, (*values.shape[:2], 1))
     values = values * (1 + 0.1 * rng.standard_normal(values.shape))
     values[1, 2, 3] = np.nan
@@ -53,8 +53,9 @@ def measured(rig: Rig) -> ComplexArray:
 
 def fit_a_rig() -> None:
     """Search with gains free, and with a prior that holds the mean of all scales."""
-    plate = sensed_plate(RIG, POINTS, FREQUENCIES, has_form=True)
-    measurement = Responses(NAMES, POINTS, FREQUENCIES, measured(RIG)).as_measurement()
+    plate = sensed_plate(RIG, sensors_at(POINTS), FREQUENCIES, has_form=True)
+    places = sensors_at(POINTS, NAMES)
+    measurement = Measurement(places, FREQUENCIES, measured(RIG).swapaxes(1, 2))
     space, count = plate.model.space, len(POINTS)
     covariance, own = np.eye(space.size), np.arange(space.size)[space.groups["sensor_scale"]]
     covariance[np.ix_(own, own)] += 1e2 * (np.eye(count) - 1 / count)
@@ -70,7 +71,7 @@ def match_a_plate() -> None:
     """Search for a plate with one channel that was not driven."""
     values = measured(replace(RIG, plate=RIG.plate.scaled(modulus=1.1)))
     values[:, 1] = np.nan
-    plate = sensed_plate(RIG, POINTS, FREQUENCIES)
+    plate = sensed_plate(RIG, sensors_at(POINTS), FREQUENCIES)
     findings.match_plate(plate, values.swapaxes(1, 2), drives=[0, 2, 1, 3])
 
 
@@ -119,7 +120,7 @@ SENSED_PLATE_POINTS = np.random.default_rng(0).uniform(0.01, 0.2, (30, 2))
 @pytest.fixture(scope="module")
 def solved() -> SensedPlate:
     """Solved as the rig has it."""
-    return sensed_plate(SENSED_PLATE_RIG, SENSED_PLATE_POINTS, SENSED_PLATE_FREQUENCIES)
+    return sensed_plate(SENSED_PLATE_RIG, sensors_at(SENSED_PLATE_POINTS), SENSED_PLATE_FREQUENCIES)
 
 
 def _with(rig: Rig, *, modulus: float = 1.0, thickness: float = 1.0, loss: float = 1.0) -> Rig:
@@ -167,7 +168,8 @@ def _mounted(rig: Rig, *, stiffness: float, damping: float, mass: float) -> Rig:
 def test_responses_are_those_of_a_new_solve(solved, other, within):
     """Relative L2 over frequencies, ERAs and points; shear and rotary inertia limit thickness."""
     found = solved.of(other).responses()
-    exact = sensed_plate(other, SENSED_PLATE_POINTS, SENSED_PLATE_FREQUENCIES).responses()
+    places = solved.model.sensors
+    exact = sensed_plate(other, places, SENSED_PLATE_FREQUENCIES).responses()
     assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
 
 
@@ -290,8 +292,8 @@ def test_form_errors_are_those_of_a_plate_solved_anew(
     rig = replace(rig, masses=(PointLoad(0.1, 0.05, mass=0.004),))
     plate = replace(rig.plate, loss_exponent=0.3, mode_deviations=((0.02, 0.3), (-0.01, 0.0)))
     rig = replace(rig, plate=plate)
-    sensed = sensed_plate(rig, points, FORM_ERRORS_FREQUENCIES, has_form=True)
-    nominal = sensed_plate(rig, points, FORM_ERRORS_FREQUENCIES).responses()
+    sensed = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES, has_form=True)
+    nominal = sensed_plate(rig, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses()
     np.testing.assert_allclose(sensed.responses(), nominal, atol=2e-5 * np.abs(nominal).max())
 
     space, z = sensed.model.space, np.zeros(sensed.model.space.size)
@@ -301,7 +303,7 @@ def test_form_errors_are_those_of_a_plate_solved_anew(
     points = points * [built.plate.length / plate.length, 1]
     if kind == "sensor_place":
         points += np.array([5e-4, -5e-4])
-    change = sensed_plate(built, points, FORM_ERRORS_FREQUENCIES).responses() - nominal
+    change = sensed_plate(built, sensors_at(points), FORM_ERRORS_FREQUENCIES).responses() - nominal
     np.testing.assert_allclose(found - nominal, change, atol=0.2 * np.abs(change).max())
 
 

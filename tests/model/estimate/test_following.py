@@ -313,7 +313,7 @@ def identified(hidden: Hidden, *, rounds: int = 4) -> Fit:
     values = hidden.measured(FREQUENCIES, np.random.default_rng(1))
     played = (np.arange(len(FREQUENCIES))[:, None] + np.arange(4)) % 4 < rounds
     values = np.where(played[:, None], values, np.nan)
-    return fit_in_stages(rig, Measurement.of(sensors, FREQUENCIES, values))
+    return fit_in_stages(rig, Measurement(sensors, FREQUENCIES, values))
 
 
 @pytest.mark.parametrize("seed", shortly([1, 2], [1]))
@@ -344,7 +344,7 @@ def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:
     """One a tenth thicker, with tones to 180 Hz, has its eighth mode above twice that."""
     rig = load_rig(example_rig_path())
     free = solve_free_plate(rig.plate, rig.mesh, frequency_max=180.0)
-    measurement = Measurement.of(
+    measurement = Measurement(
         [Sensor("A1", rig.eras[0].name)], np.array([60.0]), np.ones((1, 1, 4))
     )
     model = model_of(rig, free, measurement, masses=0)

@@ -319,7 +319,7 @@ def measured(rig: Rig, tones: FloatArray, places: FloatArray) -> Measurement:
     noise = rng.standard_normal((2, *responses.shape))
     sensors = [Sensor(f"P{n}", x=x, y=y, mass=MASS) for n, (x, y) in enumerate(places.tolist())]
     noisy = responses + 0.002 * np.abs(responses) * (noise[0] + 1j * noise[1])
-    return Measurement.of(sensors, tones, noisy)
+    return Measurement(sensors, tones, noisy)
 
 
 def test_identified_board_has_the_parts_that_it_was_built_of() -> None:

@@ -55,7 +55,7 @@ def measurement(rig: Rig, hidden: Hidden) -> Measurement:
     """Responses of the hidden plate at its ERAs to interleaved tones."""
     values = hidden.measured(FREQUENCIES, np.random.default_rng(3))
     values = np.where(ONE_ROUND[:, None], values, np.nan)
-    return Measurement.of([Sensor(era.name, era.name) for era in rig.eras], FREQUENCIES, values)
+    return Measurement([Sensor(era.name, era.name) for era in rig.eras], FREQUENCIES, values)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
     tones = np.linspace(40.0, 500.0, 47)
     values = draw("plain", 3).measured(tones, np.random.default_rng(3))
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    same = Measurement.of(sensors, tones, 1.1 * values)
+    same = Measurement(sensors, tones, 1.1 * values)
     once = identify(rig, same, seed=1)
     again = identify(once.rig, same, seed=1)
     first, second = (each.rig.uncertainty.common_gain for each in (once, again))
@@ -147,7 +147,7 @@ def test_uneven_plate_is_promised_less(rig: Rig, found: Identification) -> None:
     """
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = draw("uneven", 3).measured(FREQUENCIES, np.random.default_rng(3))
-    uneven = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=1)
+    uneven = identify(rig, Measurement(sensors, FREQUENCIES, values), seed=1)
     assert uneven.is_explained
     known = uneven.rig.uncertainty
     assert known.field > 0.01
@@ -177,7 +177,7 @@ def test_errors_of_an_uneven_plate_are_as_wide_as_paths_disagree(rig: Rig) -> No
     for seed in (2, 3, 4, 5):
         plate = draw("uneven", seed)
         values = plate.measured(FREQUENCIES, np.random.default_rng(seed))
-        identified = identify(rig, Measurement.of(sensors, FREQUENCIES, values), seed=1)
+        identified = identify(rig, Measurement(sensors, FREQUENCIES, values), seed=1)
         off = parameters_held(identified, plate.mounted)
         errors += [*np.abs(off["stiffness"]), *np.abs(off["gain"])]
     assert np.mean(np.array(errors) < 2) > 0.6
@@ -242,7 +242,7 @@ def test_values_without_an_error_and_frequencies_in_another_order_are_refused(
         (measurement.values, FREQUENCIES[::-1]),
     ):
         with pytest.raises(InputError):
-            Measurement.of(measurement.sensors, frequencies, values)
+            Measurement(measurement.sensors, frequencies, values)
 
 
 @pytest.mark.long
@@ -263,7 +263,7 @@ def test_bonded_frame_is_not_known_well_by_sensors_at_feet(rig: Rig, sensors: in
     for kind, seed in (("frame", 1), ("uneven", 3)):
         values = draw(kind, seed).measured(FREQUENCIES, np.random.default_rng([seed, 1]), sensors)
         heard = [Sensor(era.name, era.name) for era in rig.eras[:sensors]]
-        found.append(identify(rig, Measurement.of(heard, FREQUENCIES, values), seed=1))
+        found.append(identify(rig, Measurement(heard, FREQUENCIES, values), seed=1))
     frame, uneven = found
     assert frame.chi2 < 2
     assert not frame.is_explained
@@ -306,7 +306,7 @@ def test_moduli_along_across_and_of_shear_are_found() -> None:
     noise = np.random.default_rng(1).standard_normal((*responses.shape, 2)) @ [1, 1j]
     responses = responses * (1 + 0.005 * noise) / rig.eras[0].stroke
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
-    found = identify(rig, Measurement.of(sensors, tones, responses), seed=1)
+    found = identify(rig, Measurement(sensors, tones, responses), seed=1)
     assert found.is_explained
     known = found.rig.plate
     # A thicker board of a smaller modulus has the same modes: rigidities are what is found.
@@ -341,7 +341,7 @@ def clocks_found() -> Identification:
     values = draw("form", 1).measured(SETTLED_PATTERNS_FREQUENCIES, np.random.default_rng(1))
     late = LATE * (OF[None, :] - OF[:, None])
     values = values * np.exp(-2j * math.pi * SETTLED_PATTERNS_FREQUENCIES[:, None, None] * late)
-    measurement = Measurement.of(sensors, SETTLED_PATTERNS_FREQUENCIES, values)
+    measurement = Measurement(sensors, SETTLED_PATTERNS_FREQUENCIES, values)
     return identify(rig, replace(measurement, clock_errors={"a": 4e-6, "b": 4e-6}))
 
 

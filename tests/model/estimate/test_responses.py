@@ -4,6 +4,7 @@ Files of measured frequency responses, and what is refused in them.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +21,10 @@ from model.estimate.calibrate import calibrate
 from model.estimate.fit import sensed_plate
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
-    Responses,
+    Measurement,
+    measurement_of,
     read_measured,
-    responses_of,
+    sensors_at,
     write_responses_csv,
     write_responses_uff,
 )
@@ -57,7 +59,7 @@ def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     size = np.sqrt((np.abs(exact) ** 2).mean(axis=2, keepdims=True))
     noise = rng.standard_normal((2, *exact.shape))
     values = exact + 1e-3 * size * (noise[0] + 1j * noise[1])
-    responses = Responses(tuple(f"P{n}" for n in range(12)), points, TONES, values)
+    responses = Measurement(sensors_at(points), TONES, values.swapaxes(1, 2))
     found = calibrate(rig, responses, check_consistency(rig, responses))
     loss = next(one for one in found.parameters if one.parameter.kind == "loss_factor")
     assert loss.standard_error is not None
@@ -72,7 +74,7 @@ def test_viscous_plate_differs_as_its_model_in_time_does() -> None:
     from those of polynomials.
     """
     rig, points = rig_and_points()
-    plate = sensed_plate(rig, points, TONES, has_form=True)
+    plate = sensed_plate(rig, sensors_at(points), TONES, has_form=True)
     zero = np.zeros(plate.model.space.size)
     difference = viscous_difference(plate.model, zero)
     model = replace(plate.model, law=difference)
@@ -100,14 +102,21 @@ WRITERS = {"csv": write_responses_csv, "uff": write_responses_uff}
 
 
 @pytest.fixture
-def responses() -> Responses:
+def responses() -> Measurement:
     """Three sensors, three frequencies, two of four ERAs; one value was not measured."""
     rng = np.random.default_rng(4)
     values = np.full((3, 4, 3), np.nan, dtype=complex)
     values[:, :2] = 1e5 * (rng.standard_normal((3, 2, 3)) + 1j * rng.standard_normal((3, 2, 3)))
     values[1, 0, 2] = np.nan
     points = np.array([[0.1, 0.05], [0.2, 0.15], [0.3048, 0.2286]])
-    return Responses(("P1", "P2", "rim"), points, np.array([50.0, 110.25, 320.0]), values)
+    sensors = sensors_at(points, ("P1", "P2", "rim"))
+    return Measurement(sensors, np.array([50.0, 110.25, 320.0]), values.swapaxes(1, 2))
+
+
+def with_masses(measurement: Measurement, masses: Sequence[float]) -> Measurement:
+    """The same by sensors that weigh something [kg]."""
+    each = zip(measurement.sensors, masses, strict=True)
+    return replace(measurement, sensors=[replace(one, mass=mass) for one, mass in each])
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -115,11 +124,11 @@ def test_responses_files_read_back_what_was_written(responses, coarse_rig, tmp_p
     """Sensors, places, frequencies and complex values, gaps among them."""
     path = tmp_path / f"measured.{ending}"
     WRITERS[ending](path, responses, coarse_rig)
-    back = responses_of(read_measured(path), coarse_rig)
-    order = [back.sensors.index(name) for name in responses.sensors]
+    back = measurement_of(read_measured(path), coarse_rig)
+    order = [back.names.index(name) for name in responses.names]
     np.testing.assert_allclose(back.points[order], responses.points, rtol=1e-12)
     np.testing.assert_array_equal(back.frequencies, responses.frequencies)
-    np.testing.assert_allclose(back.values[:, :, order], responses.values, rtol=1e-11)
+    np.testing.assert_allclose(back.values[:, order], responses.values, rtol=1e-11)
     assert back.count == 17
 
 
@@ -158,11 +167,11 @@ def test_read_measured_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: P
     path = tmp_path / "other.unv"
     file = pyuff.UFF(str(path))
     file.write_sets([nodes, record], "overwrite", force_double=False)
-    back = responses_of(read_measured(path), coarse_rig)
-    assert back.sensors == ("node:7",)
+    back = measurement_of(read_measured(path), coarse_rig)
+    assert back.names == ("node:7",)
     np.testing.assert_allclose(back.frequencies, [50, 60, 70])
-    np.testing.assert_allclose(back.values[:, 1, 0], [-1 - 2j, -3 + 1j, 250 - 0.5j], rtol=1e-5)
-    assert np.isnan(back.values[:, [0, 2, 3]]).all()
+    np.testing.assert_allclose(back.values[:, 0, 1], [-1 - 2j, -3 + 1j, 250 - 0.5j], rtol=1e-5)
+    assert np.isnan(back.values[..., [0, 2, 3]]).all()
 
 
 # pyuff does not close a file that it has written bytes to.
@@ -170,7 +179,7 @@ def test_read_measured_reads_uff_of_another_program(coarse_rig: Rig, tmp_path: P
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_read_measured_reads_binary_uff(
-    responses: Responses, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
+    responses: Measurement, coarse_rig: Rig, tmp_path: Path, *, is_whole: bool
 ) -> None:
     """Records as bytes (58b) are read to the last bit; one that lost some of them is refused."""
     write_responses_uff(tmp_path / "ascii.uff", responses, coarse_rig)
@@ -180,7 +189,7 @@ def test_read_measured_reads_binary_uff(
     path = tmp_path / "binary.uff"
     pyuff.UFF(str(path)).write_sets(sets, "overwrite")
     if is_whole:
-        back = responses_of(read_measured(path), coarse_rig)
+        back = measurement_of(read_measured(path), coarse_rig)
         np.testing.assert_allclose(back.values, responses.values, rtol=1e-11)
         return
     content = path.read_bytes()
@@ -248,7 +257,7 @@ def test_read_measured_refuses_damaged_files(
         assert len(read_measured(path)) == 17 - 3
         return
     with pytest.raises(InputError, match=rf"measured\.{ending}.*{named}"):
-        responses_of(read_measured(path), coarse_rig)
+        measurement_of(read_measured(path), coarse_rig)
 
 
 def test_comma_may_separate_thousands(responses, coarse_rig, tmp_path):
@@ -282,7 +291,7 @@ def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path
     path = tmp_path / "measured.csv"
     write_responses_csv(path, responses, coarse_rig)
     path.write_bytes(write(path.read_text("utf-8")))
-    back = responses_of(read_measured(path), coarse_rig)
+    back = measurement_of(read_measured(path), coarse_rig)
     np.testing.assert_array_equal(back.values, responses.values)
     assert ("coherence" in caplog.text) == ("coherence" in path.read_text("utf-8", "replace"))
 
@@ -316,9 +325,9 @@ def test_read_measured_reads_uff_of_analysers(
     first = next(number for number, line in enumerate(lines) if line.strip() == "58")
     lines[first + 1] = "an offset of    -1"
     path.write_bytes(end.join(lines).encode(encoding))
-    back = responses_of(read_measured(path), coarse_rig)
-    order = [back.sensors.index(name) for name in responses.sensors]
-    np.testing.assert_allclose(back.values[:, :, order], factor * responses.values, rtol=1e-11)
+    back = measurement_of(read_measured(path), coarse_rig)
+    order = [back.names.index(name) for name in responses.names]
+    np.testing.assert_allclose(back.values[:, order], factor * responses.values, rtol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +353,7 @@ def test_values_beyond_the_limits_are_left_out(responses, coarse_rig, tmp_path, 
     path = tmp_path / "measured.csv"
     write_responses_csv(path, responses, coarse_rig)
     path.write_text(path.read_text("utf-8").replace(",50.0,", ",0.0,"), "utf-8")
-    back = responses_of(read_measured(path), coarse_rig)
+    back = measurement_of(read_measured(path), coarse_rig)
     assert (back.skipped, back.count, back.frequencies.tolist()) == (6, 11, [110.25, 320.0])
     assert "6 of 17" in caplog.text
 
@@ -393,7 +402,7 @@ def test_responses_of_refuses_another_plate(responses, coarse_rig, tmp_path, end
         (coarse_rig, [*measured, elsewhere], "sensor P1"),
     ):
         with pytest.raises(InputError, match=rf"{path.name}:\d+: .*{named}"):
-            responses_of(given, rig)
+            measurement_of(given, rig)
 
 
 @pytest.mark.parametrize("ending", WRITERS)
@@ -405,26 +414,27 @@ def test_responses_per_volt_are_of_exciters(responses, coarse_rig, tmp_path, end
     )
     rig = replace(coarse_rig, eras=exciters)
     path = tmp_path / f"measured.{ending}"
-    weighed = replace(responses, masses=np.array([2e-3, 2e-3, 1.5e-3]))
+    masses = (2e-3, 2e-3, 1.5e-3)
+    weighed = with_masses(responses, masses)
     WRITERS[ending](path, weighed, rig, setting="level 0.1, rig 1a2b3c4d")
     measured = read_measured(path)
     assert {each.setting for each in measured} == {"level 0.1, rig 1a2b3c4d"}
-    back = responses_of(measured, rig)
-    order = [back.sensors.index(name) for name in responses.sensors]
-    np.testing.assert_allclose(back.values[:, :, order], responses.values, rtol=1e-11)
-    np.testing.assert_allclose(back.sensor_masses[order], weighed.masses)
+    back = measurement_of(measured, rig)
+    order = [back.names.index(name) for name in responses.names]
+    np.testing.assert_allclose(back.values[:, order], responses.values, rtol=1e-11)
+    np.testing.assert_allclose([back.sensors[n].mass for n in order], masses)
     with pytest.raises(InputError, match=f"measured.{ending}.*per displacement of the base"):
-        responses_of(measured, coarse_rig)
+        measurement_of(measured, coarse_rig)
 
 
 def test_sensor_that_cannot_be_moved_is_refused(responses, coarse_rig, tmp_path):
     """Two masses at one place, one below zero, and one that is a paperweight's."""
     path = tmp_path / "measured.csv"
     for grams, cause in (("-1", "sensor_mass_g must be"), ("900", "sensor_mass_g must be")):
-        write_responses_csv(path, replace(responses, masses=np.full(3, 2e-3)), coarse_rig)
+        write_responses_csv(path, with_masses(responses, (2e-3,) * 3), coarse_rig)
         path.write_text(path.read_text().replace(",2.0\n", f",{grams}\n", 1))
         with pytest.raises(InputError, match=f"measured.csv:2: {cause}"):
             read_measured(path)
     path.write_text(path.read_text().replace(",900\n", ",3.0\n"))
     with pytest.raises(InputError, match="must have one mass, got"):
-        responses_of(read_measured(path), coarse_rig)
+        measurement_of(read_measured(path), coarse_rig)

@@ -23,6 +23,7 @@ from benchmarks.identification.hidden import draw
 from benchmarks.identification.mistakes import on_glue
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from controller.cli.main import run
+from controller.plate_measurement import MeasuredPlate
 from long_form import shortly
 from model.errors import InputError
 from model.estimate import findings
@@ -30,10 +31,10 @@ from model.estimate.calibrate import MAX_OUTLIERS, calibrate
 from model.estimate.findings import MAX_FIT_ERROR, TEXTS, ShapeMatch, match_plate
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
-    MeasuredPlate,
-    Responses,
+    Measurement,
+    measurement_of,
     read_measured,
-    responses_of,
+    sensors_at,
     write_responses,
 )
 from model.estimate.rig_check import (
@@ -73,7 +74,7 @@ def given_as(which: str, resonance: float = 306.0) -> Rig:
     return load_rig(FOLDER / "rig.yaml").replaced(eras=dict.fromkeys(NAMES, keys))
 
 
-def measured(rig: Rig, seed: int) -> Responses:
+def measured(rig: Rig, seed: int) -> Measurement:
     """What one moved sensor reads of a board whose parts deviate, at every place or at four."""
     found = BuiltBoard.drawn(rig, seed).measured(TONES, seed)
     return found if seed % 2 else found.without(np.arange(12) % 3 > 0)
@@ -131,8 +132,8 @@ def another(rig: Rig, change: Mapping[str, Any]) -> Rig:
             return replace(rig, eras=tuple(loose if e.name == value else e for e in rig.eras))
 
 
-def on_paper(truth: Rig, rng: np.random.Generator) -> Responses:
-    """Responses with the gains and the noise of every measurement."""
+def on_paper(truth: Rig, rng: np.random.Generator) -> Measurement:
+    """Measurement with the gains and the noise of every measurement."""
     eras = tuple(
         replace(era, gains=random_gains(rng, PAPER_TONES, size=0.05, phase=np.radians(5)))
         for era in truth.eras
@@ -140,7 +141,7 @@ def on_paper(truth: Rig, rng: np.random.Generator) -> Responses:
     return measured_by_plates(replace(truth, eras=eras), frequencies=PAPER_TONES, noise=0.02)
 
 
-def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Responses]:
+def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Measurement]:
     """A board of another rigidity (10 %) with exciters whose parts differ (20 %, 10 degrees).
 
     Read by nine sensors with 0.5 % of noise; glue [N/m]: below exciters by name.
@@ -171,10 +172,10 @@ def sold(seed: int, glue: Mapping[str, float]) -> tuple[Rig, Responses]:
     noise = np.random.default_rng([seed, 1]).standard_normal((2, *values.shape))
     names = tuple(f"P{number}" for number in range(1, len(PLACES) + 1))
     heard = values + 0.005 * size * (noise[0] + 1j * noise[1])
-    return rig, Responses(names, PLACES, SOLD_TONES, heard)
+    return rig, Measurement(sensors_at(PLACES, names), SOLD_TONES, heard.swapaxes(1, 2))
 
 
-def board_of(case: Mapping[str, Any]) -> tuple[Rig, Responses]:
+def board_of(case: Mapping[str, Any]) -> tuple[Rig, Measurement]:
     """The rig of a scenario's board, and what is measured on it before more is planted."""
     kind, _, seed = case["board"].partition(" ")
     if kind == "paper":
@@ -189,49 +190,49 @@ def board_of(case: Mapping[str, Any]) -> tuple[Rig, Responses]:
     if kind == "weekend":
         true = rig.replaced(eras={name: case.get("eras", {}) for name in NAMES})
         return rig, measured(true, int(seed))
-    right = responses_of(read_measured(EXAMPLE / "measured.uff"), rig)
+    right = measurement_of(read_measured(EXAMPLE / "measured.uff"), rig)
     few = np.flatnonzero(right.frequencies < 400)[:: len(right.frequencies) // 12]
     return rig, replace(right, frequencies=right.frequencies[few], values=right.values[few])
 
 
-def with_glitches(built: Responses, share: float) -> Responses:
+def with_glitches(built: Measurement, share: float) -> Measurement:
     """A share of the values wrong by far, one way or another."""
     rng = np.random.default_rng(0)
     broken = built.values.copy()
     wrong = rng.random(broken.shape) < share
     broken[wrong] *= rng.choice([0.1, 4.0, -1.0], wrong.sum())
-    return replace(built, values=broken)
+    return replace(built, values=broken.swapaxes(1, 2))
 
 
-def planted(case: Mapping[str, Any]) -> tuple[Rig, Responses]:
+def planted(case: Mapping[str, Any]) -> tuple[Rig, Measurement]:
     """The rig that is checked, and a measurement with all that a scenario plants."""
     rig, right = board_of(case)
-    values, eras, sensors = right.values.copy(), [e.name for e in rig.eras], [*right.sensors]
+    values, eras, sensors = right.values.copy(), [e.name for e in rig.eras], [*right.names]
     plugs, places = case.get("plugs", {}), case.get("places", {})
-    values = values[:, [eras.index(plugs.get(name, name)) for name in eras]]
+    values = values[..., [eras.index(plugs.get(name, name)) for name in eras]]
     if places:
-        values = values[:, :, [sensors.index(places.get(name, name)) for name in sensors]]
+        values = values[:, [sensors.index(places.get(name, name)) for name in sensors]]
     for name, factor in case.get("channels", {}).items():
-        values[:, eras.index(name)] *= factor
+        values[..., eras.index(name)] *= factor
     for name, degrees in case.get("turned", {}).items():
-        values[:, eras.index(name)] *= np.exp(1j * math.radians(degrees))
+        values[..., eras.index(name)] *= np.exp(1j * math.radians(degrees))
     for name, factor in case.get("sensors", {}).items():
-        values[:, :, sensors.index(name)] *= factor
+        values[:, sensors.index(name)] *= factor
     for name in case.get("undriven", ()):
-        values[:, eras.index(name)] = np.nan
+        values[..., eras.index(name)] = np.nan
     if "noise" in case:
-        noise = noise_like(right.values, 0.1, np.random.default_rng(3))
-        values[:, eras.index(case["noise"])] = noise[:, eras.index(case["noise"])]
+        noise = noise_like(right.values.swapaxes(1, 2), 0.1, np.random.default_rng(3))
+        values[..., eras.index(case["noise"])] = noise[:, eras.index(case["noise"])]
     if "loose_contact" in case:
-        values[:8:2, :, sensors.index(case["loose_contact"])] *= -1
+        values[:8:2, sensors.index(case["loose_contact"])] *= -1
     if case.get("without_phases"):
-        turned = np.random.default_rng(5).uniform(0, 6, (*values.shape[:2], 1))
+        turned = np.random.default_rng(5).uniform(0, 6, values.shape[::2])[:, None]
         right, values = replace(right, has_phases=False), values * np.exp(1j * turned)
     axes = case.get("mirrored", ())
     size = np.array([rig.plate.length, rig.plate.width])
     points = np.where(["x" in axes, "y" in axes], size - right.points, right.points)
     values = values[::-1] if "frequency" in axes else values
-    found = replace(right, values=values, points=points)
+    found = replace(right, values=values).moved(points)
     if "glitches" in case:
         found = with_glitches(found, case["glitches"])
     match case.get("rig", {}):
@@ -254,10 +255,10 @@ def solved_once():
     """Free plates of the hypotheses that are tried are those of one rig in all tests."""
     solved = {}
 
-    def solve(rig, points, frequencies, *, masses):
-        key = (rig.plate, rig.mesh, points.tobytes(), frequencies.tobytes())
+    def solve(rig, sensors, frequencies):
+        key = (rig.plate, rig.mesh, sensors, frequencies.tobytes())
         if key not in solved:
-            solved[key] = sensed_plate(rig, points, frequencies, masses=masses)
+            solved[key] = sensed_plate(rig, sensors, frequencies)
         return solved[key]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -370,7 +371,7 @@ def test_a_dead_exciter_is_no_calibrated_rig(
     """The file would say that it moves the plate: exit status 1, and what to type instead."""
     found, made = measured(given_as("free"), 1), tmp_path / "made.yaml"
     values = found.values.copy()
-    values[:, 2] *= 1e-4
+    values[..., 2] *= 1e-4
     write_responses(tmp_path / "m.uff", replace(found, values=values), given_as("free"))
     rig = shutil.copy(FOLDER / "rig.yaml", tmp_path)
     assert run(["calibrate", str(rig), f"{tmp_path}/m.uff", "-o", str(made)]) == 1
@@ -417,7 +418,7 @@ def test_commands_say_so_and_write_no_rig(
 ) -> None:
     """By a file, and of what amplifiers would have measured."""
     turned = measured(weekend.replaced(plate={"grain": "width"}), 1)
-    here = MeasuredPlate(turned.as_measurement(), None, None, (), (), {})
+    here = MeasuredPlate(turned, None, None, (), (), {})
     monkeypatch.setattr(controller.cli.rig_cli, "measured_by_amplifiers", lambda *_, **__: here)
     file, made = tmp_path / "measured.uff", tmp_path / "made.yaml"
     write_responses(file, turned, weekend)
@@ -450,7 +451,7 @@ def consistency_rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def responses(consistency_rig: Rig) -> Responses:
+def responses(consistency_rig: Rig) -> Measurement:
     """Of a plate within a builder's tolerances, with 1 % noise."""
     return measured_by_plates(
         perturbed(consistency_rig, frequencies=FREQUENCIES), frequencies=FREQUENCIES
@@ -461,7 +462,7 @@ def responses(consistency_rig: Rig) -> Responses:
     "name", shortly(DISTORTIONS, ["g", "velocity", "displacement", "two_sensors"])
 )  # the errors of the others are provoked in tests/errors
 def test_distorted_responses_are_refused_by_their_cause(
-    consistency_rig: Rig, responses: Responses, name: str
+    consistency_rig: Rig, responses: Measurement, name: str
 ) -> None:
     """Each distortion alone, with its own cause named."""
     with pytest.raises(InputError, match=NAMED[name]):
@@ -533,18 +534,18 @@ def test_axes_noted_the_other_way_round_are_refused_before_a_calibration() -> No
 
 
 @pytest.fixture(scope="module")
-def built(coarse_rig: Rig) -> Responses:
-    """Responses of one plate within tolerance."""
+def built(coarse_rig: Rig) -> Measurement:
+    """Measurement of one plate within tolerance."""
     rng = np.random.default_rng(7)
     return on_paper(within_tolerance(coarse_rig, rng), rng)
 
 
 def test_mirrored_places_on_a_symmetric_plate_may_be_exchanged_channels(
-    coarse_rig: Rig, built: Responses
+    coarse_rig: Rig, built: Measurement
 ) -> None:
     """The paper's corners: a calibration says both, a check what plugs would be."""
     mirrored = np.array([coarse_rig.plate.length, 0]) - built.points * [1, -1]
-    noted = replace(built, points=mirrored)
+    noted = built.moved(mirrored)
     with pytest.raises(InputError, match=r"mirrored in x.*channels"):
         check_consistency(coarse_rig, noted)
     found = diagnose(coarse_rig, noted).findings
@@ -567,7 +568,7 @@ def test_diagnose_refuses_too_few_sensors_or_frequencies(coarse_rig, built):
 
 def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
     """They move parameters by a tenth of their prior."""
-    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
+    plate = sensed_plate(coarse_rig, built.sensors, built.frequencies)
     clean, found = (
         match_plate(plate, each.values.swapaxes(1, 2), drives=range(4))
         for each in (built, with_glitches(built, 0.03))
@@ -577,8 +578,8 @@ def test_match_plate_is_not_moved_by_outliers(coarse_rig, built):
 
 def test_chance_counts_all_values(coarse_rig, built):
     """3.385 standard deviations are 1 normal number in 1400, and 1 in 100 sets of 14."""
-    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
-    match = match_plate(plate, built.values.swapaxes(1, 2), drives=range(4))
+    plate = sensed_plate(coarse_rig, built.sensors, built.frequencies)
+    match = match_plate(plate, built.values, drives=range(4))
     match.__dict__["z"] = 3.385 * np.eye(14)[3]
     assert match.chance == pytest.approx(0.01, rel=0.01)
 
@@ -587,8 +588,8 @@ def test_match_plate_takes_no_misfit_for_outliers(coarse_rig):
     """Of a plate 3 % longer than its rig's a calibration would leave a tenth of all values out."""
     rng = np.random.default_rng(1003)
     built = on_paper(larger(within_tolerance(coarse_rig, rng), 1.03), rng)
-    plate = sensed_plate(coarse_rig, built.points, built.frequencies)
-    match = match_plate(plate, built.values.swapaxes(1, 2), drives=range(4))
-    std, _ = without_outliers(built.values.swapaxes(1, 2), match.predicted)
+    plate = sensed_plate(coarse_rig, built.sensors, built.frequencies)
+    match = match_plate(plate, built.values, drives=range(4))
+    std, _ = without_outliers(built.values, match.predicted)
     assert 0.05 < np.isinf(std).mean() < MAX_OUTLIERS
     assert match.error > MAX_FIT_ERROR

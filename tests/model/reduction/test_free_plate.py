@@ -445,7 +445,7 @@ def test_all_that_counts_on_scaling_refuses_a_frame(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
         ForwardModel(rig, sensors, FREQUENCIES, space, free)
     with pytest.raises(InputError, match=r"plate\.frame_mass.*era rig identify"):
-        sensed_plate(known, POINTS, FREQUENCIES)
+        sensed_plate(known, sensors, FREQUENCIES)
     assert ForwardModel(
         known, sensors, FREQUENCIES, space_of(known, ["SW"], known.uncertainty), free
     )

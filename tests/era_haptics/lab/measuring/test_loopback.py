@@ -20,11 +20,11 @@ from benchmarks.desk_plate.truth import Truth
 from era_haptics.lab.cli import app
 from era_haptics.lab.measuring.loopback import read_stepped
 from era_haptics.lab.measuring.outputs import OutputFinding, listen, matched, tone
-from era_haptics.lab.measuring.sound_card import Desk
+from era_haptics.lab.measuring.sound_card import Desk, WiredSensor
 from long_form import shortly
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
-from model.estimate.measurement import Responses, WiredSensor, responses_of
+from model.estimate.measurement import Measurement, measurement_of
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -243,12 +243,12 @@ def expected(rig: Rig, sensor: int) -> ComplexArray:
     return np.array([[ratio(t, e, sensor) / 2e-3 / strokes[e] for e in range(4)] for t in range(3)])
 
 
-def check(rig: Rig, found: Responses, *, rtol: float) -> None:
+def check(rig: Rig, found: Measurement, *, rtol: float) -> None:
     """All values are what made them."""
     np.testing.assert_allclose(found.frequencies, TONES, rtol=2e-5)
     for sensor in range(2):
-        column = found.sensors.index(f"P{sensor + 1}")
-        np.testing.assert_allclose(found.values[:, :, column], expected(rig, sensor), rtol=rtol)
+        column = found.names.index(f"P{sensor + 1}")
+        np.testing.assert_allclose(found.values[:, column], expected(rig, sensor), rtol=rtol)
 
 
 @pytest.mark.parametrize(("references", "gap"), [(4, 0.3), (4, 0.0), (1, 0.3), (1, 0.0)])
@@ -258,7 +258,7 @@ def test_recording_gives_what_each_sensor_heard(
     """A reference for each output, or one for all in turn; with and without silence between."""
     path = tmp_path / "steps.wav"
     recording(path, range(4), references=references, gap=gap)
-    check(rig, responses_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=0.01)
+    check(rig, measurement_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=0.01)
 
 
 def test_recordings_of_places_and_outputs_are_told_by_their_names(rig: Rig, tmp_path: Path) -> None:
@@ -267,10 +267,9 @@ def test_recordings_of_places_and_outputs_are_told_by_their_names(rig: Rig, tmp_
         for era in range(4):
             name = tmp_path / f"P{sensor + 1}-{era + 1}.wav"
             recording(name, [era], sensors=[sensor], references=1)
-    found = responses_of(read_stepped(tmp_path, Desk(rig, MOVED)), rig)
+    found = measurement_of(read_stepped(tmp_path, Desk(rig, MOVED)), rig)
     check(rig, found, rtol=0.01)
-    assert found.masses is not None
-    assert found.masses.tolist() == [2e-3, 2e-3]
+    assert [each.mass for each in found.sensors] == [2e-3, 2e-3]
 
 
 def table(rig: Rig, form: str, separator: str) -> str:
@@ -309,7 +308,7 @@ def test_table_of_another_program_is_read(
     """Real parts, magnitudes, decibels; decimal commas and marks of byte order; names, numbers."""
     path = tmp_path / "steps.csv"
     path.write_text(table(rig, form, separator), encoding)
-    check(rig, responses_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=1e-7)
+    check(rig, measurement_of(read_stepped(path, Desk(rig, FIXED)), rig), rtol=1e-7)
 
 
 def test_lines_of_a_file_stay_at_their_frequencies(rig: Rig, tmp_path: Path) -> None:

@@ -26,11 +26,12 @@ from era_haptics.lab.measuring.sound_card import (
     Multisine,
     ResponseEstimate,
     SoundCard,
+    WiredSensor,
     default_frequencies,
 )
 from examples.make_measured import record_responses
 from model.errors import InputError
-from model.estimate.measurement import WiredSensor, read_measured, responses_of
+from model.estimate.measurement import measurement_of, read_measured
 from model.processes import unseen
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig, parse_rig
@@ -52,12 +53,12 @@ def test_responses_are_those_of_the_plate_in_time(sensors, monkeypatch, tmp_path
     rig = replace(load_rig(example_rig_path()), uncertainty=Uncertainty.none())
     output = tmp_path / "measured.csv"
     measure.measured_by_simulation(Desk(rig, sensors), output, frequencies=FREQUENCIES, seed=0)
-    found = responses_of(read_measured(output), rig)
+    found = measurement_of(read_measured(output), rig)
     for number, each in enumerate(sensors):
         load = PointLoad(each.x, each.y, mass=each.mass)
         loaded = replace(rig, masses=(*rig.masses, load) if each.mass else rig.masses)
         in_time = record_responses(loaded, [Accelerometer("", each.x, each.y)], FREQUENCIES)
-        error = found.values[:, :, number] - in_time.values[:, :, 0]
+        error = found.values[:, number] - in_time.values[:, 0]
         assert np.abs(error).max() < 0.03 * np.abs(in_time.values).max()
 
 
@@ -75,7 +76,7 @@ def test_one_command_measures_a_plate_that_deviates_as_its_seed_draws_it(
         status = run(["measure", str(rig), *options, "--frequencies", "61:301:40"])
         assert status == 0
         assert f"-o {tmp_path / 'calibrated.yaml'}" in capsys.readouterr().out
-        found.append(responses_of(read_measured(output), load_rig(rig)).values)
+        found.append(measurement_of(read_measured(output), load_rig(rig)).values)
     np.testing.assert_array_equal(found[0], found[1])
     assert np.abs(found[2] / found[0] - 1).max() > 0.05
 
@@ -164,11 +165,11 @@ def test_measured_responses_are_those_of_the_plate(
     found = undisturbed
     model = DeskModel(truth, np.array(SENSOR_PLACES)).under()
     strokes = np.array([era.stroke for era in rig.eras])
-    exact = model.response(PLAYED_HZ).swapaxes(1, 2) / strokes[:, None]
+    exact = model.response(PLAYED_HZ) / strokes
     loud = np.abs(exact) > 0.05 * np.abs(exact).max(axis=(1, 2), keepdims=True)
     # The filter of inputs at 8 kHz has a ripple over this band, which the loop-back takes out too.
     np.testing.assert_allclose(found.responses.values[loud], exact[loud], rtol=0.02)
-    assert found.responses.sensors == ("P1", "P2", "P3")
+    assert found.responses.names == ("P1", "P2", "P3")
     assert found.latency * RATE == pytest.approx(DELAY, abs=1)
     assert (found.repeated, found.coherence.min() > 0.999) == (0, True)
 

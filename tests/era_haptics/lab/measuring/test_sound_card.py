@@ -26,22 +26,25 @@ from benchmarks.desk_plate.sensing import Converters
 from benchmarks.desk_plate.truth import Truth, as_built, draw_truth
 from benchmarks.direct_plate import direct_responder
 from controller.cli.main import run
+from controller.plate_measurement import MeasuredPlate
 from drivers.errors import LinkError
 from era_haptics.lab.measuring.measure import measure_through
 from era_haptics.lab.measuring.moved_sensor import PositionsFile, measure_positions
-from era_haptics.lab.measuring.sound_card import Desk, DeviceLost, Multisine, SoundCard, open_card
+from era_haptics.lab.measuring.sound_card import (
+    Desk,
+    DeviceLost,
+    Multisine,
+    SoundCard,
+    WiredSensor,
+    open_card,
+    read_sensors,
+)
 from gateway_bench import wait_for
 from model.arrays import ComplexArray, Float32Array, FloatArray
 from model.errors import InputError
 from model.estimate.fit import sensed_plate
 from model.estimate.identify import identify
-from model.estimate.measurement import (
-    MeasuredPlate,
-    WiredSensor,
-    read_measured,
-    read_sensors,
-    responses_of,
-)
+from model.estimate.measurement import measurement_of, read_measured, sensors_at
 from model.finger import fingertips_on
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, parse_rig
@@ -140,15 +143,15 @@ def test_board_is_identified_by_one_sensor_of_known_mass(board: Rig, tmp_path: P
 
     card = DeskCard(plate, rate=RATE)
     measure_positions(file, card, periods=2, prompt=moved, tell=lambda text: None)
-    responses = responses_of(read_measured(file.path), lossy)
+    responses = measurement_of(read_measured(file.path), lossy)
     full = np.array([era.full_level for era in lossy.eras])
-    exact = DeskModel(truth, POINTS).under().response(FREQUENCIES).swapaxes(1, 2) / full[:, None]
+    exact = DeskModel(truth, POINTS).under().response(FREQUENCIES) / full
     errors = []
-    for masses in (responses.masses, None):
-        found = identify(lossy, replace(responses, masses=masses).as_measurement())
+    for places in (responses.sensors, sensors_at(responses.points, responses.names)):
+        found = identify(lossy, replace(responses, sensors=places))
         gains = np.array([era.gain(FREQUENCIES) for era in found.rig.eras]).T
-        field = sensed_plate(found.rig, POINTS, FREQUENCIES).responses().swapaxes(1, 2)
-        field = field * gains[:, :, None]
+        field = sensed_plate(found.rig, sensors_at(POINTS), FREQUENCIES).responses()
+        field = field * gains[:, None]
         common = np.vdot(field, exact) / np.vdot(field, field)
         errors.append(np.linalg.norm(common * field - exact) / np.linalg.norm(exact))
     assert errors[0] < 0.03
@@ -562,17 +565,17 @@ def test_each_place_is_measured_under_the_sensors_mass(rig: Rig, truth: Truth, m
     assert bench.measure(keys=["", "", ""]) == 0
     assert "x 30 mm, y 50 mm (place 1 of 3)" in bench.said
     assert "Next: era calibrate rig.yaml measured.uff" in bench.out
-    found = responses_of(read_measured(Path(bench.output)), rig)
+    found = measurement_of(read_measured(Path(bench.output)), rig)
     model = DeskModel(truth, np.array([*MOVED_SENSOR_PLACES.values()]))
     strokes = np.array([era.stroke for era in rig.eras])
-    bare = model.under().response(MOVED_HZ).swapaxes(1, 2) / strokes[:, None]
+    bare = model.under().response(MOVED_HZ) / strokes
     for n, name in enumerate(MOVED_SENSOR_PLACES):
         one = model.under(moved=(n, GRAMS / 1e3)).response(MOVED_HZ)[:, 0] / strokes
-        measured = found.values[:, :, found.sensors.index(name)]
+        measured = found.values[:, found.names.index(name)]
         wrong = np.linalg.norm(measured - one) / np.linalg.norm(one)
         assert wrong < 0.02
-        assert np.linalg.norm(measured - bare[:, :, n]) / np.linalg.norm(one) > 2 * wrong
-    assert found.masses is not None
+        assert np.linalg.norm(measured - bare[:, n]) / np.linalg.norm(one) > 2 * wrong
+    assert all(each.mass for each in found.sensors)
     np.testing.assert_allclose(found.masses, GRAMS / 1e3)
 
 
@@ -710,11 +713,11 @@ def test_plate_is_identified_better_with_the_mass_of_the_sensor(
     places = {f"P{n}": place for n, place in enumerate(grid, start=1)}
     bench = make(output="measured.csv", places=places, grams=2.0)
     assert bench.measure("--frequencies", "51:471:60", keys=[""] * len(places)) == 0
-    found = responses_of(read_measured(Path(bench.output)), rig)
-    assert found.masses is not None
+    found = measurement_of(read_measured(Path(bench.output)), rig)
+    assert all(each.mass for each in found.sensors)
     known, ignored = (
-        identify(rig, replace(found, masses=masses).as_measurement())
-        for masses in (found.masses, None)
+        identify(rig, replace(found, sensors=places))
+        for places in (found.sensors, sensors_at(found.points, found.names))
     )
     assert (known.is_explained, ignored.is_explained) == (True, False)
     mass = truth.rig.plate.thickness / known.rig.plate.thickness

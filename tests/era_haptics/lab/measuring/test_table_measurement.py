@@ -19,11 +19,10 @@ from drivers.errors import CommandRefused, LinkError
 from drivers.host.dialogue import StagedSet
 from drivers.playing import AmplifierLayer
 from era_haptics.lab.measuring import table_measurement
-from era_haptics.lab.measuring.sound_card import SoundCard
+from era_haptics.lab.measuring.sound_card import SoundCard, read_sensors
 from model.arrays import Float32Array, FloatArray
 from model.cli import app
 from model.errors import InputError
-from model.estimate.measurement import read_sensors
 from model.finger import detection_threshold
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import example_rig_path, load_rig

@@ -45,7 +45,7 @@ def deviations(
     for one, true in zip(found.parameters, truth["values"], strict=True):
         if one.standard_error is not None:
             off = abs(one.value - true) / one.standard_error
-            values[one.parameter.kind].append((off, one.standard_error / true))
+            values[one.kind].append((off, one.standard_error / true))
     for kind, rows in values.items():
         off, size = np.array(rows).T
         by_kind[kind] = off, float(np.median(size))

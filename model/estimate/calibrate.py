@@ -52,7 +52,7 @@ from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain
 
-MAX_FIT_ERROR = 0.25
+MAX_PREDICTION_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
 
 MAX_OUTLIERS = 0.1
@@ -73,25 +73,6 @@ _SIGNIFICANCE = 4.0  # standard errors
 _CLEAR = 3.0  # standard errors of a clear deviation
 _MAX_GAIN = 5.0  # of a drive at a frequency relative to its median, either way
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
-
-
-@dataclass(frozen=True)
-class FittedParameter:
-    """A parameter with the rig's value and the fitted one.
-
-    One that is not identified keeps the rig's value and has no standard error.
-    """
-
-    parameter: Parameter
-    before: float
-    value: float
-    standard_error: float | None
-    at_bound: bool
-
-    @property
-    def is_identified(self) -> bool:
-        """Whether the data determine the value."""
-        return self.standard_error is not None
 
 
 @dataclass(frozen=True)
@@ -135,8 +116,8 @@ class Calibration:
         """
         return as_frame(
             {
-                "parameter": [each.parameter.name for each in self.parameters],
-                "unit": [each.parameter.unit for each in self.parameters],
+                "parameter": [each.name for each in self.parameters],
+                "unit": [each.unit for each in self.parameters],
                 "before": [each.before for each in self.parameters],
                 "after": [each.value for each in self.parameters],
                 "standard_error": [each.standard_error for each in self.parameters],
@@ -146,7 +127,7 @@ class Calibration:
     @property
     def is_good(self) -> bool:
         """Whether the fit predicts held-out sensors; False where there are none."""
-        return self.held_out is not None and self.held_out.after <= MAX_FIT_ERROR
+        return self.held_out is not None and self.held_out.after <= MAX_PREDICTION_ERROR
 
     @cached_property
     def rig(self) -> Rig:
@@ -159,7 +140,7 @@ class Calibration:
         return replace(rig, eras=eras, uncertainty=self._uncertainty)
 
     @cached_property
-    def parameters(self) -> tuple[FittedParameter, ...]:
+    def parameters(self) -> tuple[Parameter, ...]:
         """The fitted values, with the errors of the fit, of the model and of the whole mass.
 
         All that is fitted but losses scales with the whole mass, which no response tells.
@@ -181,12 +162,11 @@ class Calibration:
             whole = math.hypot(float(error), share * float(value))
             is_free = bool(self.fit.searched[number])
             found.append(
-                FittedParameter(
+                replace(
                     row,
-                    row.of(plate.rig),
-                    float(value),
-                    whole if is_free else None,
-                    is_free and bool(distance[number] < _AT_BOUND),
+                    value=float(value),
+                    standard_error=whole if is_free else None,
+                    at_bound=is_free and bool(distance[number] < _AT_BOUND),
                 )
             )
         return tuple(found)
@@ -444,7 +424,7 @@ class Calibration:
         """
         before, x = self.plate.rig.uncertainty, self.fit.x
         # An exciter damps and pushes by its coil: the share of its suspension shows little alone.
-        coils = [row for row in self.plate.of_exciters if row.kind == "damping"]
+        coils = [row.name for row in self.plate.of_exciters if row.kind == "damping"]
         errors = self.plate.errors(x, self.fit.errors).tolist()
 
         def relative(kind: str, theory: float = _MODEL_ERROR) -> float | None:
@@ -452,7 +432,7 @@ class Calibration:
             of_kind = [
                 (one, error)
                 for one, error in zip(self.parameters, errors, strict=True)
-                if one.parameter.kind == kind and one.parameter not in coils
+                if one.kind == kind and one.name not in coils
             ]
             if not all(one.is_identified for one, _ in of_kind):
                 return None
@@ -468,7 +448,7 @@ class Calibration:
         feet = [
             error / one.value if one.is_identified else before.supports
             for one, error in zip(self.parameters, errors, strict=True)
-            if one.parameter.foot
+            if one.foot
         ]
         if feet:
             fitted["supports"] = math.hypot(_rms(feet), _MODEL_ERROR)
@@ -652,7 +632,7 @@ def _identified(found: Calibration) -> Calibration:
         errors = found.fit.errors[plate.numbers] / plate.largest_errors
         excess = np.where(searched[plate.numbers], errors, 0)
         # Values of a plate that does not fit are meaningless.
-        if not excess.max() > 1 or found.error > MAX_FIT_ERROR:
+        if not excess.max() > 1 or found.error > MAX_PREDICTION_ERROR:
             return found
         least, x = plate.numbers[best_of(excess)], found.fit.x.copy()
         searched[least], x[least] = False, 0.0
@@ -661,7 +641,7 @@ def _identified(found: Calibration) -> Calibration:
 
 def _check_sides(found: Calibration) -> None:
     """Raise InputError where the responses fit a plate of another size better."""
-    if found.error > MAX_FIT_ERROR:
+    if found.error > MAX_PREDICTION_ERROR:
         return
     plate, space = found.plate.rig.plate, found.plate.model.space
     offs = space.values(found.fit.x, "side").tolist()
@@ -701,12 +681,15 @@ def _check_gains(found: Calibration) -> None:
 def _check_suspensions(found: Calibration) -> None:
     """Raise InputError for exciters and feet with a stiffness at its bound, of another kind."""
     exciters, feet = {}, {}
+    names = {row.era for row in found.plate.of_exciters}
     for one in found.parameters:
-        row, factor = one.parameter, f"{one.value / one.before:.2g}" if one.at_bound else ""
-        if one.at_bound and row.kind == "stiffness" and row in found.plate.of_exciters:
-            exciters[row.era] = factor
-        elif one.at_bound and row.foot:
-            feet[row.foot] = factor
+        if not one.at_bound:
+            continue
+        factor = f"{one.value / one.before:.2g}"
+        if one.foot:
+            feet[one.foot] = factor
+        elif one.kind == "stiffness" and one.era in names:
+            exciters[one.era] = factor
     if exciters:
         raise InputError(
             f"stiffness of {', '.join(exciters)} must be about that of the rig, got "
@@ -745,15 +728,14 @@ def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
     rig, found = calibration.rig, dict[KeyPath, float]()
     for each in calibration.parameters:
-        parameter = each.parameter
         if each.standard_error is None:
             continue
-        if parameter.foot:
-            path: KeyPath = ("supports", parameter.foot, "stiffness")
-        elif parameter.era:
-            keys = ACTUATOR_KEYS[type(rig.era(parameter.era))].keys
-            path = ("eras", parameter.era, keys[parameter.field or parameter.kind])
-        elif parameter.kind == "loss_factor":
+        if each.foot:
+            path: KeyPath = ("supports", each.foot, "stiffness")
+        elif each.era:
+            era = rig.era(each.era)
+            path = ("eras", each.era, ACTUATOR_KEYS[type(era)].keys[era.fields[each.kind]])
+        elif each.kind == "loss_factor":
             path = ("plate", "loss_factor")
         elif rig.laminate is None:
             path = ("plate", "material", next(iter(rig.plate.material.moduli)))
@@ -768,7 +750,7 @@ def change_rows(calibration: Calibration) -> list[str]:
     fit, places = calibration.fit, {era.name: (era.x, era.y) for era in calibration.plate.rig.eras}
     numbers = calibration.plate.numbers
     own = fit.covariance[np.ix_(numbers, numbers)]
-    alike = confusions([each.parameter.name for each in calibration.parameters], own)
+    alike = confusions([each.name for each in calibration.parameters], own)
     moved = [
         (
             f"{name} place",
@@ -812,7 +794,7 @@ def finding_rows(calibration: Calibration) -> list[str]:
         rows.append(
             f"{calibration.outlier_count} of {calibration.value_count} values left out as outliers"
         )
-    fixed = [p.parameter.name for p in calibration.parameters if not p.is_identified]
+    fixed = [p.name for p in calibration.parameters if not p.is_identified]
     if fixed:
         rows.append(f"not identified, rig's value kept: {', '.join(fixed)}")
     return rows
@@ -838,11 +820,11 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
     return {
         "parameters": [
             {
-                "name": fitted.parameter.name,
-                "era": fitted.parameter.era or None,
-                "foot": fitted.parameter.foot or None,
-                "kind": fitted.parameter.kind,
-                "unit": fitted.parameter.unit,
+                "name": fitted.name,
+                "era": fitted.era or None,
+                "foot": fitted.foot or None,
+                "kind": fitted.kind,
+                "unit": fitted.unit,
                 "before": fitted.before,
                 "after": fitted.value,
                 "standard_error": fitted.standard_error,
@@ -874,7 +856,7 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             for name, (place, error) in calibration.moved.items()
         ],
         "uncertainty": asdict(calibration.rig.uncertainty),
-        "not_identified": [p.parameter.name for p in calibration.parameters if not p.is_identified],
+        "not_identified": [p.name for p in calibration.parameters if not p.is_identified],
         "dead_sensors": list(calibration.dead_sensors),
         "dead_eras": list(calibration.dead_eras),
         "sensor_scales": {
@@ -905,20 +887,17 @@ def _millimetres(place: Point) -> str:
     return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
 
 
-def _estimate(fitted: FittedParameter, alike: str) -> tuple[str, str, str, str, str]:
+def _estimate(fitted: Parameter, alike: str) -> tuple[str, str, str, str, str]:
     """Row of `estimate_table` of a value; alike: name of what it is hardly told apart from."""
-    parameter = fitted.parameter
-    before = in_display_unit(fitted.before, parameter.unit, digits=5)
+    before = in_display_unit(fitted.before, fitted.unit, digits=5)
     if fitted.standard_error is None:
-        return parameter.name, "", "", before, "not identified"
-    value, _, error = with_error(fitted.value, fitted.standard_error, parameter.unit).partition(
-        " ± "
-    )
+        return fitted.name, "", "", before, "not identified"
+    shown = with_error(fitted.value, fitted.standard_error, fitted.unit)
+    value, _, error = shown.partition(" ± ")
     unit = error.partition(" ")[1:]
     notes = [
         f"{100 * (fitted.value / fitted.before - 1):+.1f} %" if fitted.before else "",
         "at its bound" if fitted.at_bound else "",
         f"hardly told apart from {alike}" if alike else "",
     ]
-    shown = value + "".join(unit)
-    return parameter.name, shown, f"± {error}", before, ", ".join(filter(None, notes))
+    return fitted.name, value + "".join(unit), f"± {error}", before, ", ".join(filter(None, notes))

@@ -211,7 +211,7 @@ def fit(
         responses = measurement.driven(plate.responses)
         slopes = measurement.driven(jacobian(plate, own)[..., own])
         gains, by_gain, r, J = best_gains(responses, slopes, measurement)
-        held, by_held = _held(gains, by_gain, measurement.gain_std)
+        held, by_held = _gain_residuals(gains, by_gain, measurement.gain_std)
         if soft is not None:
             r, J = _softened(r, J, soft)
             held, by_held = _softened(held, by_held, soft)
@@ -287,7 +287,7 @@ def best_gains(
     return gains, by_gain, weight * (responses - d)[known], weight[:, None] * slopes[known]
 
 
-def _held(
+def _gain_residuals(
     gains: ComplexArray, by_gain: ComplexArray, std: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Deviations of gains (f, n) from a magnitude of 1 (k,), and their derivatives (k, q)."""
@@ -491,28 +491,33 @@ _ADDED_KINDS = {"loss_factor": "loss_added", "damping": "damping_added"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """A fitted value of a rig: of the plate, of an ERA or of a foot."""
+    """A value of a rig that a fit finds, and how sure it is of it."""
 
     kind: str
-    """Kind of value, as a key of `VALUE_UNITS`."""
-    era: str
-    """Name of the ERA, "" for the plate and for feet."""
-    field: str = ""
-    """Attribute of the ERA, which exciters name differently; by default the kind."""
+    """Kind of value: a key of `VALUE_UNITS`, or of `KINDS` where differences are reported."""
+    name: str
+    """Name in reports."""
+    unit: str
+    """Unit of its values in reports for people."""
+    era: str = ""
+    """Name of the ERA whose value it is, "" for another's."""
     foot: str = ""
-    """Name of the foot, "" for other values."""
+    """Name of the foot whose value it is, "" for another's."""
+    before: float = 0.0
+    """Value in the rig before the fit, 0 where the difference from it is reported."""
+    value: float = math.nan
+    """Value that was found, NaN before a fit."""
+    standard_error: float | None = None
+    """Standard error of the value, None of one that is not identified and keeps the rig's."""
+    prior: float = math.inf
+    """Standard deviation before the measurement, infinite where nothing held it."""
+    at_bound: bool = False
+    """Whether it is the largest or least of what was searched."""
 
     @property
-    def name(self) -> str:
-        """Name in reports."""
-        if self.foot:
-            return f"foot {self.foot} stiffness"
-        return f"{self.era or 'plate'} {self.field or self.kind}"
-
-    @property
-    def unit(self) -> str:
-        """Unit of its value."""
-        return VALUE_UNITS[self.kind]
+    def is_identified(self) -> bool:
+        """Whether the data determine the value."""
+        return self.standard_error is not None
 
     @property
     def is_factor(self) -> bool:
@@ -545,15 +550,20 @@ class SensedPlate:
     @cached_property
     def rows(self) -> tuple[Parameter, ...]:
         """The fitted values (n,): modulus and loss factor, those of every ERA and of every foot."""
-        of_eras = (
-            Parameter(kind, era.name, era.fields[kind])
+        plate = [(kind, f"plate {kind}", "", "") for kind in ("modulus", "loss_factor")]
+        of_eras = [
+            (kind, f"{era.name} {era.fields[kind]}", era.name, "")
             for era in self.rig.eras
             for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
             if kind in era.fields
-        )
+        ]
         names = self.rig.foot_names if self.rig.uncertainty.supports else ()
-        feet = (Parameter("supports", "", foot=name) for name in names)
-        return (Parameter("modulus", ""), Parameter("loss_factor", ""), *of_eras, *feet)
+        feet = [("supports", f"foot {name} stiffness", "", name) for name in names]
+        rows = [
+            Parameter(kind, name, VALUE_UNITS[kind], era, foot)
+            for kind, name, era, foot in (*plate, *of_eras, *feet)
+        ]
+        return tuple(replace(row, before=row.of(self.rig)) for row in rows)
 
     @cached_property
     def largest_errors(self) -> FloatArray:
@@ -639,7 +649,7 @@ class SensedPlate:
             "damping": math.hypot(factor, KINDS["damping_each"].std),
             "supports": stated.supports,
         }
-        own = np.array([row.of(self.rig) for row in self.rows])
+        own = np.array([row.before for row in self.rows])
         of_rig = (own > 0) * [of_kind.get(row.kind, 0.0) for row in self.rows]
         is_lossy = (own > 0) & [row.kind in _ADDED_KINDS for row in self.rows]
         unit = std / np.where(is_lossy, own, 1.0)

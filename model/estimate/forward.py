@@ -622,7 +622,7 @@ def _by_places(plate: PlateAt) -> Columns:
     masses = np.empty((*by_place.shape[:-1], model.mass_count, 3), dtype=complex)
     masses[..., 1:] = of_masses.reshape(masses[..., 1:].shape)
     at = model.movable[n : n + model.mass_count]
-    masses[..., 0] = _held(plate, at, -(model.omega[:, None] ** 2))
+    masses[..., 0] = _by_stiffness(plate, at, -(model.omega[:, None] ** 2))
     return {
         "place": places,
         "sensor_place": of_sensors,
@@ -639,7 +639,7 @@ def _by_attachments(plate: PlateAt) -> Columns:
     found: Columns = {}
     for kind in ("stiffness", "damping", "bolt_mass", *EXCITER_KINDS):
         change, of_force = np.array([each.get(kind, none) for each in slopes]).transpose(1, 2, 0)
-        found[kind] = _held(plate, eras, change)
+        found[kind] = _by_stiffness(plate, eras, change)
         found[kind][:, :, eras, eras] += Y * (of_force / plate.full_levels / plate.force)[:, None]
     for kind in EXCITER_KINDS:
         found[kind] = found[kind][..., : len(model.space.indices(kind))]
@@ -647,10 +647,10 @@ def _by_attachments(plate: PlateAt) -> Columns:
     found["damping_each"] = found["damping"] * values.damping
     found["damping"] = found["damping_each"].sum(axis=-1, keepdims=True)
     feet = np.array([n + number for number in model.rig.feet], dtype=int)
-    found["supports"] = _held(plate, feet, values.supports * model.springs)
+    found["supports"] = _by_stiffness(plate, feet, values.supports * model.springs)
     first = n + len(model.rig.masses) + model.mass_count
     by_finger = [
-        _held(plate, np.full(4, first + number), slopes)
+        _by_stiffness(plate, np.full(4, first + number), slopes)
         for number, slopes in enumerate(plate.finger_slopes)
     ]
     found["fingers"] = np.concatenate([np.zeros((*Y.shape, 0)), *by_finger], axis=-1)
@@ -708,7 +708,7 @@ _GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
 }
 
 
-def _held(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:
+def _by_stiffness(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:
     """Responses by changes (f, m) of the dynamic stiffness of attachments (m,)."""
     columns = plate.receptance[:, :, at]
     return _outer(plate, columns, columns, -change)

@@ -47,6 +47,7 @@ from model.errors import InputError
 from model.estimate.fit import (
     HELD_OUT_FOLDS,
     Fit,
+    Parameter,
     confusions,
     estimate_table,
     fit,
@@ -61,6 +62,7 @@ from model.estimate.space import (
     KINDS,
     MAX_GUESSED,
     MODE_SHIFTS,
+    UNIT_KEYS,
     Space,
     Values,
     inwards,
@@ -149,7 +151,7 @@ _THEORY = {
     "place": KINDS["place"].theory,
 }
 
-_MAX_PREDICTION_ERROR = 0.1  # of the rms at a tone; less certain predictions are no test
+_MAX_PREDICTION_STD = 0.1  # of the rms at a tone; less certain predictions are no test
 _MIN_PREDICTED = 16  # values
 _IN_COMMON = 2.0  # factor on standard deviations: what no path shows is wrong in all fits alike
 
@@ -560,7 +562,7 @@ def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
         squares[hidden] = errors - 2 * noise * measurement.std[hidden] ** 2
         fits.append(other.x)
     mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
-    predicted = variance < _MAX_PREDICTION_ERROR**2 * mean_square
+    predicted = variance < _MAX_PREDICTION_STD**2 * mean_square
     if predicted.sum() < _MIN_PREDICTED:
         return None
     total, unexplained = (
@@ -697,28 +699,11 @@ def expected_contrast(
     return expected
 
 
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """A parameter less its value in the rig; per cent are those of the rig's value.
+def parameters(found: Identification) -> list[Parameter]:
+    """All parameters that were uncertain, less their values in the rig, in units of reports.
 
-    Places of a mass count from the middle of the plate.
+    Per cent are those of the rig's value; places of a mass count from the middle of the plate.
     """
-
-    name: str
-    kind: str
-    difference: float
-    error: float
-    """Standard error of the difference."""
-    before: float
-    """Standard deviation before the measurement."""
-    unit: str
-    """Unit for people."""
-    key: str
-    """Unit for programs."""
-
-
-def estimates(found: Identification) -> list[ParameterEstimate]:
-    """All parameters that were uncertain."""
     space = found.fitted.space
     kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
     rows = []
@@ -734,7 +719,9 @@ def estimates(found: Identification) -> list[ParameterEstimate]:
             std, error = math.expm1(std), math.exp(difference) * error
             difference = math.expm1(difference)
         difference, error, std = (known.per_unit * each for each in (difference, error, std))
-        rows.append(ParameterEstimate(name, kind, difference, error, std, known.unit, known.key))
+        rows.append(
+            Parameter(kind, name, known.unit, value=difference, standard_error=error, prior=std)
+        )
     return rows
 
 
@@ -826,15 +813,16 @@ def parameter_rows(found: Identification) -> list[str]:
     names = found.fitted.space.names
     confused = dict(zip(names, confusions(names, found.covariance), strict=True))
     rows = []
-    for each in estimates(found):
-        if each.kind in _ALWAYS_LISTED or abs(each.difference) > _LISTED_STDS * each.error:
+    for each in parameters(found):
+        assert each.standard_error is not None  # noqa: S101  all were searched
+        if each.kind in _ALWAYS_LISTED or abs(each.value) > _LISTED_STDS * each.standard_error:
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
-            value, _, error = with_error(each.difference, each.error, sign="+").partition(" ± ")
+            value, _, error = with_error(each.value, each.standard_error, sign="+").partition(" ± ")
             other = confused[each.name]
             note = f"hardly told apart from {other}" if other else ""
-            if each.kind == "supports" and each.error > MAX_GUESSED * each.before:
+            if each.kind == "supports" and each.standard_error > MAX_GUESSED * each.prior:
                 note = "not identified"
-            before = f"± {float(f'{each.before:.2g}'):g}{unit}"
+            before = f"± {float(f'{each.prior:.2g}'):g}{unit}"
             rows.append((each.name, f"{value}{unit}", f"± {error}{unit}", before, note))
     rows.sort(key=lambda row: places.get(row[0].rpartition(" ")[2], -1))
     return estimate_table(rows)
@@ -880,12 +868,12 @@ def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict
         "parameters": [
             {
                 "name": each.name,
-                "unit": each.key,
-                "difference": each.difference,
-                "standard_error": each.error,
-                "standard_deviation_before": each.before,
+                "unit": UNIT_KEYS.get(each.unit, each.unit),
+                "difference": each.value,
+                "standard_error": each.standard_error,
+                "standard_deviation_before": each.prior,
             }
-            for each in estimates(found)
+            for each in parameters(found)
         ],
         "clocks": [
             {**asdict(each), "is_believed": each.is_believed} for each in clock_estimates(found)

@@ -43,6 +43,7 @@ from model.files.uff import (
     write_universal,
 )
 from model.rig.rig import Rig
+from model.structure.attachments import GRAVITY
 from model.structure.exciter import Actuator
 from model.structure.plate import Plate
 
@@ -68,7 +69,7 @@ _GENERAL = 1  # a data type without one of its own
 _ACCELERATION_UNITS = {
     **dict.fromkeys(("", "m/s2", "m/s/s", "m/ss", "ms-2", "ms2", "meter/s2"), 1.0),
     **dict.fromkeys(("mm/s2", "mm/s/s"), 1e-3),
-    **dict.fromkeys(("g", "gs", "gn", "g0"), 9.80665),
+    **dict.fromkeys(("g", "gs", "gn", "g0"), GRAVITY),
     **dict.fromkeys(("in/s2", "in/s/s", "inch/s2"), 0.0254),
 }
 _DISPLACEMENT_UNITS = {

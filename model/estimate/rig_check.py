@@ -53,7 +53,7 @@ from model.estimate.measurement import (
 )
 from model.quantities import counted, percent
 from model.rig.rig import Rig
-from model.structure.attachments import Era, PointLoad
+from model.structure.attachments import GRAVITY, Era, PointLoad
 from model.structure.exciter import Exciter
 from model.study.verification import MIN_KEPT_SHARE, promise_margins
 
@@ -89,7 +89,6 @@ _MIN_CHANNELS = 3  # of which a median shows what is the amplifier's
 
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
 _MAX_FREQUENCIES = 16  # ample for every check before a calibration
-GRAVITY = 9.80665  # m/s², standard
 _QUANTITIES = (
     ("g", f"multiply by {GRAVITY}", 1 / GRAVITY, 0),
     ("mm/s² per m", "divide by 1000", 1e3, 0),

@@ -47,8 +47,10 @@ FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
 """Parts of a finger's load that vary independently."""
 
 _BUILT = Uncertainty()
-_PHASE = ("°", "deg", math.degrees(1))
-_LENGTH, _WEIGHT = ("mm", "mm", 1e3), ("g", "g", 1e3)
+_PHASE, _LENGTH, _WEIGHT = ("°", math.degrees(1)), ("mm", 1e3), ("g", 1e3)
+
+UNIT_KEYS = {"%": "percent", "°": "deg", "/kHz²": "1/kHz^2", "/kHz": "1/kHz"}
+"""Units in reports for programs, of those that people read in another way."""
 
 EXCITER_KINDS = ("magnet_mass", "force_factor")
 """Kinds whose parameters only exciters have."""
@@ -94,8 +96,6 @@ class Kind:
     """Standard deviation for a plate that was not measured, in the unit of `Values`."""
     unit: str = "%"
     """Unit in reports for people; logarithms of factors are written as per cent."""
-    key: str = "percent"
-    """Unit in reports for programs."""
     per_unit: float = 100.0
     """Number of report units in one unit of `Values`."""
     drift: float = 0.0
@@ -126,17 +126,17 @@ KINDS = {
     "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping), theory=0.01),
     "loss": Kind(math.log(_BUILT.damping), drift=0.1),
     # Beside those of the rig, which may have none; data sheets give little, of ERAs by their ratio.
-    "damping_added": Kind(0.0, "N s/m", "N s/m", 1.0, sheet=0.015, bound=2.0, own_share=0.7),
-    "loss_added": Kind(0.0, "", "", 1.0, sheet=0.003, bound=0.5, own_share=0.7),
+    "damping_added": Kind(0.0, "N s/m", 1.0, sheet=0.015, bound=2.0, own_share=0.7),
+    "loss_added": Kind(0.0, "", 1.0, sheet=0.003, bound=0.5, own_share=0.7),
     # The power of frequency that the loss factor follows.
-    "loss_exponent": Kind(0.3, "", "", 1.0),
+    "loss_exponent": Kind(0.3, "", 1.0),
     "gain": Kind(_BUILT.gain, drift=0.01, sheet=1.0, bound=8.0),
     "phase": Kind(math.radians(_BUILT.phase_deg), *_PHASE, drift=math.radians(1)),
     # A resonance at 700 Hz with a damping ratio of 0.5.
-    "inertia": Kind(1 / 0.7**2, "/kHz²", "1/kHz^2", 1.0),
-    "drag": Kind(1 / 0.7, "/kHz", "1/kHz", 1.0),
+    "inertia": Kind(1 / 0.7**2, "/kHz²", 1.0),
+    "drag": Kind(1 / 0.7, "/kHz", 1.0),
     # Of an amplifier's clock: what no exchange over unlike lines shows.
-    "delay": Kind(200e-6, "us", "us", 1e6),
+    "delay": Kind(200e-6, "us", 1e6),
     "sensor_gain": Kind(0.05),
     "sensor_phase": Kind(math.radians(5), *_PHASE),
     # By data sheets: of the plate's mass that an ERA carries.
@@ -158,9 +158,9 @@ KINDS = {
     "sensor_place": Kind(0.5e-3, *_LENGTH),
     "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
     "side": Kind(0.5e-3, *_LENGTH),
-    "poisson": Kind(0.015, "", "", 1.0),
+    "poisson": Kind(0.015, "", 1.0),
     # From hysteretic losses, 0, to viscous ones, 1 (`model.estimate.forward`).
-    "loss_law": Kind(1.0, "", "", 1.0),
+    "loss_law": Kind(1.0, "", 1.0),
 }
 """Kinds of parameters; for some a rig's `uncertainty` states the standard deviation instead.
 

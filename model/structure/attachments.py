@@ -582,7 +582,8 @@ def _gauss(count: int) -> tuple[FloatArray, FloatArray]:
     return leggauss(count)
 
 
-GRAVITY = 9.81  # m/s²
+GRAVITY = 9.80665
+"""Standard acceleration of gravity, g [m/s²]."""
 
 MIN_RIGID_BODY_FREQUENCY = 1.0
 """Hz. Under its own weight a plate moves by g / omega²: 25 cm in a mode of this frequency."""

@@ -246,7 +246,7 @@ def test_design_writes_a_rig_that_loads(small, tmp_path: Path) -> None:
         "rig.yaml", "layouts.csv", "contrast.png", "count.png", "template.svg",
     }  # fmt: skip
     weight = sum(era["static_load_n"] for era in found["eras"].values())
-    assert weight == pytest.approx(9.81 * rig.plate.mass)
+    assert weight == pytest.approx(9.80665 * rig.plate.mass)
     assert list(found["by_count_db"]) == ["3", "4", "5", "6"]
     again = design(*arguments[:-1]).stdout
     assert load_rig(tmp_path / "rig.yaml").eras == rig.eras

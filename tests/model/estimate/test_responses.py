@@ -61,7 +61,7 @@ def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     values = exact + 1e-3 * size * (noise[0] + 1j * noise[1])
     responses = Measurement(sensors_at(points), TONES, values.swapaxes(1, 2))
     found = calibrate(rig, responses, check_consistency(rig, responses))
-    loss = next(one for one in found.parameters if one.parameter.kind == "loss_factor")
+    loss = next(one for one in found.parameters if one.kind == "loss_factor")
     assert loss.standard_error is not None
     off = abs(loss.value - truth.rig.plate.loss_factor)
     assert off < loss.standard_error < 0.01 * loss.value

@@ -391,7 +391,7 @@ def test_static_loads_of_a_seesaw() -> None:
         replace(one, name=str(number), x=x, y=y)
         for number, (x, y) in enumerate([(0, 0), (length, 0), (length / 2, width)])
     ]
-    weight = 9.81 * some.plate.mass
+    weight = 9.80665 * some.plate.mass
     assert static_loads(some.plate, eras) == pytest.approx([weight / 4, weight / 4, weight / 2])
     assert shortfall(some, eras, lowest=10.0) == 0
     # The centre of mass behind all of them: the plate tips.

@@ -9,7 +9,7 @@ from benchmarks.desk_plate.lifted_blocks import SAMPLES, LiftedBlocks, sampled
 from benchmarks.desk_plate.model_in_time import DeskModel
 from benchmarks.desk_plate.sensing import Converters, SensorChannels
 from benchmarks.desk_plate.truth import Truth
-from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, are_places
+from era_haptics.lab.measuring.sound_card import Desk, WiredSensor, are_positions
 from model.arrays import FloatArray
 from model.errors import InputError
 from model.finger import fingertips_on
@@ -44,7 +44,7 @@ class DeskPlate:
         self._model = DeskModel(truth, np.array([[sensor.x, sensor.y] for sensor in sensors]))
         self._sensors = tuple(sensors)
         self._fingers: tuple[FingertipLoad, ...] = ()
-        self._place = 0 if are_places(sensors) else None
+        self._place = 0 if are_positions(sensors) else None
         self._channels = SensorChannels(
             sensors if self._place is None else sensors[:1],
             loopback=desk.input,

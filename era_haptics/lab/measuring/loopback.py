@@ -34,7 +34,7 @@ from era_haptics.lab.measuring.sound_card import (
     Multisine,
     ResponseEstimate,
     WiredSensor,
-    are_places,
+    are_positions,
 )
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
@@ -469,7 +469,7 @@ def _of_lines(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
 
 def _of_recording(path: Path, desk: Desk) -> Iterator[MeasuredValue]:
     sensors = [*desk.sensors]
-    if are_places(sensors):
+    if are_positions(sensors):
         sensors = [_sensor(desk, _in_name(path, 0, "sensor"), str(path))]
     names = [name for name, _ in desk.eras]
     if "-" in path.stem:

@@ -33,7 +33,7 @@ from era_haptics.lab.measuring.sound_card import (
     Run,
     SoundCard,
     WiredSensor,
-    are_places,
+    are_positions,
     converters,
     default_frequencies,
     estimate,
@@ -495,7 +495,7 @@ def measured_by_simulation(
             real.eras,
             frequencies,
             point[None],
-            loads=[*real.masses, *([weight] if are_places(sensors) else weights)],
+            loads=[*real.masses, *([weight] if are_positions(sensors) else weights)],
         )
         for point, weight in zip(points, weights, strict=True)
     ]
@@ -505,7 +505,7 @@ def measured_by_simulation(
     rms = np.sqrt((np.abs(values) ** 2).mean(axis=(0, 1)))
     values += NOISE * rms * (parts[0] + 1j * parts[1])
     places = [each.place for each in sensors]
-    if not are_places(sensors):
+    if not are_positions(sensors):
         places = [replace(each, mass=0.0) for each in places]
     measured = Measurement(places, frequencies, values.swapaxes(1, 2))
     return written(measured, desk, output, source="simulated plate")

@@ -113,7 +113,7 @@ def measure(
     calibrate, and for era rig identify --measured.
     """
     from era_haptics.lab.measuring.measure import measure_at_once, open_desk
-    from era_haptics.lab.measuring.sound_card import Desk, are_places, read_sensors
+    from era_haptics.lab.measuring.sound_card import Desk, are_positions, read_sensors
     from model.config.units import parse_frequencies
     from model.files.output_paths import check_ending, check_place
     from model.rig.rig_file import load_rig
@@ -123,7 +123,7 @@ def measure(
     rig = load_rig(rig_file)
     lines = parse_frequencies(frequencies) if frequencies else None
     desk = Desk(rig, read_sensors(sensors_file, rig.plate, mass=mass, may_move=True), y_cable)
-    is_moved = are_places(desk.sensors)
+    is_moved = are_positions(desk.sensors)
     if (device is not None) + (source is not None) + is_simulated != 1:
         raise InputError(
             "give --device, a sound card, or --from, what another has measured, or --simulated"

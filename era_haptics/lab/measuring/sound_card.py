@@ -472,7 +472,7 @@ def read_sensors(
     return tuple(sensors)
 
 
-def are_places(sensors: Sequence[WiredSensor]) -> bool:
+def are_positions(sensors: Sequence[WiredSensor]) -> bool:
     """Whether the sensors are places of one that is moved."""
     return len(sensors) > 1 and len({sensor.input for sensor in sensors}) == 1
 

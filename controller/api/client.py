@@ -45,9 +45,7 @@ from controller.api.methods import (
     METHODS,
     SILENCING,
     ArmResult,
-    ClearParams,
     EffectsResult,
-    HelloParams,
     HelloResult,
     LayoutResult,
     ReloadResult,
@@ -320,30 +318,27 @@ class AsyncClient:
         lost, self._lost = self._lost, 0
         return replace(event, lost=event.lost + lost)
 
-    async def call(self, method: str, params: ApiMessage, result: type[_ResultT]) -> _ResultT:
-        """Call any method and return its result.
+    async def _call(self, result: type[_ResultT], method: str, **values: Any) -> _ResultT:
+        """Call a method with these parameters and return its result.
 
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
         state event.
         """
         if method not in SILENCING:
             self._check_lease()
-        if isinstance(params, ClearParams) and params.epoch is None and self._seen is not None:
-            params = params.model_copy(update={"epoch": self._seen[1]})
+        if method == "clear" and values["epoch"] is None and self._seen is not None:
+            values["epoch"] = self._seen[1]
+        params = make_params(method, **values)
         if method == "stop":
             self._release()
         found = await self.request(method, params)
         if method in SILENCING:
             self._release()
-        elif isinstance(params, HelloParams):
-            self._name = params.client
+        elif method == "hello":
+            self._name = values["client"]
         read = read_result(found, result)
         self._see(self._connections, getattr(read, "epoch", None))
         return read
-
-    async def _call(self, result: type[_ResultT], method: str, **values: object) -> _ResultT:
-        """Call a method with these parameters."""
-        return await self.call(method, make_params(method, **values), result)
 
     async def request(self, method: str, params: ApiMessage) -> Any:
         """Send a request, again over new connections if that is harmless.
@@ -594,8 +589,6 @@ class Client:
         """Yield notifications as they arrive; end when none arrives within a timeout [s]."""
         while (event := self._run(self._client.next_event(timeout=timeout))) is not None:
             yield event
-
-    call = _blocking(AsyncClient.call)
 
     def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
         if not self._loop.is_open:

@@ -19,7 +19,6 @@ import socket
 import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeAlias, cast
 
@@ -216,32 +215,27 @@ class Connection(asyncio.BufferedProtocol):
 Handler: TypeAlias = Callable[[Connection, Any], ApiMessage | Awaitable[ApiMessage]]
 
 
-@dataclass(slots=True)
 class _Call:
     """A line as read: a method with its parameters, or an error."""
 
-    id: Id = None
-    expects_response: bool = True
-    method: str = ""
-    params: ApiMessage | None = None
-    error: Exception | None = None
-    record: dict[str, Any] = field(default_factory=dict)  # for dumps, with the outcome
-
-
-def _read_call(line: bytes) -> _Call:
-    call = _Call()
-    try:
-        request = read_request(line)
-        call.id, call.expects_response = request.id, request.expects_response
-        if request.method not in METHODS:
-            raise unknown_method(request.method, METHODS)
-        call.params = read_params(METHODS[request.method].params, request)
-        call.method = request.method
-    except InvalidRequest as error:
-        call.id, call.error = error.id, error
-    except Exception as error:  # of the parameters, or a bug
-        call.error = error
-    return call
+    def __init__(self, line: bytes) -> None:
+        self.id: Id = None
+        self.expects_response = True
+        self.method = ""
+        self.params: ApiMessage | None = None
+        self.error: Exception | None = None
+        self.record: dict[str, Any] = {}  # for dumps, with the outcome
+        try:
+            request = read_request(line)
+            self.id, self.expects_response = request.id, request.expects_response
+            if request.method not in METHODS:
+                raise unknown_method(request.method, METHODS)
+            self.params = read_params(METHODS[request.method].params, request)
+            self.method = request.method
+        except InvalidRequest as error:
+            self.id, self.error = error.id, error
+        except Exception as error:  # of the parameters, or a bug
+            self.error = error
 
 
 class ApiServer:
@@ -408,7 +402,7 @@ class ApiServer:
             what = f"line longer than {MAX_LINE_LENGTH} bytes"
             client.refuse(RpcError(ErrorCode.PARSE, what, remedy="send less"))
             return
-        call = _read_call(line)
+        call = _Call(line)
         if (call.error or METHODS[call.method].is_limited) and not client.rate.take():
             if call.error is not None:
                 client.refuse(_busy())

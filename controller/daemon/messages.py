@@ -1,7 +1,9 @@
-"""The state of the control loop and the amplifiers as messages of the API, and their publication.
+"""Messages of the API that say what the daemon, the plate and its amplifiers do.
 
-`PlateView` holds the contacts and what plays; `EventPublisher` keeps the daemon's current state and
-publishes every change of it to subscribed clients.
+`EventPublisher` keeps what was last reported and sends every change to the clients that subscribed
+to its topic. `PlateView` describes the fingers and what plays for them, `amplifier_statuses` the
+amplifiers, `hello_result` and `effects_result` what a client can use. `LatencyStatistics` sums up
+how quickly touches were answered.
 """
 
 import asyncio
@@ -37,7 +39,6 @@ from controller.api.schema import (
     AmplifierReport,
     AmplifierSilence,
     AmplifierStatus,
-    ApiMessage,
     ContactStatus,
     EffectDescription,
     EraPosition,
@@ -72,33 +73,209 @@ from model.answer.answer import is_felt
 from model.table.table import LocalizationTable
 from registry import threads
 
+_MAX_MESSAGE = 1000
+"""Longest message of a log record that is sent [characters]."""
+
 _LEVEL = QUANTITIES["level"]
+
+_logger = logging.getLogger(__name__)
+
+
+class EventPublisher:
+    """Keeps the state of the plate up to date and sends every change to subscribed clients.
+
+    operation, amplifiers, inputs: return the current state of the daemon, of its amplifiers and of
+        its touch inputs.
+    layouts: the surface layouts of the daemon.
+    learning: returns what learns the plate; None if the plate is not learned.
+    noted: called with a record of every change of contacts and every decision, for dumps.
+    """
+
+    def __init__(
+        self,
+        *,
+        operation: Callable[[], Operation],
+        amplifiers: Callable[[], list[AmplifierStatus]],
+        layouts: LayoutChoice,
+        inputs: Callable[[], InputsEvent],
+        learning: Callable[[], Learning | None],
+        noted: Callable[[Mapping[str, object]], object],
+    ) -> None:
+        self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
+        self._player = layouts.player
+        self.latencies = LatencyStatistics()  # of touches alone
+        self.lift_latencies = LatencyStatistics()
+        self.learning_latencies = LatencyStatistics()
+        self._learning = learning
+        self._noted = noted
+        self.amplifiers = amplifiers
+        self.inputs = inputs
+        self._operation = operation
+        self._last_link_message = ""
+        self._loop = asyncio.get_running_loop()
+        self.hub = Hub(
+            {
+                "state": lambda: _state_event(operation(), operation()),
+                "contacts": self.view.contacts_event,
+                "pattern": self.view.pattern_event,
+                "silence": self.view.silence_event,
+                "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
+                "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
+                "layout": layouts.event,
+                "plate": lambda: None if (found := learning()) is None else found.event,
+                "inputs": inputs,
+                "strength": self.strengths,
+            },
+            clock=threads.now,
+        )
+
+    def observe(self, loop: Observers) -> None:
+        """Subscribe to the reports of the control loop."""
+        loop.contacts_changed.append(self._contacts_changed)
+        loop.pattern_applied.append(partial(self._reported, "pattern"))
+        loop.silenced.append(partial(self._reported, "silence"))
+        loop.refused.append(self._refused)
+
+    def state_changed(self, old: Operation, new: Operation) -> None:
+        """Publish a transition of the daemon, and the silence that it causes.
+
+        Nothing plays outside OPERATION_ENABLED. The control loop does not report the end of what
+        another part of the daemon has silenced.
+        """
+        self.hub.publish("state", lambda: _state_event(old, new))
+        if new.state is DaemonState.OPERATION_ENABLED:
+            return
+        was_playing, self.view.report = self.view.applied is not None, None
+        if was_playing:
+            silence = SilenceEvent(
+                contacts=self.view.contact_statuses(),
+                reason=new.cause,
+                latency_ms=None,
+            )
+            self.hub.publish("silence", lambda: silence)
+
+    def _why_not(self, key: ContactKey) -> str:
+        """Return why a contact feels nothing of its own, unless the loop has reported it."""
+        operation = self._operation()
+        if operation.state is not DaemonState.OPERATION_ENABLED:
+            return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
+        if operation.degraded:
+            return f"{operation.cause}; {operation.remedy}"
+        return self._player.why_not(key)
+
+    def plate_changed(self, event: PlateEvent) -> None:
+        """Publish that the plate has changed, or that it is learned in another way."""
+        self.hub.publish("plate", lambda: event)
+
+    def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
+        """Publish that the link to amplifiers was degraded, restored, lost, retried or reopened."""
+        if change == "retry" and message != self._last_link_message:
+            _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
+        self._last_link_message = message
+        event = LinkEvent(
+            event=change,
+            amplifier=lost[0] if len(lost) == 1 else None,
+            message=message,
+            remedy=None if change in ("restored", "reopened") else self._operation().remedy,
+        )
+        self.hub.publish("link", lambda: event)
+
+    def logged(self, record: logging.LogRecord) -> None:
+        """Publish a log record, from any thread.
+
+        A record that is marked with a topic is left out: an event of that topic reports it.
+        """
+        if hasattr(record, "topic"):
+            return
+        event = {
+            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
+            # File names may contain bytes that are not valid text.
+            "message": record.getMessage()[:_MAX_MESSAGE]
+            .encode(errors="backslashreplace")
+            .decode(),
+            "cause": getattr(record, "cause", None),
+            "remedy": getattr(record, "remedy", None),
+        }
+        make = partial(LogEvent.model_validate, event)
+        with contextlib.suppress(RuntimeError):  # the loop may be closed
+            self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
+
+    def strengths(self) -> StrengthResult:
+        """Return the strengths of all known touch sources, clients and regions."""
+        known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
+        clients = [name for _, name in known.clients() if not UNNAMED.fullmatch(name)]
+        regions = [each.name for each in self._player.layout.regions]
+        names = sorted({*inputs, *known.sources, *clients, *regions})
+        return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
+
+    def learning_summary(self) -> LearningSummary | None:
+        """Return what was learned of the plate; None if it is not learned."""
+        learning = self._learning()
+        return None if learning is None else learning.summary(self.learning_latencies.summary())
+
+    def _refused(self, reason: str) -> None:
+        self._noted({"time_s": threads.now(), "refused": reason})
+        _logger.warning("refused: %s", reason)
+
+    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
+        self.view.contacts = contacts
+        self._noted({"time_s": threads.now(), "contacts": contacts})
+        self.hub.publish("contacts", self.view.contacts_event)
+
+    def _reported(
+        self, topic: Literal["pattern", "silence"], report: PlayReport | SilenceReport
+    ) -> None:
+        """Publish what plays or that nothing does, and count its latency.
+
+        Latencies of touches are counted apart from all others.
+        """
+        self.view.report = report
+        why = report.reason if isinstance(report, SilenceReport) else ""
+        self._noted({"time_s": report.time, topic: report.targets, "reason": why})
+        if report.latency is not None:
+            latencies = self.latencies if report.is_touch else self.lift_latencies
+            latencies.add(report.latency)
+        event = self.view.pattern_event if topic == "pattern" else self.view.silence_event
+        self.hub.publish(topic, event)
+
+
+def _state_event(old: Operation, new: Operation) -> StateEvent:
+    return StateEvent(
+        old=old.state.value,
+        new=new.state.value,
+        cause=new.cause,
+        remedy=new.remedy,
+        epoch=new.epoch,
+    )
 
 
 @dataclass
 class PlateView:
-    """Contacts on the plate, and what the control loop has last reported of what plays."""
+    """The contacts on the plate and the last report of what plays for them."""
 
     effect_of: Callable[[ContactKey], str | None]
-    """The effect that plays for a contact."""
+    """Returns the effect that plays for a contact."""
     contacts: tuple[Contact, ...] = ()
     report: PlayReport | SilenceReport | None = None
-    """None before the first report, and once another part of the daemon has silenced the plate."""
+    """The last report of the control loop.
+
+    None before the first one, and after another part of the daemon has silenced the plate.
+    """
     why_not: Callable[[ContactKey], str] = lambda key: ""
-    """Why a contact feels nothing, where the report does not say so; "" if it should feel."""
+    """Returns why a contact feels nothing if the report does not say it; "" if it should feel."""
 
     @property
     def applied(self) -> PlayReport | None:
-        """The pattern that plays; None while nothing does."""
+        """The report of the pattern that plays; None while nothing plays."""
         return self.report if isinstance(self.report, PlayReport) else None
 
     def contact_statuses(self) -> list[ContactStatus]:
-        """All contacts with their roles."""
+        """Describe all contacts with their roles."""
         return self._statuses(self.contacts)
 
     @property
     def silence_reason(self) -> str | None:
-        """Why nothing plays for the contacts of now; None while a pattern plays."""
+        """Why nothing plays for the present contacts; None while a pattern plays."""
         if self.applied is not None:
             return None
         reasons = dict.fromkeys(each.held_back for each in self.contact_statuses())
@@ -110,7 +287,7 @@ class PlateView:
             reason = report.reason
         known = {(each.key, each.since) for each in report.contacts} if report and reason else ()
         return [
-            contact_status(
+            _contact_status(
                 each,
                 report,
                 self.effect_of(each.key),
@@ -121,7 +298,7 @@ class PlateView:
         ]
 
     def statuses_now(self, table: LocalizationTable) -> list[ContactStatus]:
-        """All contacts with their roles, and what leaks to them where they are now."""
+        """Describe all contacts with their roles and with what leaks to their present places."""
         statuses = self.contact_statuses()
         if self.applied is None:
             return statuses
@@ -134,16 +311,16 @@ class PlateView:
 
     @property
     def targets(self) -> list[str]:
-        """The fingers that feel something now, by source and number."""
+        """The fingers that feel something now, each as its source and number."""
         keys = [each.contact.key for each in self.applied.targets] if self.applied else []
         return [f"{key.source} {key.id}" for key in keys]
 
     def contacts_event(self) -> ContactsEvent:
-        """The event of topic `contacts`."""
+        """Return the event of topic `contacts`."""
         return ContactsEvent(contacts=self.contact_statuses())
 
     def pattern_event(self) -> PatternEvent | None:
-        """The event of topic `pattern`; None while nothing plays."""
+        """Return the event of topic `pattern`; None while nothing plays."""
         applied = self.applied
         if applied is None:
             return None
@@ -154,7 +331,7 @@ class PlateView:
         )
 
     def silence_event(self) -> SilenceEvent | None:
-        """The event of topic `silence`; None while something plays, or before a decision."""
+        """Return the event of topic `silence`; None while something plays or before a decision."""
         silenced = self.report
         if not isinstance(silenced, SilenceReport):
             return None
@@ -165,33 +342,12 @@ class PlateView:
         )
 
 
-def playing_of(applied: PlayReport | None) -> dict[str, Any]:
-    """The values of `PatternFields`: tones of a pattern, and its promised and predicted figures."""
-    felt = None if applied is None else applied.felt
-    contents = {} if applied is None else applied.contents
-    return {
-        "drive": {} if applied is None else played_tones(applied.drive),
-        "layers": {str(number): played_tones(each.drive) for number, each in contents.items()},
-        "promised_contrast_db": felt and _finite(felt.promised_contrast_db),
-        "predicted_contrast_db": felt and _finite(felt.contrast_db),
-        "predicted_level_db_sl": felt and _finite(felt.nominal_db_sl),
-    }
-
-
-def played_tones(drive: Drive) -> dict[str, PlayedTone]:
-    """Describe what ERAs play in one layer."""
-    return {
-        era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
-        for era, tone in drive.items()
-    }
-
-
-def contact_status(
+def _contact_status(
     contact: Contact, report: PlayReport | SilenceReport | None, effect: str | None, *, why_not: str
 ) -> ContactStatus:
-    """Describe a contact with what it is predicted to feel, and the effect that it was to feel.
+    """Describe a contact, its predicted sensation and its effect.
 
-    why_not: why it feels nothing of its own, unless it is a target of the report.
+    why_not: why it feels nothing of its own; used if it is not a target of the report.
     """
     status: dict[str, object] = {
         "source": contact.key.source,
@@ -226,6 +382,115 @@ def contact_status(
             "is_foreign_felt": is_felt(highest),
         }
     return ContactStatus.model_validate(status)
+
+
+def playing_of(applied: PlayReport | None) -> dict[str, Any]:
+    """Return the values of `PatternFields`: the tones of a pattern and its figures."""
+    felt = None if applied is None else applied.felt
+    contents = {} if applied is None else applied.contents
+    return {
+        "drive": {} if applied is None else _played_tones(applied.drive),
+        "layers": {str(number): _played_tones(each.drive) for number, each in contents.items()},
+        "promised_contrast_db": felt and _finite(felt.promised_contrast_db),
+        "predicted_contrast_db": felt and _finite(felt.contrast_db),
+        "predicted_level_db_sl": felt and _finite(felt.nominal_db_sl),
+    }
+
+
+def _played_tones(drive: Drive) -> dict[str, PlayedTone]:
+    """Describe the tones of one layer by ERA."""
+    return {
+        era: PlayedTone(frequency_hz=tone.frequency, level=tone.level, phase_deg=tone.phase)
+        for era, tone in drive.items()
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """Return a finite value unchanged; None for infinity and NaN, which JSON lacks."""
+    return value if value is not None and abs(value) < float("inf") else None
+
+
+def amplifier_statuses(
+    amplifiers: Mapping[str, Amplifier],
+    urls: Mapping[str, str],
+    *,
+    are_open: bool,
+    lost: Loss | None,
+    what_may_play: Callable[[str], StopOutcome],
+    clock_errors: Mapping[str, float],
+    targets: Sequence[str] = (),
+) -> list[AmplifierStatus]:
+    """Describe all amplifiers by their last statuses, without sending a request.
+
+    are_open: whether all are open together; otherwise their last statuses are outdated.
+    lost: the loss after which the other amplifiers were closed.
+    what_may_play: returns what an amplifier that does not reply may play, by its name.
+    clock_errors: RMS errors of the clocks [s]; see `Group`.
+    targets: the fingers that feel something now.
+    """
+    now, statuses = threads.now(), []
+    for name, url in urls.items():
+        status = status_at = serial_number = None
+        is_degraded, counts = False, LinkStatistics()
+        reports: list[AmplifierReport] = []
+        if (amplifier := amplifiers.get(name)) is not None:
+            is_known = are_open and not is_lost(amplifier)
+            status = amplifier.status if is_known else None
+            is_degraded = is_known and amplifier.silence_cause is not None
+            status_at = amplifier.status_at
+            serial_number = amplifier.identity.get("serial_number")
+            reports = [
+                _report(kind, targets)
+                for kind, at in amplifier.reported_at.items()
+                if at > now - REPORT_LIFE
+            ]
+            counts = amplifier.statistics
+        readings: dict[str, Any] = {
+            each.key: each.in_unit(status) if status else None for each in READINGS
+        }
+        counters = {
+            key: getattr(counts, key)
+            for key in LinkCounters.model_fields.keys() - {"round_trip_ms"}
+        }
+        round_trip, clock_error = counts.last_round_trip, clock_errors.get(name, math.inf)
+        has_clock_error = status and len(urls) > 1 and clock_error < math.inf
+        closed_with_lost = lost is not None and bool(lost.names) and name not in lost.names
+        statuses.append(
+            AmplifierStatus(
+                name=name,
+                url=url,
+                serial_number=serial_number,
+                state=name_of(STATES, status["state"]) if status else None,
+                fault=name_of(FAULTS, status["fault"]) if status else None,
+                levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
+                high_voltage=has_flag(status, "high_voltage") if status else None,
+                **readings,
+                reply_age_s=None if status_at is None else max(0.0, now - status_at),
+                clock_skew_us=1e6 * clock_error if has_clock_error else None,
+                degraded=is_degraded,
+                lost=status is None and not closed_with_lost,
+                closed_with_lost=status is None and closed_with_lost,
+                reports=reports,
+                silence=AmplifierSilence(**what_may_play(name).rows(now))
+                if status is None or is_degraded
+                else None,
+                statistics=LinkCounters(
+                    **counters, round_trip_ms=None if round_trip is None else 1e3 * round_trip
+                ),
+            )
+        )
+    return statuses
+
+
+def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
+    """Describe a report of an amplifier.
+
+    Limited levels are felt less by every finger that feels something, so its cause names them.
+    """
+    cause, remedy = REPORTS[kind]
+    if kind == "limited" and targets:
+        cause += f", and fingers feel less than promised: {', '.join(targets)}"
+    return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
 
 
 def hello_result(
@@ -291,279 +556,9 @@ def effects_result(layout: SurfaceLayout) -> EffectsResult:
     )
 
 
-def amplifier_statuses(
-    amplifiers: Mapping[str, Amplifier],
-    urls: Mapping[str, str],
-    *,
-    are_open: bool,
-    lost: Loss | None,
-    what_may_play: Callable[[str], StopOutcome],
-    clock_errors: Mapping[str, float],
-    targets: Sequence[str] = (),
-) -> list[AmplifierStatus]:
-    """Describe all amplifiers from their last statuses, without sending a request.
-
-    are_open: whether all are open together; otherwise their last statuses are left out.
-    lost: the loss that has closed the others.
-    what_may_play: what an amplifier that does not reply may play, by its name.
-    clock_errors: see `Group`.
-    targets: the fingers that feel something now.
-    """
-    missing = () if lost is None else lost.names
-    return [
-        _amplifier_status(
-            name,
-            amplifiers.get(name),
-            url,
-            is_open=are_open,
-            closed_with_lost=bool(missing) and name not in missing,
-            what_may_play=what_may_play,
-            clock_error=clock_errors.get(name, math.inf) if len(urls) > 1 else math.inf,
-            targets=targets,
-        )
-        for name, url in urls.items()
-    ]
-
-
-def _amplifier_status(
-    name: str,
-    amplifier: Amplifier | None,
-    url: str,
-    *,
-    is_open: bool,
-    closed_with_lost: bool,
-    what_may_play: Callable[[str], StopOutcome],
-    clock_error: float,
-    targets: Sequence[str],
-) -> AmplifierStatus:
-    """closed_with_lost: whether it was closed because another amplifier was lost."""
-    status = status_at = serial_number = None
-    is_degraded, counts = False, LinkStatistics()
-    reports: list[AmplifierReport] = []
-    if amplifier is not None:
-        is_known = is_open and not is_lost(amplifier)
-        status = amplifier.status if is_known else None
-        is_degraded = is_known and amplifier.silence_cause is not None
-        status_at = amplifier.status_at
-        serial_number = amplifier.identity.get("serial_number")
-        recent = threads.now() - REPORT_LIFE
-        reports = [
-            _report(kind, targets) for kind, at in amplifier.reported_at.items() if at > recent
-        ]
-        counts = amplifier.statistics
-    readings: dict[str, Any] = {
-        each.key: each.in_unit(status) if status else None for each in READINGS
-    }
-    return AmplifierStatus(
-        name=name,
-        url=url,
-        serial_number=serial_number,
-        state=name_of(STATES, status["state"]) if status else None,
-        fault=name_of(FAULTS, status["fault"]) if status else None,
-        levels=[_LEVEL.from_wire(level) for level in status["levels"]] if status else [],
-        high_voltage=has_flag(status, "high_voltage") if status else None,
-        **readings,
-        reply_age_s=None if status_at is None else max(0.0, threads.now() - status_at),
-        clock_skew_us=1e6 * clock_error if status and clock_error < math.inf else None,
-        degraded=is_degraded,
-        lost=status is None and not closed_with_lost,
-        closed_with_lost=status is None and closed_with_lost,
-        reports=reports,
-        silence=AmplifierSilence(**what_may_play(name).rows(threads.now()))
-        if status is None or is_degraded
-        else None,
-        statistics=LinkCounters(
-            **_same(counts, LinkCounters),
-            round_trip_ms=None if counts.last_round_trip is None else 1e3 * counts.last_round_trip,
-        ),
-    )
-
-
-def _report(kind: ReportKind, targets: Sequence[str]) -> AmplifierReport:
-    """Describe a report; what is limited is felt less by every finger that feels something."""
-    cause, remedy = REPORTS[kind]
-    if kind == "limited" and targets:
-        cause += f", and fingers feel less than promised: {', '.join(targets)}"
-    return AmplifierReport(kind=kind, cause=cause, remedy=remedy)
-
-
-def _same(status: object, message: type[ApiMessage]) -> dict[str, Any]:
-    """The attributes of a status that are fields of a message."""
-    return {key: getattr(status, key) for key in message.model_fields if hasattr(status, key)}
-
-
-def _finite(value: float | None) -> float | None:
-    """The value if JSON can represent it, else None."""
-    return value if value is not None and abs(value) < float("inf") else None
-
-
-_MAX_MESSAGE = 1000  # characters
-
-_logger = logging.getLogger(__name__)
-
-
-class EventPublisher:
-    """Keeps the current state of the plate and publishes every change at `hub`.
-
-    operation, amplifiers, inputs: return the present state of the daemon, its amplifiers and its
-        touch inputs.
-    layouts: the surface layouts.
-    learning: returns the learning of the plate, None where nothing is learned.
-    noted: called with a record of each change of contacts and each decision.
-    """
-
-    def __init__(
-        self,
-        *,
-        operation: Callable[[], Operation],
-        amplifiers: Callable[[], list[AmplifierStatus]],
-        layouts: LayoutChoice,
-        inputs: Callable[[], InputsEvent],
-        learning: Callable[[], Learning | None],
-        noted: Callable[[Mapping[str, object]], object],
-    ) -> None:
-        self.view = PlateView(layouts.player.effect_of, why_not=self._why_not)
-        self._player = layouts.player
-        self.latencies = LatencyStatistics()  # of touches alone
-        self.lift_latencies = LatencyStatistics()
-        self.learning_latencies = LatencyStatistics()
-        self._learning = learning
-        self._noted = noted
-        self.amplifiers = amplifiers
-        self.inputs = inputs
-        self._operation = operation
-        self._last_link_message = ""
-        self._loop = asyncio.get_running_loop()
-        self.hub = Hub(
-            {
-                "state": lambda: _state_event(operation(), operation()),
-                "contacts": self.view.contacts_event,
-                "pattern": self.view.pattern_event,
-                "silence": self.view.silence_event,
-                "amplifiers": lambda: AmplifiersEvent(amplifiers=amplifiers()),
-                "latency": lambda: LatencyEvent(latency_ms=self.latencies.summary()),
-                "layout": layouts.event,
-                "plate": lambda: None if (found := learning()) is None else found.event,
-                "inputs": inputs,
-                "strength": self.strengths,
-            },
-            clock=threads.now,
-        )
-
-    def observe(self, loop: Observers) -> None:
-        """Publish what the control loop reports."""
-        loop.contacts_changed.append(self._contacts_changed)
-        loop.pattern_applied.append(partial(self._reported, "pattern"))
-        loop.silenced.append(partial(self._reported, "silence"))
-        loop.refused.append(self._refused)
-
-    def state_changed(self, old: Operation, new: Operation) -> None:
-        """Publish a transition; outside OPERATION_ENABLED nothing plays, because of the state."""
-        self.hub.publish("state", lambda: _state_event(old, new))
-        if new.state is DaemonState.OPERATION_ENABLED:
-            return
-        # The control loop does not report the end of what others have silenced.
-        was_playing, self.view.report = self.view.applied is not None, None
-        if was_playing:
-            silence = SilenceEvent(
-                contacts=self.view.contact_statuses(),
-                reason=new.cause,
-                latency_ms=None,
-            )
-            self.hub.publish("silence", lambda: silence)
-
-    def _why_not(self, key: ContactKey) -> str:
-        """Why a contact feels nothing of its own that the control loop has not reported."""
-        operation = self._operation()
-        if operation.state is not DaemonState.OPERATION_ENABLED:
-            return f"{STATE_WORDS[operation.state]}: {operation.next_step or operation.cause}"
-        if operation.degraded:
-            return f"{operation.cause}; {operation.remedy}"
-        return self._player.why_not(key)
-
-    def plate_changed(self, event: PlateEvent) -> None:
-        """Publish what has happened to the plate, or to learning it."""
-        self.hub.publish("plate", lambda: event)
-
-    def link_changed(self, change: LinkChange, lost: Sequence[str], message: str) -> None:
-        """Publish that the link to amplifiers was degraded, lost, retried or opened again."""
-        if change == "retry" and message != self._last_link_message:
-            _logger.warning("link: retrying: %s", message, extra={"topic": "link"})
-        self._last_link_message = message
-        event = LinkEvent(
-            event=change,
-            amplifier=lost[0] if len(lost) == 1 else None,
-            message=message,
-            remedy=None if change in ("restored", "reopened") else self._operation().remedy,
-        )
-        self.hub.publish("link", lambda: event)
-
-    def logged(self, record: logging.LogRecord) -> None:
-        """Publish a log record from any thread, unless it is marked with another topic."""
-        if hasattr(record, "topic"):
-            return
-        event = {
-            "level": "error" if record.levelno >= logging.ERROR else record.levelname.lower(),
-            # file names may contain bytes that are not valid text
-            "message": record.getMessage()[:_MAX_MESSAGE]
-            .encode(errors="backslashreplace")
-            .decode(),
-            "cause": getattr(record, "cause", None),
-            "remedy": getattr(record, "remedy", None),
-        }
-
-        make = partial(LogEvent.model_validate, event)
-        with contextlib.suppress(RuntimeError):  # the loop may be closed
-            self._loop.call_soon_threadsafe(self.hub.publish, "log", make)
-
-    def strengths(self) -> StrengthResult:
-        """The strengths of all touch sources, clients and regions that are known."""
-        known, inputs = self._player.strengths, [each.name for each in self.inputs().inputs]
-        clients = [name for _, name in known.clients() if not UNNAMED.fullmatch(name)]
-        regions = [each.name for each in self._player.layout.regions]
-        names = sorted({*inputs, *known.sources, *clients, *regions})
-        return StrengthResult(strengths={**dict.fromkeys(names, 0.0), **known.gains_db})
-
-    def learning_summary(self) -> LearningSummary | None:
-        """What is learned of the plate; None where nothing is to be."""
-        learning = self._learning()
-        return None if learning is None else learning.summary(self.learning_latencies.summary())
-
-    def _refused(self, reason: str) -> None:
-        self._noted({"time_s": threads.now(), "refused": reason})
-        _logger.warning("refused: %s", reason)
-
-    def _contacts_changed(self, contacts: tuple[Contact, ...], change: Change) -> None:
-        self.view.contacts = contacts
-        self._noted({"time_s": threads.now(), "contacts": contacts})
-        self.hub.publish("contacts", self.view.contacts_event)
-
-    def _reported(
-        self, topic: Literal["pattern", "silence"], report: PlayReport | SilenceReport
-    ) -> None:
-        """Publish what plays, or silence; count its latency as one of touches, or of the rest."""
-        self.view.report = report
-        why = report.reason if isinstance(report, SilenceReport) else ""
-        self._noted({"time_s": report.time, topic: report.targets, "reason": why})
-        if report.latency is not None:
-            latencies = self.latencies if report.is_touch else self.lift_latencies
-            latencies.add(report.latency)
-        event = self.view.pattern_event if topic == "pattern" else self.view.silence_event
-        self.hub.publish(topic, event)
-
-
-def _state_event(old: Operation, new: Operation) -> StateEvent:
-    return StateEvent(
-        old=old.state.value,
-        new=new.state.value,
-        cause=new.cause,
-        remedy=new.remedy,
-        epoch=new.epoch,
-    )
-
-
 BUCKETS_MS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0, 15.0, 20.0, 50.0, 100.0)
-_WINDOW = 10_000
+"""Upper edges of the histogram of latencies [ms]."""
+_WINDOW = 10_000  # latencies, of which the percentiles are taken
 
 
 class LatencyStatistics:

@@ -217,19 +217,14 @@ _BELOW_NYQUIST, _FREQUENCY_MAX = 0.8, 3000.0  # Hz
 
 @final
 class Sensing:
-    """The sensors of an amplifier that plays on a plate; feet: those at its ERAs."""
+    """The sensors of an amplifier that plays on a plate, at the feet of its ERAs and elsewhere."""
 
     def __init__(
-        self,
-        plate: "Bench",
-        amplifier: SimulatedAmplifier,
-        feet: Sequence[Accelerometer],
-        *,
-        seed: int,
+        self, plate: "Bench", name: str, amplifier: SimulatedAmplifier, *, seed: int
     ) -> None:
         self._plate = plate
+        self._name = name
         self._amplifier = amplifier
-        self._feet = tuple(feet)
         self._others: tuple[Accelerometer, ...] = ()
         self._rng = np.random.default_rng(seed)
         self.reader: ToneReader | None = None
@@ -251,7 +246,7 @@ class Sensing:
                     "range": float(np.float32(sensor.reach)),
                     "frequency_max": _Q["frequency"].to_wire(self._frequency_max),
                 }
-                for sensor in self.sensors
+                for sensor in self._sensors_of(self._plate.rig)
             ]
             listed = described[values["first"] :][: (MAX_WORDS - 2) // _SENSOR_WORDS]
             return {"all": len(described), "count": len(listed), "sensors": listed}
@@ -278,10 +273,9 @@ class Sensing:
         if reader is not None and reader in self._plate.probes:
             self._plate.probes.remove(reader)
 
-    @property
-    def sensors(self) -> tuple[Accelerometer, ...]:
-        """All sensors, those at its ERAs first."""
-        return (*self._feet, *self._others)[:_MAX_SENSORS]
+    def _sensors_of(self, rig: Rig) -> tuple[Accelerometer, ...]:
+        """All sensors, those at its ERAs first, where a rig has these."""
+        return (*_feet(rig, self._name), *self._others)[:_MAX_SENSORS]
 
     @property
     def _frequency_max(self) -> float:
@@ -300,7 +294,7 @@ class Sensing:
         self.reader = ToneReader(
             self._plate,
             measurement,
-            self.sensors,
+            self._sensors_of(self._plate.real),
             start=now,
             clock=self._amplifier.clock,
             token=self._amplifier.token,
@@ -379,11 +373,13 @@ class Bench:
         self.rig = rig
         self.sample_rate = sample_rate
         self.imperfections = imperfections
+        self.real = imperfections.plate.realised(rig)
+        """The rig with the errors of plate and ERAs: what moves, and where feet stand."""
         self._probes: list[Probe] = []
         self.time = now
         """The present time [s]."""
         # Behind the amplifiers, and advanced in few large steps: nothing acts back on them.
-        self._plant = _plant_of(imperfections.plate.realised(rig), now)
+        self._plant = _plant_of(self.real, now)
         self._sampled_until = now  # up to when [s] fingers and probes have samples
         self._fingers = Fingers(self._plant.reduced)
         self._is_sampling = False
@@ -405,7 +401,7 @@ class Bench:
         clocks = {name: amplifier.clock for name, amplifier in self.amplifiers.items()}
         self._clocks = StraightClocks(clocks, time=now)
         self._sensing = [
-            Sensing(self, amplifier, _feet(rig, name), seed=number)
+            Sensing(self, name, amplifier, seed=number)
             for number, (name, amplifier) in enumerate(self.amplifiers.items())
         ]
         for amplifier, sensing in zip(self.amplifiers.values(), self._sensing, strict=True):
@@ -529,12 +525,13 @@ class Bench:
         """
         self.advance(now)
         self._sample_plate()
-        plant = _plant_of(errors.realised(self.rig), self.time)
+        real = errors.realised(self.rig)
+        plant = _plant_of(real, self.time)
         plant.set_contacts(self._plant.contacts)
         for index, playing in enumerate(self._applied_outputs):
             plant.set_input(index, self._motion(index, playing, self._clock_of(index)))
         self.imperfections = replace(self.imperfections, plate=errors)
-        self._plant = plant
+        self.real, self._plant = real, plant
         self._shapes_at.cache_clear()
         self._fingers.place(self._fingers.layout.positions, reduced=plant.reduced)
         for sensing in self._sensing:

@@ -245,11 +245,8 @@ def test_identified_rig_is_the_truth_and_its_patterns_have_more_contrast(
             taken = await measured(rig, far)
             found = identify(rig, taken.measurement)
             assert found.is_explained
-            check(
-                found.posterior.space.names,
-                found.posterior.x * found.posterior.space.std,
-                found.posterior.std,
-            )
+            space = found.fitted.space
+            check(space.names, found.fitted.x * space.std, found.std)
             before = await contrasts(rig, far, rig)
             return taken, before, found.rig, await contrasts(rig, far, found.rig)
 

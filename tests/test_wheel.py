@@ -128,7 +128,7 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
     assert not platform.startswith("linux_")  # which no package index takes
     with zipfile.ZipFile(ours) as archive, zipfile.ZipFile(wheel) as plain:
         assert set(archive.namelist()) - set(plain.namelist()) == {
-            "sim/soft_amp/engine.so",
+            "sim/soft_amp/sound-engine.so",
             *(f"model/compiled/{version.file}" for version in versions()),
         }
         archive.extractall(tmp_path / "installed")
@@ -143,7 +143,7 @@ def test_wheel_of_a_platform_brings_its_engine(wheel: Path, tmp_path: Path) -> N
         text=True,
         check=True,
     )
-    assert Path(done.stdout.strip()) == tmp_path / "installed/sim/soft_amp/engine.so"
+    assert Path(done.stdout.strip()) == tmp_path / "installed/sim/soft_amp/sound-engine.so"
 
 
 @pytest.mark.long

@@ -19,8 +19,8 @@ from model.compiled.kernels import compile_library, kept_library
 from model.errors import InputError
 from sim.soft_amp.settings import MAX_CHANNELS, Law, SoftAmplifierSettings
 
-ENGINE = "engine.so"
-"""The file of the library in a wheel of one platform."""
+ENGINE = "sound-engine.so"
+"""The file of the library in a wheel of one platform; no name of a module, which it would hide."""
 
 _HERE = Path(__file__).parent
 _FOLDERS = (_HERE / "firmware", _HERE.parents[1] / "firmware")  # of a wheel, of a checkout

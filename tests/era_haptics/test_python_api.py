@@ -112,7 +112,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
                 ("draw_map", "matplotlib.pyplot"),
                 ("plugins.touch_sources", "sim numpy scipy matplotlib pythonosc"),
                 ("plugins.content_formats", "sim scipy matplotlib drivers"),
-                ("plugins.effects", "sim scipy matplotlib drivers.backend"),
+                ("plugins.effects", "sim matplotlib drivers.backend"),
                 ("plugins.materials", "sim controller drivers numpy"),
             )
         ),

@@ -13,11 +13,11 @@ from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 from model.spectral.modes import Band, SpectralPlate
 from model.spectral.polynomials import CLASSES
+from model.structure.material import Material
 from model.structure.plate import (
     AirGap,
     Laminate,
     LaminateLayer,
-    Material,
     Plate,
     bending,
     equivalent_plate,

@@ -12,7 +12,8 @@ from scipy import linalg, sparse
 from scipy.sparse.linalg import eigsh
 
 from model.arrays import FloatArray
-from model.structure.plate import LaminateLayer, Material
+from model.structure.material import Material
+from model.structure.plate import LaminateLayer
 
 _GAUSS = [(-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)]
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import ComplexArray, FloatArray
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 
 ALUMINIUM = Material("aluminium", E=70e9, rho=2700.0, nu=0.33)
 GLASS = Material("glass", E=72e9, rho=2500.0, nu=0.23)

@@ -1,6 +1,5 @@
 """Interfaces for materials by name: entry points `era_haptics.materials`."""
 
-from model.structure.material import KnownMaterial
-from model.structure.plate import Material, Orthotropy
+from model.structure.material import KnownMaterial, Material, Orthotropy
 
 __all__ = ["KnownMaterial", "Material", "Orthotropy"]

@@ -67,15 +67,19 @@ from model.structure.attachments import (
     PointLoad,
     edge_points,
 )
-from model.structure.material import KnownMaterial, known_material, material_names
+from model.structure.material import (
+    KnownMaterial,
+    Material,
+    Orthotropy,
+    known_material,
+    material_names,
+)
 from model.structure.plate import (
     MAX_LOSS_EXPONENT,
     AirGap,
     Bond,
     Laminate,
     LaminateLayer,
-    Material,
-    Orthotropy,
     Plate,
     equivalent_plate,
 )

@@ -1,4 +1,4 @@
-"""Catalogue of materials and of exciters by name, each value with its source.
+"""A material, and the catalogue of materials and of exciters by name, each with its source.
 
 An installed package adds a material by an entry point of the group `era_haptics.materials` that
 leads to a `KnownMaterial` of that name; rig files, their schema and `era plate materials` follow.
@@ -14,9 +14,88 @@ gives any. A resonance is that of the light coil against the magnet (`free`). Me
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from model.errors import InputError
-from model.structure.plate import Material, Orthotropy
+from model.errors import InputError, expect_values
 from registry.plugins import PluginRegistry
+
+
+@dataclass(frozen=True)
+class Orthotropy:
+    """Moduli of a material with a grain, as shares of E, the modulus along the plate's length."""
+
+    e2: float  # across the length
+    g12: float  # shear in the plane
+    g13: float  # transverse shear along the length
+    g23: float  # transverse shear across it
+
+    def __post_init__(self) -> None:
+        """Refuse moduli that are not above zero."""
+        expect_values(self, "orthotropic material", above="e2 g12 g13 g23")
+
+
+@dataclass(frozen=True)
+class Material:
+    """A linear material, isotropic unless it has a grain."""
+
+    name: str
+    E: float
+    """Young's modulus [Pa], with a grain along the plate's length."""
+
+    rho: float
+    """Density [kg/m³]."""
+
+    nu: float
+    """Poisson's ratio, with a grain the contraction across the length by a stress along it."""
+
+    orthotropy: Orthotropy | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values of no solid."""
+        expect_values(self, f"material {self.name}", above="E rho")
+        if self.orthotropy is None and not -1 < self.nu < 0.5:
+            raise InputError(
+                f"material {self.name}: nu must be between -1 and 0.5, got {self.nu} (most solids: "
+                "0.2 to 0.45)"
+            )
+        if not self.nu**2 * self.shares.e2 < 1:  # of no elastic energy; also of NaN
+            raise InputError(
+                f"material {self.name}: nu12 must be less than the root of E1 / E2, "
+                f"{self.shares.e2**-0.5:.3g}, got {self.nu}"
+            )
+
+    @property
+    def shares(self) -> Orthotropy:
+        """Moduli as shares of E: an isotropic one has G = E / 2 (1 + nu) in all planes."""
+        if self.orthotropy is not None:
+            return self.orthotropy
+        shear = 1 / (2 * (1 + self.nu))
+        return Orthotropy(1.0, shear, shear, shear)
+
+    @property
+    def moduli(self) -> dict[str, float]:
+        """Its moduli [Pa] by the keys of a rig file."""
+        of = self.orthotropy
+        if of is None:
+            return {"E": self.E}
+        shares = {"E1": 1.0, "E2": of.e2, "G12": of.g12, "G13": of.g13, "G23": of.g23}
+        return {key: share * self.E for key, share in shares.items()}
+
+    @property
+    def plane_stress(self) -> float:
+        """1 - nu_12 nu_21, by which moduli are divided in a plate."""
+        return 1 - self.nu**2 * self.shares.e2
+
+    def turned(self) -> "Material":
+        """The material with its grain turned by a right angle."""
+        of = self.orthotropy
+        if of is None:
+            return self
+        return Material(
+            self.name,
+            E=self.E * of.e2,
+            rho=self.rho,
+            nu=self.nu * of.e2,
+            orthotropy=Orthotropy(1 / of.e2, *(g / of.e2 for g in (of.g12, of.g23, of.g13))),
+        )
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ from model.finger import (
 )
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import SpectralMesh
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.vibration import (
     Tone,
     default_frequencies,

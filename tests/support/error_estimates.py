@@ -24,7 +24,8 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import mesh_of
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.vibration import estimate_error
 
 MAX_RATIO = 1.4

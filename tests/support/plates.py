@@ -47,7 +47,8 @@ from model.structure.attachments import (
     damping_from_ratio,
     footprints_of,
 )
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, build_table, solve_table
 from model.transients.base_motion import Motion as BaseMotionMotion

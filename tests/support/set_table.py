@@ -25,7 +25,8 @@ from model.fem import Mesh
 from model.finger import STRONG_DB_SL
 from model.rig.rig import Channel, Rig
 from model.structure.attachments import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.vibration import Excitation
 from registry.limits import GuardLimits

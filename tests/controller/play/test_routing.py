@@ -54,7 +54,8 @@ from model.fem import Mesh
 from model.rig.rig import Channel, Rig, Uncertainty
 from model.rig.rig_file import load_rig
 from model.structure.attachments import Era
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.table.table_file import build_table
 from model.transients.base_motion import BaseEnvelope, Envelopes

@@ -31,7 +31,8 @@ from long_form import shortly
 from model.answer.answer import Answer, Layer, Limits
 from model.answer.stimulus import Finger, Placement, Stimulus
 from model.errors import InputError
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.transients.base_motion import BaseEnvelope
 from model.vibration import Excitation, Tone

@@ -20,7 +20,8 @@ from controller.sources.touch import (
     TouchFrame,
     turned,
 )
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from registry.limits import MAX_CONTACTS
 
 PLATE = Plate(0.3, 0.2, 0.0015, Material("aluminium", 70e9, 2700.0, 0.33))

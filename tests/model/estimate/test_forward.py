@@ -39,7 +39,8 @@ from model.spectral.direct_solution import direct_spectral_acceleration
 from model.spectral.modes import SpectralMesh
 from model.structure.attachments import Fingertip, FingertipLoad, PointLoad, Support
 from model.structure.exciter import Exciter
-from model.structure.plate import Bond, Laminate, LaminateLayer, Material, equivalent_plate
+from model.structure.material import Material
+from model.structure.plate import Bond, Laminate, LaminateLayer, equivalent_plate
 from plates import exciter_rig, exciter_rig_text
 
 FREQUENCIES = np.array([60.0, 140.0, 222.0, 350.0, 480.0])

@@ -37,7 +37,7 @@ from model.rig.rig import Channel, Rig
 from model.rig.rig_file import example_rig_path, load_rig, rig_of
 from model.rig.rig_writing import save_fitted, stated
 from model.spectral.modes import SpectralMesh
-from model.structure.plate import Orthotropy
+from model.structure.material import Orthotropy
 from plates import SETTLED_PATTERNS_FREQUENCIES
 
 FREQUENCIES = np.linspace(40.0, 500.0, 21)

@@ -34,8 +34,8 @@ from model.rig.rig_writing import stated as keys_of
 from model.rig.sections import PlateSection
 from model.structure.attachments import rigid_body_frequencies
 from model.structure.exciter import Exciter
-from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS
-from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Material, Plate
+from model.structure.material import EXCITER_TYPES, KNOWN_MATERIALS, Material
+from model.structure.plate import FOLLOWED_FIELDS, AirGap, Laminate, Plate
 from model.table.table_file import build_table, table_following
 from model.vibration import natural_modes
 from plates import exciter_rig, exciter_rig_text

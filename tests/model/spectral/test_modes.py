@@ -33,6 +33,7 @@ from model.spectral.modes import Band, SpectralMesh, SpectralPlate, local_compli
 from model.spectral.polynomials import CLASSES as PARITY_CLASSES
 from model.spectral.polynomials import EVEN, EdgedFunctions, air_motion
 from model.structure.attachments import Era, PointLoad, footprints_of
+from model.structure.material import Material, Orthotropy
 from model.structure.plate import (
     HEAT_RATIO,
     PRESSURE,
@@ -40,8 +41,6 @@ from model.structure.plate import (
     AirGap,
     Laminate,
     LaminateLayer,
-    Material,
-    Orthotropy,
     Plate,
     equivalent_plate,
 )

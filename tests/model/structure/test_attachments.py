@@ -31,8 +31,8 @@ from model.structure.attachments import (
     static_loads,
     support_problem,
 )
-from model.structure.material import known_material
-from model.structure.plate import Material, Plate
+from model.structure.material import Material, known_material
+from model.structure.plate import Plate
 from model.table.table import LocalizationTable
 from model.table.table_file import TableProblem, solve_table, table_following
 from model.vibration import natural_modes

@@ -20,14 +20,12 @@ from model.fem import assemble
 from model.reduction.free_plate import solve_free_plate
 from model.structure.attachments import Era, Fingertip, FingertipLoad, PointLoad
 from model.structure.exciter import Actuator, Exciter
-from model.structure.material import material
+from model.structure.material import Material, Orthotropy, material
 from model.structure.plate import (
     AirGap,
     Bond,
     Laminate,
     LaminateLayer,
-    Material,
-    Orthotropy,
     Plate,
     bending,
     equivalent_plate,

@@ -16,7 +16,8 @@ from model.fem import assemble
 from model.finger import Grid, detection_threshold, fingertip_points, fingertip_weights
 from model.rig.rig import Rig
 from model.structure.attachments import FingertipLoad, PointLoad
-from model.structure.plate import AirGap, Laminate, LaminateLayer, Material, Plate
+from model.structure.material import Material
+from model.structure.plate import AirGap, Laminate, LaminateLayer, Plate
 from model.study.verification import Plates, felt_on
 from model.table.table import LocalizationTable, Raster, default_drive_frequencies, read_fingertips
 from model.table.table_file import TableProblem, build_table, table_following

@@ -27,7 +27,8 @@ from model.finger import contrast_db, felt_part, fingertip_points, fingertip_wei
 from model.reduction.reduced_plate import ReducedPlate, modal_matrices, reduce_plate
 from model.rig.rig import Rig
 from model.structure.attachments import Era, Fingertip, FingertipLoad, footprints_of
-from model.structure.plate import Material, Plate
+from model.structure.material import Material
+from model.structure.plate import Plate
 from model.table.table_file import build_table
 from model.transients.base_motion import Term, raised_cosine
 from model.transients.shaping import ONSET_WINDOW

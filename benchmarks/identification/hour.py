@@ -118,7 +118,7 @@ def hour(seed: int, *, is_quiet: bool) -> Hour:
     rig, hidden = load_rig(RIG), draw("form", seed)
     sensors = [Sensor(era.name, era.name) for era in rig.eras]
     values = hidden.measured(FREQUENCIES, np.random.default_rng([seed, 1]))
-    identified = identify(rig, Measurement(sensors, FREQUENCIES, values), seed=seed)
+    identified = identify(rig, Measurement(sensors, FREQUENCIES, values))
     live, mounted = LivePlate(PlateEstimate.of_rig(identified.rig, sensors)), hidden.mounted
     loaded = table_of(identified.rig, FREQUENCIES, loaded=True)
     weightless = table_of(identified.rig, FREQUENCIES, loaded=False)

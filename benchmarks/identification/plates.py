@@ -69,7 +69,7 @@ def outcome(
     started = time.process_time()
     try:
         measured = _measurement(hidden, rig, seed, rounds, sensors)
-        identified = identify(rig, measured, seed=seed)
+        identified = identify(rig, measured)
     except InputError as refusal:
         found.refusal = str(refusal)
         return found

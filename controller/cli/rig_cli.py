@@ -136,10 +136,11 @@ def identify(
     from controller.plate_measurement import observation_of
     from model.config.units import parse_frequencies
     from model.estimate import identify as identification_report
-    from model.estimate.identify import expected_contrast, standard_errors
     from model.estimate.identify import identify as fit
+    from model.estimate.identify import standard_errors
     from model.estimate.rig_check import check_meaning
     from model.structure.modal_elasticity import check_measurable
+    from model.study.verification import expected_contrast
 
     if measured_file is not None:
         played = {"--url": url, "--level": level, "--quick": quick or None, "--device": device}
@@ -182,11 +183,11 @@ def identify(
     try:
         check_meaning(rig, observation_of(measured.measurement, rig))
         with progress_bar("fits") as progress:
-            found = fit(rig, measured.measurement, seed=seed, progress=progress)
+            found = fit(rig, measured.measurement, progress=progress)
     except InputError as error:
         typer.echo(f"era: {error}; no rig is written", err=True)
         raise typer.Exit(NO_FIT) from error
-    expected = expected_contrast(found)
+    expected = expected_contrast(rig, found.rig, seed=seed) if found.can_promise else []
     rows = [
         measured_line(rig, measured),
         *measured.notes,

@@ -27,7 +27,9 @@ from model.estimate.fit import (
     Fit,
     Parameter,
     SensedPlate,
+    are_impossible,
     confusions,
+    errors_by_key,
     estimate_table,
     fit,
     fit_to_noise,
@@ -48,7 +50,6 @@ from model.estimate.space import FORM, KINDS, MASS_CELLS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import counted, in_display_unit, percent, with_error
-from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain
 
@@ -668,8 +669,8 @@ def _check_gains(found: Calibration) -> None:
             continue
         size = sizes[measured, number]
         relative = size / np.median(size)
-        clear = np.abs(np.log(relative)) - _SIGNIFICANCE * errors[measured, number] / size
-        if (clear > math.log(_MAX_GAIN)).any():
+        least_sure = _SIGNIFICANCE * errors[measured, number] / size
+        if are_impossible(relative, math.log(_MAX_GAIN) + least_sure).any():
             raise InputError(
                 f"gains of ERA {era.name} must be within a factor of {_MAX_GAIN:g} of their median "
                 f"over frequency, got {relative.min():.2g} to {relative.max():.2g} of it, as no "
@@ -726,23 +727,8 @@ def _rms(values: ArrayLike) -> float:
 
 def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
-    rig, found = calibration.rig, dict[KeyPath, float]()
-    for each in calibration.parameters:
-        if each.standard_error is None:
-            continue
-        if each.foot:
-            path: KeyPath = ("supports", each.foot, "stiffness")
-        elif each.era:
-            era = rig.era(each.era)
-            path = ("eras", each.era, ACTUATOR_KEYS[type(era)].keys[era.fields[each.kind]])
-        elif each.kind == "loss_factor":
-            path = ("plate", "loss_factor")
-        elif rig.laminate is None:
-            path = ("plate", "material", next(iter(rig.plate.material.moduli)))
-        else:
-            continue  # its modulus is that of all layers together
-        found[path] = each.standard_error
-    return found
+    found = calibration.parameters
+    return errors_by_key(calibration.rig, ((each, each.standard_error) for each in found))
 
 
 def change_rows(calibration: Calibration) -> list[str]:

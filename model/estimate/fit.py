@@ -15,7 +15,7 @@ that a calibration and a rig check fit of it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray, best_by, best_first
+from model.config.document import KeyPath
 from model.estimate.forward import ForwardModel, PlateAt, Sensor, by_mass_at, jacobian
 from model.estimate.measurement import Measurement
 from model.estimate.space import (
@@ -38,6 +39,7 @@ from model.estimate.space import (
 )
 from model.quantities import percent
 from model.reduction.free_plate import solve_free_plate
+from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 
 HELD_OUT_FOLDS = 5
@@ -203,31 +205,11 @@ def fit(
     last: dict[bytes, Fit] = {}
 
     def at(y: FloatArray) -> Fit:
-        if y.tobytes() in last:
-            return last[y.tobytes()]
-        x = base.copy()
-        x[own] = y
-        plate = model.at(x)
-        responses = measurement.driven(plate.responses)
-        slopes = measurement.driven(jacobian(plate, own)[..., own])
-        gains, by_gain, r, J = best_gains(responses, slopes, measurement)
-        held, by_held = _gain_residuals(gains, by_gain, measurement.gain_std)
-        if soft is not None:
-            r, J = _softened(r, J, soft)
-            held, by_held = _softened(held, by_held, soft)
-        last.clear()
-        last[y.tobytes()] = Fit(
-            model,
-            measurement,
-            x,
-            np.nan,
-            own,
-            np.concatenate([r.real, r.imag, root @ (y - mean), held.real]),
-            np.vstack([J.real, J.imag, root, by_held.real]),
-            np.nan_to_num(gains)[:, None] * responses,
-            gains,
-            by_gain,
-        )
+        if y.tobytes() not in last:
+            x = base.copy()
+            x[own] = y
+            last.clear()
+            last[y.tobytes()] = _linearised(model, measurement, x, own, (mean, root), soft)
         return last[y.tobytes()]
 
     margin = np.minimum(inside, (high - low) / 4)
@@ -252,6 +234,40 @@ def fit(
         xtol=_CONVERGED,
     )
     return replace(at(best.x), cost=float(best.cost))
+
+
+def _linearised(
+    model: ForwardModel,
+    measurement: Measurement,
+    x: FloatArray,
+    own: NDArray[np.bool_],
+    prior: tuple[FloatArray, FloatArray],
+    soft: float | None,
+) -> Fit:
+    """Linearise a fit at x (p,), without its cost; own (p,): what is searched.
+
+    prior: mean (q,) and root of the inverse covariance (q, q) of what is searched.
+    """
+    plate, (mean, root) = model.at(x), prior
+    responses = measurement.driven(plate.responses)
+    slopes = measurement.driven(jacobian(plate, own)[..., own])
+    gains, by_gain, r, J = best_gains(responses, slopes, measurement)
+    held, by_held = _gain_residuals(gains, by_gain, measurement.gain_std)
+    if soft is not None:
+        r, J = _softened(r, J, soft)
+        held, by_held = _softened(held, by_held, soft)
+    return Fit(
+        model,
+        measurement,
+        x,
+        np.nan,
+        own,
+        np.concatenate([r.real, r.imag, root @ (x[own] - mean), held.real]),
+        np.vstack([J.real, J.imag, root, by_held.real]),
+        np.nan_to_num(gains)[:, None] * responses,
+        gains,
+        by_gain,
+    )
 
 
 def best_gains(
@@ -524,6 +540,19 @@ class Parameter:
         """Whether x is the logarithm of a factor on the rig's value, not what is added to it."""
         return self.kind in ("modulus", "stiffness", "magnet_mass", "supports")
 
+    def path(self, rig: Rig) -> KeyPath | None:
+        """Path of its key in a rig's file, None of what several layers have together."""
+        if self.foot:
+            return "supports", self.foot, "stiffness"
+        if self.era:
+            era = rig.era(self.era)
+            return "eras", self.era, ACTUATOR_KEYS[type(era)].keys[era.fields[self.kind]]
+        if rig.laminate is not None and self.kind != "loss_factor":
+            return None
+        if self.kind == "modulus":
+            return "plate", "material", next(iter(rig.plate.material.moduli))
+        return "plate", self.kind
+
     def of(self, rig: Rig) -> float:
         """The value in a rig."""
         if self.era:
@@ -534,6 +563,43 @@ class Parameter:
         return (
             rig.plate.material.E if self.kind == "modulus" else float(getattr(rig.plate, self.kind))
         )
+
+
+def parameters_of(
+    rig: Rig, of_plate: Sequence[str], of_eras: Sequence[str], feet: Sequence[str]
+) -> tuple[Parameter, ...]:
+    """Values of a rig before a fit: of some kinds of its plate and of every ERA, and of feet."""
+    plate = [(kind, f"plate {kind}", "", "") for kind in of_plate]
+    eras = [
+        (kind, f"{era.name} {era.fields[kind]}", era.name, "")
+        for era in rig.eras
+        for kind in of_eras
+        if kind in era.fields
+    ]
+    supports = [("supports", f"foot {name} stiffness", "", name) for name in feet]
+    rows = [
+        Parameter(kind, name, VALUE_UNITS[kind], era, foot)
+        for kind, name, era, foot in (*plate, *eras, *supports)
+    ]
+    return tuple(replace(row, before=row.of(rig)) for row in rows)
+
+
+def errors_by_key(
+    rig: Rig, found: Iterable[tuple[Parameter, float | None]]
+) -> dict[KeyPath, float]:
+    """Standard errors of the values that a rig's file states, by the path of their key."""
+    by_path = ((parameter.path(rig), error) for parameter, error in found)
+    return {path: float(error) for path, error in by_path if path and error}
+
+
+def are_impossible(
+    gains: ComplexArray, size: FloatArray | float, phase: float = math.inf
+) -> NDArray[np.bool_]:
+    """Mask of gains that no drive and no sensor has, relative to what they should be.
+
+    size: largest logarithm of the magnitude, either way; phase: largest phase [rad].
+    """
+    return np.asarray((np.abs(np.log(np.abs(gains))) > size) | (np.abs(np.angle(gains)) > phase))
 
 
 @dataclass(frozen=True, eq=False)
@@ -550,20 +616,9 @@ class SensedPlate:
     @cached_property
     def rows(self) -> tuple[Parameter, ...]:
         """The fitted values (n,): modulus and loss factor, those of every ERA and of every foot."""
-        plate = [(kind, f"plate {kind}", "", "") for kind in ("modulus", "loss_factor")]
-        of_eras = [
-            (kind, f"{era.name} {era.fields[kind]}", era.name, "")
-            for era in self.rig.eras
-            for kind in ("stiffness", "damping", "bolt_mass", "magnet_mass")
-            if kind in era.fields
-        ]
-        names = self.rig.foot_names if self.rig.uncertainty.supports else ()
-        feet = [("supports", f"foot {name} stiffness", "", name) for name in names]
-        rows = [
-            Parameter(kind, name, VALUE_UNITS[kind], era, foot)
-            for kind, name, era, foot in (*plate, *of_eras, *feet)
-        ]
-        return tuple(replace(row, before=row.of(self.rig)) for row in rows)
+        of_eras = ("stiffness", "damping", "bolt_mass", "magnet_mass")
+        feet = self.rig.foot_names if self.rig.uncertainty.supports else ()
+        return parameters_of(self.rig, ("modulus", "loss_factor"), of_eras, feet)
 
     @cached_property
     def largest_errors(self) -> FloatArray:

@@ -25,9 +25,6 @@ the model. By that part parameters disagree between fits to different paths, bey
 (a jackknife over groups: B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans, SIAM
 1982, ch. 3). Where the measurement leaves a quantity unknown, `unknowns` names the tone and the
 sensor that would show it.
-
-The contrast to expect is that of answers on plates within the remaining uncertainty, solved
-exactly.
 """
 
 import math
@@ -38,20 +35,20 @@ from typing import Any
 
 import numpy as np
 
-from model.answer.plan import query
-from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
 from model.config.document import KeyPath
-from model.ensemble.draws import PERCENTILE
 from model.errors import InputError
 from model.estimate.fit import (
     HELD_OUT_FOLDS,
     Fit,
     Parameter,
+    are_impossible,
     confusions,
+    errors_by_key,
     estimate_table,
     fit,
     likeliest,
+    parameters_of,
     prediction_errors,
     quality_rows,
     relative_rms,
@@ -74,16 +71,13 @@ from model.finger import Grid
 from model.processes import Progress, unseen
 from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
-from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
 from model.spectral.direct_solution import grain_slopes
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable, lowest_elastic
 from model.structure.plate import Plate
-from model.study.contrast_maps import MIN_DISTANCE, random_contacts
-from model.study.verification import draw_plates, felt_on
-from model.table.table_file import build_table
+from model.study.verification import ExpectedContrast
 
 MAX_CHI2 = 2.0
 """Largest chi² of a model that explains a measurement, so that answers may be promised from it."""
@@ -98,9 +92,6 @@ _DRIVE_GAIN, _DRIVE_PHASE_DEG = 0.01, 1.0
 _MIN_VALUES = 16
 _GAIN_STDS = 5.0  # beyond which a gain is wrong
 _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
-
-_PLATES = 60
-_MARGIN = 0.013  # m, of fingers from the edges
 
 _MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters
 _CLOCK_STDS = 4.0  # beyond which a clock is not as stated
@@ -202,8 +193,6 @@ class Identification:
     """Covariance (p, p) of the parameters, wider by the disagreement of held-out paths."""
     held_out: HeldOutPaths | None
     """Prediction of unseen paths, None where there are too few."""
-    seed: int
-    """Seed of the contacts that a promise draws."""
 
     @property
     def chi2(self) -> float:
@@ -229,6 +218,11 @@ class Identification:
     def is_known_well(self) -> bool:
         """Whether the modes are those of the rig's plate, and with them fields between sensors."""
         return self.mode_shift <= MAX_MODE_SHIFT
+
+    @property
+    def can_promise(self) -> bool:
+        """Whether contrasts may be promised: explained, and of paths that could be held out."""
+        return self.is_explained and self.held_out is not None
 
     @cached_property
     def std(self) -> FloatArray:
@@ -277,10 +271,8 @@ class Identification:
         )
 
 
-def identify(
-    rig: Rig, measurement: Measurement, *, seed: int = 0, progress: Progress = unseen
-) -> Identification:
-    """Identify a rig by a measurement on it; the same for the same data and seed.
+def identify(rig: Rig, measurement: Measurement, *, progress: Progress = unseen) -> Identification:
+    """Identify a rig by a measurement on it.
 
     progress: called with the fits done and all, one of everything and one of each held-out share.
     Raises InputError for a rig with a part that does not scale, for a plate that was not linear or
@@ -291,7 +283,7 @@ def identify(
     _check(rig, measurement)
     fitted = fit_board(rig, measurement)
     board = fitted.model.rig
-    found = Identification(rig, board, fitted, fitted.stated_covariance, None, seed)
+    found = Identification(rig, board, fitted, fitted.stated_covariance, None)
     if found.is_explained:
         _check_gains(board, measurement, found.values, fitted.space)
     unknown = unknowns(found)
@@ -488,8 +480,8 @@ def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Spac
     drives = [f"drive {era.name}" for era in rig.eras]
     sensors = [f"sensor {sensor.name}" for sensor in measurement.sensors]
     wrong = [
-        *_wrong_gains(drives, np.log(values.drive_gains), space, ""),
-        *_wrong_gains(sensors, np.log(values.sensor_gains), space, "sensor_"),
+        *_wrong_gains(drives, values.drive_gains, space, ""),
+        *_wrong_gains(sensors, values.sensor_gains, space, "sensor_"),
     ]
     if wrong:
         raise InputError(
@@ -498,14 +490,15 @@ def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Spac
         )
 
 
-def _wrong_gains(names: list[str], logarithms: FloatArray, space: Space, whose: str) -> list[str]:
-    """Those whose complex logarithm of the gain is beyond what is usual, in words."""
-    gain, phase = (space.std[space.groups[whose + kind]].max() for kind in ("gain", "phase"))
+def _wrong_gains(names: list[str], gains: ComplexArray, space: Space, whose: str) -> list[str]:
+    """Those whose gain is beyond what is usual, in words."""
+    size, phase = (
+        max(allowed, _GAIN_STDS * space.std[space.groups[whose + kind]].max())
+        for kind, allowed in (("gain", _GAIN_ALLOWED), ("phase", _PHASE_ALLOWED))
+    )
     return [
-        f"{name} {math.exp(one.real):.2f} at {math.degrees(one.imag):.0f}°"
-        for name, one in zip(names, logarithms.tolist(), strict=True)
-        if abs(one.real) > max(_GAIN_ALLOWED, _GAIN_STDS * gain)
-        or abs(one.imag) > max(_PHASE_ALLOWED, _GAIN_STDS * phase)
+        f"{names[n]} {abs(gains[n]):.2f} at {np.degrees(np.angle(gains[n])):.0f}°"
+        for n in np.flatnonzero(are_impossible(gains, size, phase))
     ]
 
 
@@ -642,63 +635,6 @@ def _narrowed(J: ComplexArray, covariance: FloatArray, direction: FloatArray) ->
     return total
 
 
-@dataclass(frozen=True)
-class ExpectedContrast:
-    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts."""
-
-    quiet: int
-    before: float
-    """Given by half of the plates like the identified one, with answers of the rig as written."""
-    after: float
-    """The same with answers of the identified rig."""
-    promised: float
-    """Given by nine of ten of these plates with answers of the identified rig."""
-
-
-def expected_contrast(
-    found: Identification, *, frequencies: FloatArray | None = None, sets: int = 12
-) -> list[ExpectedContrast]:
-    """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
-
-    frequencies (f,) [Hz]: of the tables, by default the usual ones. Returns an empty list, since
-    nothing can be promised, where the model does not explain the measurement or too few paths were
-    measured to hold any out.
-    """
-    if not found.is_explained or found.held_out is None:
-        return []
-    written, identified = (
-        build_table(rig, frequencies=frequencies, drive_mode="phased")
-        for rig in (found.before, found.rig)
-    )
-    expected, plate = [], identified.plate
-    shorter = min(plate.length, plate.width)
-    margin = min(_MARGIN, shorter / 4)
-    for quiet in (1, 2, 3):
-        rng = np.random.default_rng([found.seed, quiet])
-        apart = min(MIN_DISTANCE, shorter / (2 * (quiet + 1)))
-        rows = []
-        for _ in range(sets):
-            places = random_contacts(rng, quiet + 1, plate, margin=margin, apart=apart)
-            placed = Placement(places[:1], places[1:])
-            plates = draw_plates(
-                rng,
-                identified.uncertainty,
-                count=_PLATES,
-                of=identified,
-                contact_count=quiet + 1,
-            )
-            each = []
-            for table in (written, identified):
-                drive = query(table, placed, MIN_LEVEL_DB_SL).layers[0].excitation
-                _, contrast = felt_on(identified, placed, drive, plates)
-                assert contrast is not None  # noqa: S101  there are quiet fingers
-                each.append(20 * np.log10(contrast))
-            before, after = each
-            rows.append((np.median(before), np.median(after), np.percentile(after, PERCENTILE)))
-        expected.append(ExpectedContrast(quiet, *np.median(rows, axis=0).tolist()))
-    return expected
-
-
 def parameters(found: Identification) -> list[Parameter]:
     """All parameters that were uncertain, less their values in the rig, in units of reports.
 
@@ -727,20 +663,15 @@ def parameters(found: Identification) -> list[Parameter]:
 
 def standard_errors(found: Identification) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
-    rig, space, std = found.rig, found.fitted.space, found.std
-    errors: dict[KeyPath, float] = {}
-    if rig.laminate is None:
-        errors["plate", "thickness"] = rig.plate.thickness * std[space.groups["thickness"].start]
-    errors["plate", "loss_factor"] = rig.plate.loss_factor * std[space.groups["loss"].start]
-    for kind, part in (("stiffness", "stiffness"), ("damping", "damping_each")):
-        for era, error in zip(rig.eras, std[space.groups[part]], strict=True):
-            key = ACTUATOR_KEYS[type(era)].keys[era.fields[kind]]
-            errors["eras", era.name, key] = float(getattr(era, era.fields[kind]) * error)
-    for name, number, error in zip(
-        rig.foot_names, rig.feet, std[space.groups["supports"]], strict=False
-    ):
-        errors["supports", name, "stiffness"] = rig.masses[number].stiffness * float(error)
-    return {path: float(error) for path, error in errors.items() if error > 0}
+    rig, groups = found.rig, found.fitted.space.groups
+    plate, eras, feet = (
+        [found.std[groups[kind]] for kind in kinds]
+        for kinds in (("thickness", "loss"), ("stiffness", "damping_each"), ("supports",))
+    )
+    relative = np.concatenate([*plate, np.transpose(eras).ravel(), *feet])
+    own = parameters_of(rig, ("thickness", "loss_factor"), ("stiffness", "damping"), rig.foot_names)
+    stated = zip(own, relative, strict=False)  # feet that no spring holds have no error
+    return errors_by_key(rig, ((each, each.before * error) for each, error in stated))
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from model.answer.answer import Answer
 from model.answer.plan import query
-from model.answer.stimulus import Placement
+from model.answer.stimulus import MIN_LEVEL_DB_SL, Placement
 from model.arrays import ComplexArray, FloatArray, IntArray, Point
 from model.ensemble.attached_plate import AttachedPlate
-from model.ensemble.draws import over_fingertips
+from model.ensemble.draws import PERCENTILE, over_fingertips
 from model.errors import InputError
 from model.finger import (
     Grid,
@@ -58,7 +58,7 @@ from model.structure.attachments import (
     footprints_of,
 )
 from model.structure.modal_elasticity import check_scales, modal_receptance
-from model.study.contrast_maps import random_contacts
+from model.study.contrast_maps import MIN_DISTANCE, random_contacts
 from model.table.table import LocalizationTable, read_fingertips
 from model.table.table_file import build_table
 from model.transients.base_motion import ramped_onset
@@ -619,3 +619,59 @@ def promise_margins(rig: Rig, plate: Rig) -> tuple[float, ...]:
     except InputError:
         return ()
     return tuple(margins)
+
+
+_EXPECTED_PLATES = 60
+_MARGIN = 0.013  # m, of fingers from the edges
+
+
+@dataclass(frozen=True)
+class ExpectedContrast:
+    """Contrast [dB] with a number of quiet fingers, medians over sets of contacts."""
+
+    quiet: int
+    before: float
+    """Given by half of the plates like the identified one, with answers of the rig as written."""
+    after: float
+    """The same with answers of the identified rig."""
+    promised: float
+    """Given by nine of ten of these plates with answers of the identified rig."""
+
+
+def expected_contrast(
+    before: Rig, after: Rig, *, seed: int, frequencies: FloatArray | None = None, sets: int = 12
+) -> list[ExpectedContrast]:
+    """Expect contrasts for one, two and three quiet fingers; the same for the same seed.
+
+    before, after: the rig as written and as identified, on plates within whose uncertainty they
+    are; frequencies (f,) [Hz]: of the tables, by default the usual ones; sets: of contacts.
+    """
+    written, identified = (
+        build_table(rig, frequencies=frequencies, drive_mode="phased") for rig in (before, after)
+    )
+    expected, plate = [], identified.plate
+    shorter = min(plate.length, plate.width)
+    margin = min(_MARGIN, shorter / 4)
+    for quiet in (1, 2, 3):
+        rng = np.random.default_rng([seed, quiet])
+        apart = min(MIN_DISTANCE, shorter / (2 * (quiet + 1)))
+        rows = []
+        for _ in range(sets):
+            places = random_contacts(rng, quiet + 1, plate, margin=margin, apart=apart)
+            placed = Placement(places[:1], places[1:])
+            plates = draw_plates(
+                rng,
+                identified.uncertainty,
+                count=_EXPECTED_PLATES,
+                of=identified,
+                contact_count=quiet + 1,
+            )
+            felt = []
+            for table in (written, identified):
+                drive = query(table, placed, MIN_LEVEL_DB_SL).layers[0].excitation
+                _, contrast = felt_on(identified, placed, drive, plates)
+                assert contrast is not None  # noqa: S101  there are quiet fingers
+                felt.append(20 * np.log10(contrast))
+            rows.append((*np.median(felt, axis=1), np.percentile(felt[1], PERCENTILE)))
+        expected.append(ExpectedContrast(quiet, *np.median(rows, axis=0).tolist()))
+    return expected

@@ -267,7 +267,7 @@ def test_responses_of_a_real_plate_are_read_from_a_file(tmp_path: Path, ending: 
     rig = load_rig(write_rig(tmp_path / "rig.yaml", mesh="12x9"))
     sensors = scanning_grid(rig.plate, 3, 2, like=Accelerometer("", 0, 0, noise_density=5e-3))
     responses = record_responses(rig, sensors, np.linspace(61, 461, 6))
-    swapped = replace(responses, values=responses.values[:, [0, 3, 2, 1]])
+    swapped = replace(responses, values=responses.values[..., [0, 3, 2, 1]])
     file = tmp_path / f"measured.{ending}"
     write = write_responses_csv if ending == "csv" else write_responses_uff
     write(file, swapped, rig)

@@ -218,7 +218,7 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     wrong by factors of 2 to 20 with any phase, and left out.
     """
     clean = measured(truth, scales={"P4": 0.05})
-    values = clean.values.copy()
+    values = clean.values.swapaxes(1, 2).copy()  # (f, eras, s)
     rng = np.random.default_rng(7)
     values[rng.random(values.shape) < 0.3] = np.nan
     wild = rng.random(values.shape) < 0.05
@@ -226,7 +226,7 @@ def test_calibrate_finds_a_dead_era_despite_gaps_and_outliers(rig, truth):
     wild[:, 2] = wild[:, :, NAMES.index("P4")] = False
     values[wild] *= rng.uniform(2, 20, wild.sum()) * np.exp(2j * np.pi * rng.random(wild.sum()))
     values[:, 2] *= 1e-4
-    found = calibrated(rig, replace(clean, values=values))
+    found = calibrated(rig, replace(clean, values=values.swapaxes(1, 2)))
     assert 0.9 * wild.sum() <= found.outlier_count <= 1.1 * wild.sum()
     assert found.scales == {}
     assert found.dead_eras == ("NE",)
@@ -245,7 +245,7 @@ def test_calibrate_leaves_out_a_sensor_that_is_elsewhere(rig: Rig, truth: Rig) -
     full = measured(truth)
     values = full.values.copy()
     silent = measured(truth, noise=0.0).values
-    values[:, :, NAMES.index("P6")] = 1.05 * silent[:, :, NAMES.index("P1")]
+    values[:, NAMES.index("P6")] = 1.05 * silent[:, NAMES.index("P1")]
     found = calibrated(rig, replace(full, values=values))
     assert found.dead_sensors == ("P6",)
     assert found.outlier_count == 0
@@ -282,7 +282,7 @@ def test_calibrate_refuses_gains_that_no_drive_has(rig, truth):
     """Eight times the response at one frequency of one ERA, at all sensors alike."""
     full = measured(truth)
     values = full.values.copy()
-    values[5, 1] *= 8
+    values[5, :, 1] *= 8
     with pytest.raises(InputError, match=r"gains of ERA SE .* factor of 5 .* to [78]\.\d of it"):
         calibrated(rig, replace(full, values=values))
 

@@ -308,26 +308,13 @@ def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
         )
     if skipped:
         _logger.warning("%d of %d values beyond %s are left out", skipped, len(measured), limits)
-    sensors: dict[str, tuple[float, float]] = {}
-    masses: dict[str, float] = {}
-    first: dict[str, str] = {}
+    first: dict[str, MeasuredValue] = {}
     eras: dict[tuple[str, tuple[float, float] | None], int] = {}
     found: dict[tuple[float, int, str], complex] = {}
     for each in within:
-        if each.sensor not in sensors:
+        if each.sensor not in first:
             _check_point(each, rig)
-        known = sensors.setdefault(each.sensor, each.point)
-        place = first.setdefault(each.sensor, each.place)
-        if math.dist(known, each.point) > _EDGE_TOLERANCE:
-            raise InputError(
-                f"{each.place}: sensor {each.sensor} must have one position, got {_shown(known)} "
-                f"({place}) and {_shown(each.point)} m; name sensors differently"
-            )
-        if masses.setdefault(each.sensor, each.sensor_mass) != each.sensor_mass:
-            raise InputError(
-                f"{each.place}: sensor {each.sensor} must have one mass, got "
-                f"{1e3 * masses[each.sensor]:g} ({place}) and {1e3 * each.sensor_mass:g} g"
-            )
+        _check_sensor(each, first.setdefault(each.sensor, each))
         if (each.era, each.era_point) not in eras:
             eras[each.era, each.era_point] = _era_of(each, rig)
         number = eras[each.era, each.era_point]
@@ -339,20 +326,36 @@ def measurement_of(measured: Sequence[MeasuredValue], rig: Rig) -> Measurement:
             )
         found[each.frequency, number, each.sensor] = each.value
     frequencies = np.unique([each.frequency for each in within])
-    values = np.full((len(frequencies), len(sensors), len(rig.eras)), np.nan, dtype=complex)
-    column = {name: number for number, name in enumerate(sensors)}
+    values = np.full((len(frequencies), len(first), len(rig.eras)), np.nan, dtype=complex)
+    column = {name: number for number, name in enumerate(first)}
     for (frequency, number, sensor), value in found.items():
         values[np.searchsorted(frequencies, frequency), column[sensor], number] = value
     # A point at the edge may have been rounded off the plate.
-    points = np.clip(list(sensors.values()), 0, [rig.plate.length, rig.plate.width])
-    at = zip(masses.items(), points.tolist(), strict=True)
+    points = [each.point for each in first.values()]
+    points = np.clip(points, 0, [rig.plate.length, rig.plate.width]).tolist()
+    at = zip(first.values(), points, strict=True)
     return Measurement(
-        tuple(Sensor(name, x=x, y=y, mass=mass) for (name, mass), (x, y) in at),
+        tuple(Sensor(each.sensor, x=x, y=y, mass=each.sensor_mass) for each, (x, y) in at),
         frequencies,
         values,
         drives_lag=True,
         skipped=skipped,
     )
+
+
+def _check_sensor(measured: MeasuredValue, first: MeasuredValue) -> None:
+    """Raise InputError unless a sensor is where its first value has it, and weighs as much."""
+    of, before = f"{measured.place}: sensor {measured.sensor}", first.place
+    if math.dist(first.point, measured.point) > _EDGE_TOLERANCE:
+        raise InputError(
+            f"{of} must have one position, got {_shown(first.point)} ({before}) and "
+            f"{_shown(measured.point)} m; name sensors differently"
+        )
+    if measured.sensor_mass != first.sensor_mass:
+        raise InputError(
+            f"{of} must have one mass, got {1e3 * first.sensor_mass:g} ({before}) and "
+            f"{1e3 * measured.sensor_mass:g} g"
+        )
 
 
 def _check_point(measured: MeasuredValue, rig: Rig) -> None:

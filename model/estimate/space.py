@@ -269,11 +269,33 @@ def space_of(
     lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic
     modes that may shift; form_of: number of sensors beside ERAs of a plate with form errors.
     """
-    plate, eras, has_form = rig.plate, [era.name for era in rig.eras], form_of is not None
-    excites = np.array(["force_factor" in era.fields for era in rig.eras])
-    drives = eras if excites.any() else []
+    names = _names(rig, sensors, amplifiers, masses, mode_count, form_of)
+    stds = _stds(rig, uncertainty, masses)
+    # Only differences count: those to the first.
+    stds["delay"] = np.where(np.arange(len(amplifiers)) > 0, KINDS["delay"].std, 0.0)
+    # A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
+    lags = [drives_lag and not (era.gains or "force_factor" in era.fields) for era in rig.eras]
+    for kind in ("inertia", "drag"):
+        stds[kind] = np.where(lags, KINDS[kind].std, 0.0)
+    bounds, space = _bounds(rig, masses), Space((), np.zeros(0), np.zeros(0), np.zeros(0), {})
+    for kind, own in names.items():
+        space = space.and_further(kind, own, stds.get(kind), *bounds.get(kind, (-np.inf, np.inf)))
+    return space
+
+
+def _names(
+    rig: Rig,
+    sensors: Sequence[str],
+    amplifiers: Sequence[str],
+    masses: int,
+    mode_count: int,
+    form_of: int | None,
+) -> dict[str, Sequence[str]]:
+    """Names of all parameters by their kind, as `space_of`."""
+    eras, has_form = [era.name for era in rig.eras], form_of is not None
+    drives = eras if any("force_factor" in era.fields for era in rig.eras) else []
     cells, modes = range(MASS_CELLS.cell_count), range(1, mode_count + 1)
-    names: dict[str, Sequence[str]] = {
+    return {
         "thickness": ["thickness"],
         "modulus": ["modulus"],
         "stiffness": [f"stiffness {name}" for name in eras],
@@ -306,14 +328,17 @@ def space_of(
         "poisson": ["Poisson's ratio"] if has_form else [],
         "loss_law": ["loss law"] if has_form else [],
     }
+
+
+def _stds(rig: Rig, uncertainty: Uncertainty, masses: int) -> dict[str, Number]:
+    """Standard deviations of parameters, where they are not those of their kind, as `space_of`."""
+    plate, sides = rig.plate, np.array([rig.plate.length, rig.plate.width])
+    excites = np.array(["force_factor" in era.fields for era in rig.eras])
+    of_drives = uncertainty.stiffness * (excites if excites.any() else excites[:0])
     damping = math.log(uncertainty.damping)
     damped = (damping > 0) * np.array([float(era.damping > 0) for era in rig.eras])
     lossy = float(damping > 0 and plate.loss_factor > 0)
-    # A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
-    lagging = drives_lag & ~excites & [not era.gains for era in rig.eras]
-    sides = np.array([plate.length, plate.width])
-    places = np.array([(era.x, era.y) for era in rig.eras])
-    std: dict[str, Number] = {
+    return {
         "thickness": uncertainty.thickness,
         "modulus": max(KINDS["modulus"].std, uncertainty.modulus) * (uncertainty.thickness > 0),
         "stiffness": uncertainty.stiffness,
@@ -323,20 +348,22 @@ def space_of(
         "loss_exponent": KINDS["loss_exponent"].std * lossy,
         "gain": uncertainty.gain,
         "phase": math.radians(uncertainty.phase_deg),
-        "inertia": np.where(lagging, KINDS["inertia"].std, 0.0),
-        "drag": np.where(lagging, KINDS["drag"].std, 0.0),
-        # Only differences count: those to the first.
-        "delay": np.where(np.arange(len(amplifiers)) > 0, KINDS["delay"].std, 0.0),
-        "magnet_mass": uncertainty.stiffness * excites[: len(drives)],
-        "force_factor": uncertainty.stiffness * excites[: len(drives)],
+        "magnet_mass": of_drives,
+        "force_factor": of_drives,
         # About the middle of the plate.
         "masses": np.tile([KINDS["masses"].std, *sides / 3], masses),
         "mode_losses": KINDS["mode_losses"].std * lossy,
         "supports": uncertainty.supports,
     }
+
+
+def _bounds(rig: Rig, masses: int) -> dict[str, tuple[ArrayLike, ArrayLike]]:
+    """Bounds of x of the kinds of parameters that have some, as `space_of`."""
+    sides = np.array([rig.plate.length, rig.plate.width])
+    places = np.array([(era.x, era.y) for era in rig.eras])
     least = np.array([-getattr(era, era.fields["bolt_mass"]) for era in rig.eras])
-    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - plate.loss_exponent
-    bounds: dict[str, tuple[ArrayLike, ArrayLike]] = {
+    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - rig.plate.loss_exponent
+    return {
         "loss_exponent": tuple(exponents / KINDS["loss_exponent"].std),
         "inertia": (0.0, np.inf),
         "drag": (0.0, np.inf),
@@ -347,11 +374,6 @@ def space_of(
         ),
         "masses": (np.tile([0.0, -1.5, -1.5], masses), np.tile([np.inf, 1.5, 1.5], masses)),
     }
-    space = Space((), np.zeros(0), np.zeros(0), np.zeros(0), {})
-    for kind, own in names.items():
-        limits = bounds.get(kind, (-np.inf, np.inf))
-        space = space.and_further(kind, own, std.get(kind), *limits)
-    return space
 
 
 def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:

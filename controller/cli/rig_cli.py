@@ -135,7 +135,7 @@ def identify(
 
     from controller.plate_measurement import observation_of
     from model.config.units import parse_frequencies
-    from model.estimate import identify as identification_report
+    from model.estimate import fit_report
     from model.estimate.identify import identify as fit
     from model.estimate.identify import standard_errors
     from model.estimate.rig_check import check_meaning
@@ -191,10 +191,10 @@ def identify(
     rows = [
         measured_line(rig, measured),
         *measured.notes,
-        *identification_report.parameter_rows(found),
-        *identification_report.clock_rows(found),
-        *identification_report.fit_rows(found),
-        *identification_report.contrast_rows(expected),
+        *fit_report.parameter_rows(found),
+        *fit_report.clock_rows(found),
+        *fit_report.fit_rows(found),
+        *fit_report.contrast_rows(expected),
     ]
     made = f"{source.name} identified in place by `era rig identify`:"
     files = (
@@ -202,7 +202,7 @@ def identify(
         if found.is_explained
         else []
     )
-    report = identification_report.as_json(found, expected) | measured_json(measured)
+    report = fit_report.identification_json(found, expected) | measured_json(measured)
     reason = _NOT_EXPLAINED if found.is_known_well else _NOT_KNOWN
     finish(
         rows,

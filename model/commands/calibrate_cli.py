@@ -136,13 +136,13 @@ def calibrate(
     Write what was found beside the rig's file, and print its values with their uncertainties.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibrate import (
+    from model.estimate.calibrate import standard_errors
+    from model.estimate.fit_report import (
         calibration_json,
         change_rows,
         check_rows,
         finding_rows,
         gain_rows,
-        standard_errors,
     )
     from model.estimate.measurement import LEAST_SENSORS, measurement_of, read_measured
     from model.estimate.rig_check import check_consistency

@@ -28,14 +28,11 @@ from model.estimate.fit import (
     Parameter,
     SensedPlate,
     are_impossible,
-    confusions,
     errors_by_key,
-    estimate_table,
     fit,
     fit_to_noise,
     gains_of,
     plate_of,
-    quality_rows,
     row_rms,
     without_outliers,
 )
@@ -49,7 +46,7 @@ from model.estimate.measurement import (
 from model.estimate.space import FORM, KINDS, MASS_CELLS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
-from model.quantities import counted, in_display_unit, percent, with_error
+from model.quantities import in_display_unit
 from model.rig.rig import Rig, Uncertainty
 from model.structure.attachments import Gain
 
@@ -729,161 +726,3 @@ def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
     found = calibration.parameters
     return errors_by_key(calibration.rig, ((each, each.standard_error) for each in found))
-
-
-def change_rows(calibration: Calibration) -> list[str]:
-    """Table of all parameters, and of ERAs that are not at the rig's places."""
-    fit, places = calibration.fit, {era.name: (era.x, era.y) for era in calibration.plate.rig.eras}
-    numbers = calibration.plate.numbers
-    own = fit.covariance[np.ix_(numbers, numbers)]
-    alike = confusions([each.name for each in calibration.parameters], own)
-    moved = [
-        (
-            f"{name} place",
-            f"{_millimetres(place)} mm",
-            f"± {_millimetres(error)} mm",
-            f"{_millimetres(places[name])} mm",
-            "",
-        )
-        for name, (place, error) in calibration.moved.items()
-    ]
-    return estimate_table([*map(_estimate, calibration.parameters, alike), *moved])
-
-
-def gain_rows(calibration: Calibration) -> list[str]:
-    """Lines of all ERAs: median and range over frequency of their gains, with standard error."""
-    rows = []
-    for number, era in enumerate(calibration.rig.eras):
-        if era.name in calibration.dead_eras or not era.gains:
-            rows.append(f"{era.name} gain  not measured")
-            continue
-        size = 100 * (np.array([row[1] for row in era.gains]) - 1)
-        phase = np.degrees([row[2] for row in era.gains])
-        error = float(np.nanmedian(calibration.gains_error[:, number]))
-        rows.append(
-            f"{era.name} gain  {np.median(size):+.1f} % ({size.min():+.1f} to {size.max():+.1f}), "
-            f"phase {np.median(phase):+.1f}° ({phase.min():+.1f} to {phase.max():+.1f}), "
-            f"± {100 * error:.2g} % at {counted(len(size), 'frequency', plural='frequencies')}"
-        )
-    return rows
-
-
-def finding_rows(calibration: Calibration) -> list[str]:
-    """Lines of faults of the measurement, and of parameters that are not identified."""
-    rows = [f"sensor {name}: no signal, left out" for name in calibration.dead_sensors]
-    rows += [f"ERA {name}: no motion; gains unchanged" for name in calibration.dead_eras]
-    rows += [
-        f"sensor {name}: scale {with_error(scale, error)} of the others"
-        for name, (scale, error) in calibration.scales.items()
-    ]
-    if calibration.outlier_count:
-        rows.append(
-            f"{calibration.outlier_count} of {calibration.value_count} values left out as outliers"
-        )
-    fixed = [p.name for p in calibration.parameters if not p.is_identified]
-    if fixed:
-        rows.append(f"not identified, rig's value kept: {', '.join(fixed)}")
-    return rows
-
-
-def check_rows(calibration: Calibration) -> list[str]:
-    """Lines of the new rig's uncertainty and of the held-out check."""
-    held, known = calibration.held_out, calibration.rig.uncertainty
-    if held is None:
-        return quality_rows(known, beside=f"error of the fit {percent(calibration.error)}")
-    return quality_rows(
-        known,
-        held_out=f"sensors {', '.join(held.sensors)}",
-        error=held.after,
-        beside=f"by the old rig {percent(held.before)}",
-    )
-
-
-def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
-    """All results for programs, units in the keys or beside the values."""
-    held_out = calibration.held_out
-    frequencies = calibration.frequencies
-    return {
-        "parameters": [
-            {
-                "name": fitted.name,
-                "era": fitted.era or None,
-                "foot": fitted.foot or None,
-                "kind": fitted.kind,
-                "unit": fitted.unit,
-                "before": fitted.before,
-                "after": fitted.value,
-                "standard_error": fitted.standard_error,
-                "identified": fitted.is_identified,
-                "at_bound": fitted.at_bound,
-            }
-            for fitted in calibration.parameters
-        ],
-        "gains": {
-            era.name: {
-                "frequency_hz": [row[0] for row in era.gains],
-                "magnitude": [row[1] for row in era.gains],
-                "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
-                "standard_error": [
-                    float(error)
-                    for error in calibration.gains_error[:, number]
-                    if np.isfinite(error)
-                ],
-            }
-            for number, era in enumerate(calibration.rig.eras)
-        },
-        "moved_eras": [
-            {
-                "era": name,
-                "before_m": [before.era(name).x, before.era(name).y],
-                "after_m": list(place),
-                "standard_error_m": list(error),
-            }
-            for name, (place, error) in calibration.moved.items()
-        ],
-        "uncertainty": asdict(calibration.rig.uncertainty),
-        "not_identified": [p.name for p in calibration.parameters if not p.is_identified],
-        "dead_sensors": list(calibration.dead_sensors),
-        "dead_eras": list(calibration.dead_eras),
-        "sensor_scales": {
-            name: {"scale": scale, "standard_error": error}
-            for name, (scale, error) in calibration.scales.items()
-        },
-        "sensors": list(calibration.sensors),
-        "drive_frequencies_hz": frequencies.tolist(),
-        "values": calibration.value_count,
-        "outliers": calibration.outlier_count,
-        "fit_error": calibration.error,
-        "chi2": calibration.chi2,
-        "held_out": None
-        if held_out is None
-        else {
-            "sensors": list(held_out.sensors),
-            "error_before": held_out.before,
-            "error_after": held_out.after,
-            "median_error_after": held_out.median,
-        },
-        "good": calibration.is_good,
-        "fingerprint_before": before.fingerprint,
-        "fingerprint_after": calibration.rig.fingerprint,
-    }
-
-
-def _millimetres(place: Point) -> str:
-    return f"({1e3 * place[0]:.1f}, {1e3 * place[1]:.1f})"
-
-
-def _estimate(fitted: Parameter, alike: str) -> tuple[str, str, str, str, str]:
-    """Row of `estimate_table` of a value; alike: name of what it is hardly told apart from."""
-    before = in_display_unit(fitted.before, fitted.unit, digits=5)
-    if fitted.standard_error is None:
-        return fitted.name, "", "", before, "not identified"
-    shown = with_error(fitted.value, fitted.standard_error, fitted.unit)
-    value, _, error = shown.partition(" ± ")
-    unit = error.partition(" ")[1:]
-    notes = [
-        f"{100 * (fitted.value / fitted.before - 1):+.1f} %" if fitted.before else "",
-        "at its bound" if fitted.at_bound else "",
-        f"hardly told apart from {alike}" if alike else "",
-    ]
-    return fitted.name, value + "".join(unit), f"± {error}", before, ", ".join(filter(None, notes))

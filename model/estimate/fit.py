@@ -37,10 +37,9 @@ from model.estimate.space import (
     rig_with,
     space_by_sheets,
 )
-from model.quantities import percent
 from model.reduction.free_plate import solve_free_plate
 from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
-from model.rig.rig import Rig, Uncertainty
+from model.rig.rig import Rig
 
 HELD_OUT_FOLDS = 5
 """One path or sensor in so many is held out."""
@@ -52,7 +51,6 @@ _SETTLED = 0.1  # of the noise between two rounds
 _MIN_NOISE_LEFT = 0.1  # of a value's noise: residuals with less do not show it
 _SMALLEST_NOISE = 1e-4  # of the response: what meshes and reduction are wrong by
 _MAX_DEVIATION = 5.0  # standard deviations; of 10 000 good complex values 0.04 lie beyond
-_ALIKE = 0.9  # of a correlation of errors: beyond it two values are hardly told apart
 _MAX_GROUPS = 12  # of weak to strong rows, each with a noise of its own
 
 
@@ -455,44 +453,6 @@ def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
     share = squares / mean_squares
     known = share[np.isfinite(share)]
     return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
-
-
-def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
-    """Name what each of some parameters is hardly told apart from, "" where it is from all others.
-
-    By the largest correlation of the errors of a covariance (p, p).
-    """
-    std = np.sqrt(np.diagonal(covariance))
-    std = np.where(std > 0, std, np.inf)
-    alike = np.abs(covariance / np.outer(std, std)) * ~np.eye(len(std), dtype=bool)
-    nearest = alike.argmax(axis=1)
-    return [
-        names[other] if alike[own, other] > _ALIKE else ""
-        for own, other in enumerate(nearest.tolist())
-    ]
-
-
-def estimate_table(rows: Sequence[tuple[str, str, str, str, str]]) -> list[str]:
-    """Table of what was found: name, value, standard error, what was known before, and a note."""
-    cells = [("", "found", "standard error", "before", "note"), *rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]
-
-
-def quality_rows(
-    uncertainty: Uncertainty, *, held_out: str = "", error: float | None = None, beside: str
-) -> list[str]:
-    """Lines of the uncertainty that the new rig states, and of the held-out prediction.
-
-    held_out: what was held out; error: of its prediction, relative to the response, None where too
-    little was measured to hold any out; beside: a further note on the fit's errors.
-    """
-    found = (
-        f"{held_out} predicted within {percent(error)} of the response"
-        if error is not None
-        else "too few sensors to leave any out"
-    )
-    return [f"uncertainty in the new rig: {uncertainty}", f"held out: {found}; {beside}"]
 
 
 def likeliest(found: Sequence[Fit]) -> Fit:

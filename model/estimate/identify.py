@@ -29,9 +29,8 @@ sensor that would show it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -41,25 +40,19 @@ from model.errors import InputError
 from model.estimate.fit import (
     HELD_OUT_FOLDS,
     Fit,
-    Parameter,
     are_impossible,
-    confusions,
     errors_by_key,
-    estimate_table,
     fit,
     likeliest,
     parameters_of,
     prediction_errors,
-    quality_rows,
     relative_rms,
 )
 from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.estimate.measurement import Measurement
 from model.estimate.space import (
     KINDS,
-    MAX_GUESSED,
     MODE_SHIFTS,
-    UNIT_KEYS,
     Space,
     Values,
     inwards,
@@ -69,7 +62,6 @@ from model.estimate.space import (
 )
 from model.finger import Grid
 from model.processes import Progress, unseen
-from model.quantities import percent, with_error
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.rig.rig_file import mesh_of
@@ -77,7 +69,6 @@ from model.spectral.direct_solution import grain_slopes
 from model.spectral.modes import PlateMesh, SpectralMesh
 from model.structure.modal_elasticity import check_measurable, lowest_elastic
 from model.structure.plate import Plate
-from model.study.verification import ExpectedContrast
 
 MAX_CHI2 = 2.0
 """Largest chi² of a model that explains a measurement, so that answers may be promised from it."""
@@ -93,20 +84,7 @@ _MIN_VALUES = 16
 _GAIN_STDS = 5.0  # beyond which a gain is wrong
 _GAIN_ALLOWED, _PHASE_ALLOWED = 0.3, math.radians(20)  # whatever the rig's uncertainty
 
-_MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters
 _CLOCK_STDS = 4.0  # beyond which a clock is not as stated
-_LISTED_STDS = 2.0  # from the rig's value, beyond which a parameter is listed
-
-_ALWAYS_LISTED = (
-    "thickness",
-    "modulus",
-    "stiffness",
-    "damping",
-    "loss",
-    "gain",
-    "phase",
-    "supports",
-)
 
 
 _EXTRA_NOISE = 0.05  # of the rms at each frequency, in the first stages
@@ -635,32 +613,6 @@ def _narrowed(J: ComplexArray, covariance: FloatArray, direction: FloatArray) ->
     return total
 
 
-def parameters(found: Identification) -> list[Parameter]:
-    """All parameters that were uncertain, less their values in the rig, in units of reports.
-
-    Per cent are those of the rig's value; places of a mass count from the middle of the plate.
-    """
-    space = found.fitted.space
-    kinds = {number: kind for kind in space.groups for number in space.indices(kind)}
-    rows = []
-    for number, name in enumerate(space.names):
-        if not space.std[number]:
-            continue
-        kind = kinds[number]
-        is_place = kind == "masses" and (number - space.groups[kind].start) % 3
-        known = KINDS["place" if is_place else kind]
-        std, error = float(space.std[number]), float(found.std[number])
-        difference = std * float(found.fitted.x[number])
-        if known.unit == "%":  # of logarithms of factors
-            std, error = math.expm1(std), math.exp(difference) * error
-            difference = math.expm1(difference)
-        difference, error, std = (known.per_unit * each for each in (difference, error, std))
-        rows.append(
-            Parameter(kind, name, known.unit, value=difference, standard_error=error, prior=std)
-        )
-    return rows
-
-
 def standard_errors(found: Identification) -> dict[KeyPath, float]:
     """Standard errors of the values that a rig's file states, by the path of their key."""
     rig, groups = found.rig, found.fitted.space.groups
@@ -703,120 +655,3 @@ def clock_estimates(found: Identification) -> list[ClockEstimate]:
         if name != first
     ]
     return [each for each in estimated if math.isfinite(each.stated_us)]
-
-
-def fit_rows(found: Identification) -> list[str]:
-    """Lines of how well the model explains the measurement."""
-    held, known = found.held_out, found.rig.uncertainty
-    verdict = "explains" if found.chi2 <= MAX_CHI2 else "does not explain"
-    rows = [f"chi² {found.chi2:.2f}: the model {verdict} the measurement (at most {MAX_CHI2:g})"]
-    material = found.rig.plate.material
-    if material.orthotropy != found.before.plate.material.orthotropy:
-        moduli = ", ".join(f"{key} {each / 1e9:.4g}" for key, each in material.moduli.items())
-        rows.append(f"the board's grain was found, too: {moduli} GPa")
-    if not found.is_known_well:
-        rows.append(
-            f"not known well enough: modes are {found.mode_shift:.1f} standard deviations from "
-            f"those of the rig's plate (at most {MAX_MODE_SHIFT:g})"
-        )
-    if held is None:
-        return [*rows, *quality_rows(known, beside="nothing is promised")]
-    rows += quality_rows(
-        known,
-        held_out="every fifth path",
-        error=held.total,
-        beside=f"the model leaves {percent(held.unexplained)} unexplained",
-    )
-    if held.unexplained > _MISTAKEN:
-        rows.append(
-            "the plate differs from the rig by more than its parameters, such as in thickness from "
-            "end to end; errors of values and answers allow for that"
-        )
-    return rows
-
-
-def parameter_rows(found: Identification) -> list[str]:
-    """Table of parameters: those that a rig file states, and all others that clearly differ.
-
-    Those of the plate come first, then ERA by ERA. What was found is the difference from the rig.
-    """
-    places = {era.name: place for place, era in enumerate(found.rig.eras)}
-    names = found.fitted.space.names
-    confused = dict(zip(names, confusions(names, found.covariance), strict=True))
-    rows = []
-    for each in parameters(found):
-        assert each.standard_error is not None  # noqa: S101  all were searched
-        if each.kind in _ALWAYS_LISTED or abs(each.value) > _LISTED_STDS * each.standard_error:
-            unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
-            value, _, error = with_error(each.value, each.standard_error, sign="+").partition(" ± ")
-            other = confused[each.name]
-            note = f"hardly told apart from {other}" if other else ""
-            if each.kind == "supports" and each.standard_error > MAX_GUESSED * each.prior:
-                note = "not identified"
-            before = f"± {float(f'{each.prior:.2g}'):g}{unit}"
-            rows.append((each.name, f"{value}{unit}", f"± {error}{unit}", before, note))
-    rows.sort(key=lambda row: places.get(row[0].rpartition(" ")[2], -1))
-    return estimate_table(rows)
-
-
-def clock_rows(found: Identification) -> list[str]:
-    """Lines of the clocks' delays, which the rig's gains correct, and of unbelievable ones."""
-    rows = []
-    for each in clock_estimates(found):
-        late = f"{with_error(each.delay_us, each.error_us, sign='+')} us"
-        rows.append(f"clock of amplifier {each.amplifier}: {late}, taken off by its ERAs' gains")
-        if not each.is_believed:
-            rows.append(
-                f"amplifier {each.amplifier} or the first one must be within "
-                f"{each.stated_us:.0f} us, as stated, got {late}; its clock_error is not true, "
-                "or its output is late otherwise than that of its product"
-            )
-    return rows
-
-
-def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
-    """Lines of the contrast to expect before and after, and of what is promised."""
-    if not expected:
-        return ["contrast: nothing is promised"]
-    rows = ["contrast on plates like this one, median over random fingers:"]
-    for each in expected:
-        rows.append(
-            f"  {each.quiet} quiet: as written {each.before:.1f} dB, identified {each.after:.1f} "
-            f"dB; nine of ten plates {each.promised:.1f} dB"
-        )
-    return rows
-
-
-def as_json(found: Identification, expected: Sequence[ExpectedContrast]) -> dict[str, Any]:
-    """All results for programs, units in the keys or beside the values."""
-    return {
-        "explained": found.is_explained,
-        "chi2": found.chi2,
-        "known_well": found.is_known_well,
-        "mode_shift": found.mode_shift,
-        "held_out_error": None if found.held_out is None else found.held_out.total,
-        "unexplained_error": None if found.held_out is None else found.held_out.unexplained,
-        "parameters": [
-            {
-                "name": each.name,
-                "unit": UNIT_KEYS.get(each.unit, each.unit),
-                "difference": each.value,
-                "standard_error": each.standard_error,
-                "standard_deviation_before": each.prior,
-            }
-            for each in parameters(found)
-        ],
-        "clocks": [
-            {**asdict(each), "is_believed": each.is_believed} for each in clock_estimates(found)
-        ],
-        "uncertainty": asdict(found.rig.uncertainty),
-        "expected_contrast": [
-            {
-                "quiet": each.quiet,
-                "before_db": each.before,
-                "after_db": each.after,
-                "promised_db": each.promised,
-            }
-            for each in expected
-        ],
-    }

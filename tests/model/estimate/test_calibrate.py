@@ -17,13 +17,8 @@ from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, 
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import (
-    Calibration,
-    calibrate,
-    calibration_json,
-    change_rows,
-    finding_rows,
-)
+from model.estimate.calibrate import Calibration, calibrate
+from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.measurement import Measurement
 from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
+from model.estimate.fit_report import parameter_rows
 from model.estimate.forward import (
     SENSOR_FOOT,
     ForwardModel,
@@ -19,7 +20,7 @@ from model.estimate.forward import (
     by_mass_at,
     jacobian,
 )
-from model.estimate.identify import identify, parameter_rows
+from model.estimate.identify import identify
 from model.estimate.measurement import Measurement
 from model.estimate.space import (
     FINGER_PARTS,

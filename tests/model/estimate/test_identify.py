@@ -19,16 +19,9 @@ from long_form import shortly
 from model.arrays import FloatArray
 from model.config.document import parse_document
 from model.errors import InputError
+from model.estimate.fit_report import clock_rows, fit_rows, identification_json
 from model.estimate.forward import ForwardModel, Sensor
-from model.estimate.identify import (
-    MAX_CHI2,
-    Identification,
-    as_json,
-    clock_estimates,
-    clock_rows,
-    fit_rows,
-    identify,
-)
+from model.estimate.identify import MAX_CHI2, Identification, clock_estimates, identify
 from model.estimate.measurement import Measurement, Repeat
 from model.estimate.space import space_of
 from model.reduction.free_plate import solve_free_plate
@@ -271,7 +264,7 @@ def test_bonded_frame_is_not_known_well_by_sensors_at_feet(rig: Rig, sensors: in
     assert frame.chi2 < 2
     assert not frame.is_explained
     assert frame.rig.uncertainty == rig.uncertainty
-    assert as_json(frame, [])["known_well"] is False
+    assert identification_json(frame, [])["known_well"] is False
     assert uneven.is_explained
 
 
@@ -355,7 +348,7 @@ def test_a_constant_delay_is_found_and_taken_off(clocks_found: Identification) -
     assert clock.delay_us == pytest.approx(1e6 * LATE, abs=5)
     assert clock.error_us < 3
     assert clocks_found.is_explained
-    (shown,) = as_json(clocks_found, ())["clocks"]
+    (shown,) = identification_json(clocks_found, ())["clocks"]
     assert shown["delay_us"] == clock.delay_us
     tones = np.array([100.0, 400.0])
     for era in clocks_found.rig.eras[2:]:

@@ -28,14 +28,13 @@ firmware-test: .venv/installed-test
 	$(BIN)/python firmware/test/run.py $(FIRMWARE)
 
 # What needs the processors, and sometimes waits for processes: one worker more than there are; what
-# plays in real time; what loads the processors itself.
+# plays in real time. What loads the processors itself is in `make test-long`.
 WORKERS = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 # A test that never ends is one failure, which says where it was; a worker begun anew would wait for ever.
 ENDING := -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=true --max-worker-restart 0
 test: .venv/installed-test
-	$(BIN)/pytest $(ENDING) -m 'not real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest $(ENDING) -m 'real_time and not alone and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
-	$(BIN)/pytest $(ENDING) -m 'alone and not long'
+	$(BIN)/pytest $(ENDING) -m 'not real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest $(ENDING) -m 'real_time and not long' --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # Of these for a minute those that are nearest to what differs from a commit, by default from where
 # this branch has left main. Others: make test-changed SINCE=HEAD~3

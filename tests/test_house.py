@@ -18,6 +18,7 @@ import pytest
 import changed_tests
 import vocabulary
 from changed_tests import ALSO, also, nearest
+from long_form import shortly
 from names import misleading_names
 from vocabulary import retired_identifiers
 
@@ -76,7 +77,10 @@ def importing(module: str) -> set[str]:
     return {path.relative_to(ROOT).as_posix() for path in found}
 
 
-@pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
+@pytest.mark.parametrize(
+    "path",
+    shortly(["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"], ["sim/cli.py"]),
+)
 def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
     """And those before all others, which only import what imports it.
 
@@ -218,7 +222,10 @@ def test_neighbour(): pass
 """
 
 
-@pytest.mark.parametrize(("ci", "outcome"), [("", "1 passed, 1 skipped"), ("1", "1 error")])
+@pytest.mark.parametrize(
+    ("ci", "outcome"),
+    [pytest.param("", "1 passed, 1 skipped", marks=pytest.mark.long), ("1", "1 error")],
+)
 def test_missing_component_skips_its_user_and_not_its_neighbour(
     tmp_path: Path, ci: str, outcome: str
 ) -> None:

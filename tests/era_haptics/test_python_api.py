@@ -414,7 +414,11 @@ def written(path: Path, *, distribution: str = "") -> Path:
 
 @pytest.mark.parametrize(
     ("hiding", "distribution"),
-    [("model.py", ""), ("sim/__init__.py", ""), ("drivers/__init__.py", "other-drivers")],
+    [
+        pytest.param("model.py", "", marks=pytest.mark.long),
+        pytest.param("sim/__init__.py", "", marks=pytest.mark.long),
+        ("drivers/__init__.py", "other-drivers"),
+    ],
 )
 def test_what_hides_a_package_is_named(tmp_path: Path, hiding: str, distribution: str) -> None:
     """A file, a folder and a distribution, to a program as an exception, to `era` as one line."""

@@ -354,7 +354,9 @@ def test_reader_refuses_in_words_what_is_no_such_file(tmp_path: Path, name: str,
         assert "must be up to" in str(caught.value)
 
 
-@pytest.mark.parametrize("shape", [b"(True, 4)", b"(-1, -4)", b"(%s,)" % (b"9" * 5000), b"4"])
+@pytest.mark.parametrize(
+    "shape", shortly([b"(True, 4)", b"(-1, -4)", b"(%s,)" % (b"9" * 5000), b"4"], [b"(-1, -4)"])
+)
 def test_array_without_a_shape_is_refused(tmp_path: Path, shape: bytes) -> None:
     """Of .npy, whose header Python parses: True counts as 1, and two negative counts as a size."""
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': %s}" % shape

@@ -127,6 +127,7 @@ def problems(root: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.long
 def test_sources_pass() -> None:
     """Those of firmware, example and kernels."""
     assert problems(ROOT) == []
@@ -217,7 +218,7 @@ WIRES: dict[str, tuple[Callable[..., Bodies], Callable[[bytes], bytes]]] = {
 """The bodies of a request on each wire, and the frame of a body, with a good checksum."""
 
 
-@pytest.mark.parametrize("wire", LINES)
+@pytest.mark.parametrize("wire", shortly(LINES, ["tcp", "can"]))
 def test_damaged_frames_leave_a_valid_amplifier(wire: str, moved: Callable[..., Path]) -> None:
     """Half of the requests are whole, so that it plays; damaged ones have a good checksum mostly.
 
@@ -475,7 +476,8 @@ OF_WIRE = {"rtu": {"events"}, "tcp": {"events"}}
 """Skipped, too, by the wire."""
 
 
-@pytest.mark.parametrize("kind", shortly(FIRMWARE_KINDS, ["can"]))
+@pytest.mark.long
+@pytest.mark.parametrize("kind", FIRMWARE_KINDS)
 def test_firmware_passes_conformance(kind: str, replaying: Path) -> None:
     """Every check of its wire; nothing is skipped but what it has not."""
     results = judged(kind, far=partial(FirmwareEnd, kind, replaying))

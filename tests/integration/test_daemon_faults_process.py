@@ -86,8 +86,6 @@ from sim.plant import imperfections
 from sim.plant.imperfections import Imperfections, draw_imperfections, realised
 from sim.plant.plant import SAMPLE_RATE, Plant
 
-pytestmark = pytest.mark.real_time
-
 
 @pytest.mark.real_time
 async def test_second_daemon_is_refused_while_first_plays_on(tmp_path: Path) -> None:
@@ -224,9 +222,6 @@ async def test_dashboard_process_ends_with_killed_daemon(tmp_path: Path) -> None
             await until(lambda: not serves(port))
 
 
-pytestmark = pytest.mark.real_time
-
-
 @asynccontextmanager
 async def running(program: str) -> AsyncIterator[None]:
     """Run a Python program as a process until the context ends."""
@@ -318,6 +313,7 @@ async def test_daemon_loses_only_log_lines_when_disk_is_full(tmp_path: Path) -> 
         await until(lambda: (tmp_path / "era.log").stat().st_size > size)
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 @pytest.mark.alone
 async def test_daemon_replays_nothing_when_starved(tmp_path: Path) -> None:
@@ -691,7 +687,7 @@ TURNS = Stream(
 # each knot: an ending follows in a set of its own.
 KNOTS = {"modbus-rtu": 2, "slcan": 9, "socketcand": 9}
 WIRES = ("serial", "modbus-tcp", "modbus-rtu", "slcan", "socketcand")
-SHORTLY = ("serial", "modbus-rtu", "socketcand")
+SHORTLY = ("serial", "modbus-rtu")
 
 
 def truth_of(folder: Path, stream: Stream, *changes: tuple[str, str], **options: str) -> Truth:

@@ -670,6 +670,7 @@ def deaf_connection(gateway: GatewayProcess) -> socket.socket:
     return made
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 def test_gateway_serves_with_two_thousand_silent_connections(gateway: GatewayProcess) -> None:
     """The oldest are closed until 128 are left."""

@@ -490,6 +490,7 @@ async def contrast(bench: LearningBench) -> float:
     return float(np.median([each for each in found if each is not None]))
 
 
+@pytest.mark.long
 @beside_a_process
 async def test_touches_go_on_without_an_estimator(tmp_path: Path) -> None:
     """Killed, another follows; stopped, it is replaced; meanwhile and after touches play."""

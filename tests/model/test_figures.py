@@ -87,8 +87,8 @@ def test_pages_of_a_pdf_are_a4_and_cover_the_board(rig: Path, tmp_path: Path) ->
 
 
 def test_labels_keep_off_the_frames_of_pages(rig: Path) -> None:
-    """Of places 18 mm apart all over the board; SW, on channel 0, is labelled with output 1."""
-    places = product(np.arange(0.003, 0.3, 0.018), np.arange(0.003, 0.22, 0.018))
+    """Of places 36 mm apart all over the board; SW, on channel 0, is labelled with output 1."""
+    places = product(np.arange(0.003, 0.3, 0.036), np.arange(0.003, 0.22, 0.036))
     sensors = {f"P{n}": (float(x), float(y)) for n, (x, y) in enumerate(places)}
     found = set()
     for page in _pages(Template(load_rig(rig), sensors)):

@@ -206,6 +206,7 @@ async def test_simulation_in_virtual_time_advances_only_by_steps(tmp_path: Path)
     assert (recording.start, recording.samples.shape) == (0.0005, (2000, 2))
 
 
+@pytest.mark.long
 async def test_simulation_applies_a_fault_within_a_step_at_its_time(tmp_path: Path) -> None:
     """Half a second into a step of 0.8 s the fault silences the amplifier, not before."""
     async with (

@@ -40,7 +40,6 @@ from gateway_bench import (
     wait_for,
     wait_for_daemon,
 )
-from long_form import shortly
 from model.errors import InputError
 from typed_page import installed_program
 
@@ -271,7 +270,6 @@ def test_gateway_connects_to_a_daemon_that_starts_later(tmp_path: Path) -> None:
             wait_for(lambda: http(gateway).status == 503)
 
 
-SHORT = ("8 WebSockets, texts of 2 bytes",)
 MAX_GROWTH = 400.0  # MB; of responses that are not read
 
 
@@ -291,9 +289,10 @@ def attacked(attacked_daemon: Path, tmp_path: Path) -> Iterator[GatewayProcess]:
         assert gateway.log() == ""
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 @pytest.mark.alone
-@pytest.mark.parametrize("name", shortly(ATTACKS, SHORT))
+@pytest.mark.parametrize("name", ATTACKS)
 def test_stops_get_through_an_attack(attacked: GatewayProcess, name: str) -> None:
     """Each is carried out, and the gateway takes less than half a second of a processor meanwhile.
 

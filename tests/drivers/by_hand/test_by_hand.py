@@ -27,6 +27,7 @@ from drivers.trace import tracing
 from drivers.urls import with_address
 from era_haptics.lab.cli import app as lab_app
 from era_haptics.lab.conformance.check import ConformanceReport
+from long_form import shortly
 from model.rig.rig_file import example_rig_path
 from real_wires import WORD_WIRES, WordFarSide
 from registry.limits import GuardLimits
@@ -49,7 +50,7 @@ async def leave_playing(far: WordFarSide, number: int = 1) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", WORD_WIRES)
+@pytest.mark.parametrize("wire", shortly(WORD_WIRES, ["serial", "modbus+tcp", "can+socketcand"]))
 async def test_stop_is_sent_before_anything_is_read(wire: str, tmp_path: Path) -> None:
     """An amplifier that plays for another host is silent, confirmed; identity is read after."""
     async with WORD_WIRES[wire](1) as far:
@@ -97,7 +98,9 @@ async def test_identity_has_units_and_the_limits_of_the_wire() -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", WORD_WIRES)
+@pytest.mark.parametrize(
+    "wire", shortly(WORD_WIRES, ["serial+tcp", "modbus+rtu server", "can+python-can virtual"])
+)
 async def test_status_of_what_plays_and_clear_of_a_stop(wire: str) -> None:
     """Looking changes nothing; after a stop Clear leaves it disarmed.
 
@@ -173,7 +176,7 @@ async def test_drive_after_a_stop_names_the_clear_command() -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", ADDRESSED)
+@pytest.mark.parametrize("wire", shortly(ADDRESSED, ["serial", "modbus+rtu"]))
 async def test_amplifier_takes_another_address(wire: str) -> None:
     """It replies there, nobody where it was, and the other amplifier where it is."""
     async with WORD_WIRES[wire](2) as far:

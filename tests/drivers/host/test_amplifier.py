@@ -40,6 +40,7 @@ from drivers.wires.can_frames import unpack_frames
 from drivers.wires.serial_frames import REPLY_BIT, FrameReader, encode_frame
 from drivers.wires.serial_line import SerialWire
 from drivers.wires.wire import Reply
+from long_form import shortly
 from real_wires import WORD_WIRES
 from registry.limits import GuardLimits
 from sim.amplifier.readings import capabilities
@@ -621,7 +622,13 @@ async def test_bus_that_is_opened_again_goes_on_with_its_numbers() -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", WORD_WIRES)
+@pytest.mark.parametrize(
+    "wire",
+    shortly(
+        WORD_WIRES,
+        ["modbus+rtu", "modbus+tcp", "can+slcan", "can+python-can udp_multicast"],
+    ),
+)
 async def test_group_plays_over_a_wire_and_stops(
     wire: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -650,7 +657,9 @@ async def test_group_plays_over_a_wire_and_stops(
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", CUT)
+@pytest.mark.parametrize(
+    "wire", shortly(CUT, ["modbus+rtu", "serial+tcp", "modbus+tcp", "can+slcan server"])
+)
 async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
     """Requests of both amplifiers fail with the same message, and those of a new line do not."""
     async with WORD_WIRES[wire](2) as far, opened_lines() as lines:
@@ -680,7 +689,7 @@ async def test_cut_line_is_lost_once_and_opened_again(wire: str) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("wire", WORD_WIRES)
+@pytest.mark.parametrize("wire", shortly(WORD_WIRES, ["serial", "modbus+rtu", "can+slcan"]))
 async def test_amplifier_that_does_not_reply_leaves_the_line(wire: str) -> None:
     """Nobody has the second address; the first one replies as before."""
     async with WORD_WIRES[wire](1) as far, opened_lines() as lines:

@@ -225,6 +225,7 @@ def test_other_plates_are_felt_by_their_energy() -> None:
     assert found == pytest.approx(np.array([[4.0, 6.25, 3.25], [1.0, 1.0, 0.0]]))
 
 
+@pytest.mark.long
 def test_promise_over_a_click_is_kept() -> None:
     """On 240 plates in time, of other thickness, springs, losses and drives: by nine of ten."""
     rig = smooth_rig()

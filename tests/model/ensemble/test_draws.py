@@ -57,8 +57,17 @@ def test_common_gain_moves_all_channels_together():
 WEEKEND = Path(__file__).parents[3] / "examples" / "weekend" / "rig.yaml"
 
 
-def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_plates() -> None:
-    """On 60 plates each, solved exactly, all else known to 1 %, 24 answers: 86 to 95 % of all.
+@pytest.mark.parametrize(
+    ("answers", "count", "least", "most", "without"),
+    [
+        pytest.param(6, 30, 0.8, 1.0, 0.4, id="6"),
+        pytest.param(24, 60, 0.86, 0.95, 0.2, id="24", marks=pytest.mark.long),
+    ],
+)
+def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_plates(
+    answers: int, count: int, least: float, most: float, without: float
+) -> None:
+    """On plates solved exactly, all else known to 1 %: 86 to 95 % of 24 answers on 60 plates each.
 
     Where feet do not count one of eight keeps them. By default they count, by their stiffness, too.
     """
@@ -72,10 +81,10 @@ def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_pl
     stated = (0.0, 0.3)
     tables = [replace(table, uncertainty=replace(known, supports=each)) for each in stated]
     rng, kept = np.random.default_rng(3), []
-    for _ in range(24):
+    for _ in range(answers):
         target, quiet = random_contacts(rng, 2, (0.4, 0.3), margin=0.02).tolist()
         placed = Placement((tuple(target),), (tuple(quiet),))
-        plates = draw_plates(rng, known, of=rig, count=60, contact_count=2)
+        plates = draw_plates(rng, known, of=rig, count=count, contact_count=2)
         each = []
         for counted in tables:
             layer, promise = only(counted, placed, drive_mode="phased")
@@ -85,8 +94,8 @@ def test_promises_of_a_board_on_rubber_at_its_corners_are_kept_on_nine_of_ten_pl
             each.append((20 * np.log10(contrast) >= promise.promised_contrast_db).mean())
         kept.append(each)
     shares = np.mean(kept, axis=0)
-    assert 0.86 <= shares[-1] <= 0.95
-    assert shares[0] < 0.2
+    assert least <= shares[-1] <= most
+    assert shares[0] < without
 
 
 def test_feet_leave_all_else_that_is_drawn_as_it_is() -> None:

@@ -282,6 +282,7 @@ def test_calibrate_refuses_gains_that_no_drive_has(rig, truth):
         calibrated(rig, replace(full, values=values))
 
 
+@pytest.mark.long
 def test_calibrate_estimates_all_scales_when_requested(rig, truth):
     """Every sensor's scale relative to their median, also of one mounted upside down."""
     found = calibrated(rig, measured(truth, scales={"P2": -1.0, "P5": 1.01}), all_scales=True)

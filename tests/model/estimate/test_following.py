@@ -330,6 +330,7 @@ def test_hidden_mass_and_places_are_found(seed: int) -> None:
     np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
 
 
+@pytest.mark.long
 def test_one_round_of_interleaved_tones_finds_the_springs() -> None:
     """Where each ERA plays every fourth tone only, springs are found within 2 %, and no mass."""
     hidden = draw("plain", 4)

@@ -324,6 +324,7 @@ def measured(rig: Rig, tones: FloatArray, places: FloatArray) -> Measurement:
     return Measurement(sensors, tones, noisy)
 
 
+@pytest.mark.long
 def test_identified_board_has_the_parts_that_it_was_built_of() -> None:
     """Stiffness within 2 %, magnet within 5 % and force within 1 %, from a rig file to a rig file.
 

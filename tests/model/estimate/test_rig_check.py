@@ -336,15 +336,16 @@ def weekend() -> Rig:
     return load_rig(FOLDER / "rig.yaml")
 
 
+@pytest.mark.parametrize("seeds", shortly([range(1), range(6)], [range(1)]), ids=len)
 @pytest.mark.parametrize(
     ("true", "written", "glued"), [("free", "mounted", 60), ("mounted", "free", 306)]
 )
 def test_the_other_resonance_is_named_before_anything_is_fitted(
-    true: str, written: str, glued: int
+    true: str, written: str, glued: int, seeds: range
 ) -> None:
-    """Six boards: 306 Hz of a coil of 1.29 g are 306 sqrt(1.29 / 33.5) = 60 Hz of a magnet."""
+    """Of each board: 306 Hz of a coil of 1.29 g are 306 sqrt(1.29 / 33.5) = 60 Hz of a magnet."""
     said = rf"^resonance_is of NE, NW, SW, SE must be {true}, got {written}: .* at {glued} Hz"
-    for seed in range(6):
+    for seed in seeds:
         with pytest.raises(InputError, match=said):
             check_consistency(given_as(written), measured(given_as(true), seed))
 
@@ -386,16 +387,18 @@ def test_shapes_that_are_alike_beyond_rounding_have_no_error() -> None:
     assert ShapeMatch(np.full((3, 1, 1), 1 + 2.3e-16)).error([0]) == 0.0
 
 
-def test_boards_cut_as_their_file_says_are_not_accused(weekend: Rig) -> None:
-    """Twenty whose parts deviate as bought ones do, half of them by four of the twelve places."""
-    for seed in range(20):
+@pytest.mark.parametrize("seeds", shortly([range(4), range(20)], [range(4)]), ids=len)
+def test_boards_cut_as_their_file_says_are_not_accused(weekend: Rig, seeds: range) -> None:
+    """Their parts deviate as bought ones do, half of them by four of the twelve places."""
+    for seed in seeds:
         check_meaning(weekend, measured(weekend, seed))
 
 
-def test_boards_cut_the_other_way_are_accused_of_that_alone(weekend: Rig) -> None:
-    """Ten, before anything is fitted in full."""
+@pytest.mark.parametrize("seeds", shortly([range(2), range(10)], [range(2)]), ids=len)
+def test_boards_cut_the_other_way_are_accused_of_that_alone(weekend: Rig, seeds: range) -> None:
+    """Before anything is fitted in full."""
     across = weekend.replaced(plate={"grain": "width"})
-    for seed in range(10):
+    for seed in seeds:
         with pytest.raises(InputError, match=r"^plate\.grain must be width, got length: "):
             check_consistency(weekend, measured(across, seed))
 

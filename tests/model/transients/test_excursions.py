@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
+from long_form import shortly
 from model.answer.stimulus import Course, swings_of_pulse
 from model.reduction.free_plate import solve_free_plate
 from model.reduction.reduced_plate import (
@@ -276,7 +277,7 @@ def test_knots_are_those_of_numpy(eras, quiet, level):
         assert np.abs(knots[1:-1]).max() <= 1
 
 
-@pytest.mark.parametrize("rig", ["paper_plate", "eight_eras", "table"])
+@pytest.mark.parametrize("rig", shortly(["paper_plate", "eight_eras", "table"], ["eight_eras"]))
 def test_onsets_and_endings_do_what_those_of_numpy_do(rig, without_kernels):
     """Contrast of onsets within 0.02 dB, what is left after endings within 0.2, on rigs.
 

@@ -30,6 +30,7 @@ from drivers.host.amplifier import Amplifier
 from drivers.opening import Lines
 from drivers.protocol.definition import FAULTS, STATES
 from gateway_bench import wait_for
+from long_form import shortly
 from model.errors import InputError
 from sim.soft_amp.engine import (
     Counters,
@@ -527,7 +528,7 @@ def test_unsuitable_device_is_refused(
 @pytest.mark.real_time
 @pytest.mark.needs("jackd", "cc")
 @pytest.mark.needs("portaudio")
-@pytest.mark.parametrize("line", ["--tcp", "--modbus-tcp"])
+@pytest.mark.parametrize("line", shortly(["--tcp", "--modbus-tcp"], ["--tcp"]))
 def test_all_of_it_killed_is_silent(
     sound: tuple[Capture, dict[str, str]], tmp_path: Path, line: str
 ) -> None:

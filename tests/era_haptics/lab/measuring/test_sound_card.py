@@ -406,6 +406,7 @@ def measured(
     return measure_through(desk, card, multisine, periods=2, progress=lambda done, of: None)
 
 
+@pytest.mark.long
 def test_identified_plate_is_the_one_behind_the_card(rig: Rig, truth: Truth) -> None:
     """Springs per mass, rigidity, gains over frequency: what drove the plate, with resonances.
 

@@ -268,6 +268,8 @@ NAMES = [
 ]
 WITH_CONFORMANCE = ["write-an-amplifier"]
 """It runs the whole of it."""
+WITHOUT_CODE = ["identify-a-plate"]
+"""Commands alone, without a file of the examples."""
 SHORT = "add-a-material"
 """Executed by every run of the tests; the others by `make test-long`, and when they change."""
 
@@ -294,7 +296,7 @@ def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
     "name",
     [
         pytest.param(name, marks=[] if name == SHORT else [pytest.mark.long, pytest.mark.alone])
-        for name in [*NAMES, *WITH_CONFORMANCE]
+        for name in [*NAMES, *WITH_CONFORMANCE, *WITHOUT_CODE]
     ],
 )
 def test_page_commands_print_what_is_shown(name: str, reader: Reader) -> None:

@@ -9,10 +9,9 @@ from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, layers_of
 from model.errors import InputError, expect_path, shown
-from model.estimate.calibrate import Calibration
+from model.estimate.calibrate import Calibration, check_consistency
 from model.estimate.calibrate import calibrate as fit
 from model.estimate.measurement import measurement_of, read_measured
-from model.estimate.rig_check import check_consistency
 from model.processes import Progress, check_progress, unseen
 from model.rig.actuator_keys import EraSection, ExciterSection
 from model.rig.rig import Rig

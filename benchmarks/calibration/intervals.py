@@ -18,9 +18,8 @@ from benchmarks.calibration.hidden_plates import CHOSEN, field_deviations, senso
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate
+from model.estimate.calibrate import calibrate, check_consistency
 from model.estimate.measurement import Measurement, measurement_of, read_measured
-from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 

@@ -32,9 +32,8 @@ from era_haptics.lab.measuring.sound_card import WiredSensor, read_sensors
 from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate
+from model.estimate.calibrate import calibrate, check_consistency
 from model.estimate.measurement import Measurement, write_responses
-from model.estimate.rig_check import check_consistency
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
 from model.rig.rig import Rig, Uncertainty

@@ -21,8 +21,7 @@ from benchmarks.setting import use_one_thread
 from benchmarks.weekend.boards import ROOT
 from benchmarks.weekend.chain import FOLDER, measured
 from model.errors import InputError
-from model.estimate.calibrate import calibrate
-from model.estimate.rig_check import check_consistency
+from model.estimate.calibrate import calibrate, check_consistency
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import load_rig
 

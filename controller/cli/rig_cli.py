@@ -225,8 +225,8 @@ def _measured_before(path: Path, rig: "Rig") -> "MeasuredPlate":
     import numpy as np
 
     from controller.plate_measurement import MeasuredPlate
+    from model.estimate.calibrate import check_consistency
     from model.estimate.measurement import measurement_of, read_measured
-    from model.estimate.rig_check import check_consistency
 
     measured = measurement_of(read_measured(path), rig)
     screened = check_consistency(rig, measured)

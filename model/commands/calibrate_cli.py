@@ -136,7 +136,7 @@ def calibrate(
     Write what was found beside the rig's file, and print its values with their uncertainties.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibrate import standard_errors
+    from model.estimate.calibrate import check_consistency, standard_errors
     from model.estimate.fit_report import (
         calibration_json,
         change_rows,
@@ -145,7 +145,6 @@ def calibrate(
         gain_rows,
     )
     from model.estimate.measurement import LEAST_SENSORS, measurement_of, read_measured
-    from model.estimate.rig_check import check_consistency
     from model.rig.rig_file import load_rig
 
     check_rig_output(output, rig_file, measured_file)

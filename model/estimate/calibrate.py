@@ -6,11 +6,13 @@ d are measured values at frequency f of sensor s and ERA n, a those of the model
 scales read them, g a complex gain of every frequency and ERA. x has the values of the rig and the
 plate's form errors, in standard deviations of what data sheets and tolerances leave.
 
+`check_consistency` is the gate before it: it refuses responses that are not what they claim to be.
 Dead channels and outliers are left out. The rig of a fit has what a rig file can express, and
 states how well it is then known.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import compress
@@ -22,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.arrays import ComplexArray, FloatArray, Point, best_of
 from model.config.document import KeyPath
 from model.errors import InputError
+from model.estimate.findings import MAX_FIT_ERROR
 from model.estimate.fit import (
     HELD_OUT_FOLDS,
     Fit,
@@ -40,15 +43,14 @@ from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
-    Screening,
     check_enough_sensors,
 )
+from model.estimate.rig_check import Verdict, cycles, diagnose
 from model.estimate.space import FORM, KINDS, MASS_CELLS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import in_display_unit
 from model.rig.rig import Rig, Uncertainty
-from model.structure.attachments import Gain
 
 MAX_PREDICTION_ERROR = 0.25
 """Largest relative error at held-out sensors of an acceptable fit."""
@@ -56,6 +58,7 @@ MAX_PREDICTION_ERROR = 0.25
 MAX_OUTLIERS = 0.1
 """Largest share of values left out of an acceptable fit."""
 
+_MAX_FREQUENCIES = 16  # ample for every check before a calibration
 _LEAST = 1e-4  # of an uncertainty; no fit is exact
 
 # Relative error of values by idealisations of the model, of any but the loss factor, and of that:
@@ -71,6 +74,75 @@ _SIGNIFICANCE = 4.0  # standard errors
 _CLEAR = 3.0  # standard errors of a clear deviation
 _MAX_GAIN = 5.0  # of a drive at a frequency relative to its median, either way
 _MAX_SIDE = 4.0  # tolerances by which a side of the plate may be off
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """Result of a check of responses, for a calibration."""
+
+    dead_eras: NDArray[np.bool_]
+    """Mask (e,) of the ERAs that do not move the plate."""
+    dead_sensors: NDArray[np.bool_]
+    """Mask (s,) of the sensors that hear next to nothing."""
+    start: FloatArray
+    """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
+
+
+def check_consistency(rig: Rig, responses: Measurement) -> Screening:
+    """Check that responses are what they claim to be, and screen them for a fit.
+
+    A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped
+    plug, outlier rejection whole sensors. Raises InputError that names the cause: too few sensors
+    or frequencies, another quantity or unit, a grain along the other side, the other meaning of a
+    resonance, conjugated phases, sensors at swapped places, swapped or inverted channels.
+    """
+    rows = np.unique(
+        np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
+    )
+    some, values = responses.frequencies[rows], responses.values[rows]
+    observation = replace(responses, frequencies=some, values=values, errors=None)
+    if observation.count and not (np.abs(values) > 0).any():
+        raise InputError("measured responses must not all be zero; check that ERAs were driven")
+    # Values of the plate that are off are what a calibration is for.
+    verdict = diagnose(rig, observation, false_alarm=0.0, refuses=True)
+    _check_wiring(verdict)
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    if best and best.key in ("plate.length", "plate.width") and best.match.error <= MAX_FIT_ERROR:
+        raise _wrong_size(best.key, best.expected, best.value)
+    assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
+    return Screening(
+        np.array(["dead" in channel.states for channel in verdict.channels]),
+        np.isin(responses.names, [each.of for each in verdict.of_kinds("silent", "mute")]),
+        verdict.match.fit.x[verdict.match.plate.numbers],
+    )
+
+
+def _check_wiring(verdict: Verdict) -> None:
+    """Raise InputError for channels that drive another ERA or have the opposite sign."""
+    for cycle in cycles(verdict.channels):
+        raise InputError(
+            f"channels must drive the ERAs of the rig, got swapped ones: those of "
+            f"{_joined([each.era for each in cycle])} drive each other's ERA, as it looks; correct "
+            "the plugs, the names in the file, or the channels in the rig, or the sensors' "
+            "positions if they are mirrored, and measure again"
+        )
+    for channel in verdict.channels:
+        if "other ERA" in channel.states:
+            raise InputError(
+                f"channels must drive the ERAs of the rig, got ERA {channel.drives} driven by that "
+                f"of {channel.era}, as it looks; correct the plug or the names in the file"
+            )
+    inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
+    if inverted:
+        raise InputError(
+            f"signs must be upwards positive for sensors and ERAs, got opposite ones of "
+            f"{_joined(inverted)}; swap the two wires of these, or turn the sensors over if it is "
+            "all of them"
+        )
+
+
+def _joined(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 @dataclass(frozen=True)
@@ -131,11 +203,13 @@ class Calibration:
     def rig(self) -> Rig:
         """The calibrated rig: without form errors, with its gains and its uncertainty."""
         rig = self._fitted
-        eras = tuple(
-            replace(era, gains=_stated_gains(gains, self.frequencies) or era.gains)
-            for era, gains in zip(rig.eras, self._gains.T, strict=True)
-        )
-        return replace(rig, eras=eras, uncertainty=self._uncertainty)
+        eras = []
+        for era, gains in zip(rig.eras, self._gains.T, strict=True):
+            known = np.isfinite(gains) & (gains != 0)
+            rows = zip(self.frequencies[known].tolist(), gains[known].tolist(), strict=True)
+            stated = tuple((f, abs(gain), float(np.angle(gain))) for f, gain in rows)
+            eras.append(replace(era, gains=stated or era.gains))
+        return replace(rig, eras=tuple(eras), uncertainty=self._uncertainty)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -645,10 +719,10 @@ def _check_sides(found: Calibration) -> None:
     offs = space.values(found.fit.x, "side").tolist()
     for key, side, off in zip(("length", "width"), (plate.length, plate.width), offs, strict=True):
         if abs(off) > _MAX_SIDE * KINDS["side"].std:
-            raise wrong_size(f"plate.{key}", side, side + off)
+            raise _wrong_size(f"plate.{key}", side, side + off)
 
 
-def wrong_size(key: str, in_rig: float, measured: float) -> InputError:
+def _wrong_size(key: str, in_rig: float, measured: float) -> InputError:
     """Error for a side [m] of the plate, by its key, where another size fits the responses."""
     rig_has, fits = (in_display_unit(side, "m", digits=4) for side in (in_rig, measured))
     return InputError(
@@ -706,15 +780,6 @@ def _check_suspensions(found: Calibration) -> None:
 def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """Variances (f, n) of linear functions of parameters, by slopes (f, n, q) and covariance."""
     return np.asarray(((slopes @ covariance) * slopes).sum(axis=-1))
-
-
-def _stated_gains(gains: ComplexArray, frequencies: FloatArray) -> tuple[Gain, ...]:
-    """Gains of an ERA for a rig, of those among gains (f,) that are known."""
-    known = np.isfinite(gains) & (gains != 0)
-    return tuple(
-        (float(f), float(abs(gain)), float(np.angle(gain)))
-        for f, gain in zip(frequencies[known], gains[known], strict=True)
-    )
 
 
 def _rms(values: ArrayLike) -> float:

@@ -404,18 +404,6 @@ def _shown(point: tuple[float, float]) -> str:
     return f"({point[0]:g}, {point[1]:g})"
 
 
-@dataclass(frozen=True, eq=False)
-class Screening:
-    """Result of a check of responses, for a calibration."""
-
-    dead_eras: NDArray[np.bool_]
-    """Mask (e,) of the ERAs that do not move the plate."""
-    dead_sensors: NDArray[np.bool_]
-    """Mask (s,) of the sensors that hear next to nothing."""
-    start: FloatArray
-    """Fitted values (n,) of the most likely plate, as `SensedPlate.numbers` are in its space."""
-
-
 def silent_sensors(measurement: Measurement) -> NDArray[np.bool_]:
     """Mask of sensors without a response to any ERA (s,)."""
     size = np.abs(measurement.values)

@@ -1,12 +1,11 @@
-"""Rig check: compare measured responses with a rig, and screen them before a calibration.
+"""Rig check: compare measured responses with a rig.
 
 `diagnose` first finds what a rig's file says the wrong way round, then matches plate and wiring,
 and gives a `Verdict`: its findings, and a state for each channel. What is right or wrong is decided
 by the functions of `model.estimate.findings`.
 
-`check_consistency` refuses responses that are not what they claim to be. A fit can absorb almost
-any error of a measurement: gains take wrong units, springs a swapped plug, outlier rejection whole
-sensors. Each check looks for one such error alone, in what the fit would leave free, and names it.
+Before a fit (`model.estimate.calibrate.check_consistency`) it refuses what is not what it claims to
+be. Each check looks for one error alone, in what the fit would leave free, and names it.
 """
 
 import math
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 
 from model.arrays import ComplexArray, FloatArray, best_by, best_of
 from model.errors import InputError
-from model.estimate.calibrate import wrong_size
 from model.estimate.findings import (
     FALSE_ALARM,
     MAX_FIT_ERROR,
@@ -46,7 +44,6 @@ from model.estimate.fit import SensedPlate, gains_of, plate_of, row_rms
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
-    Screening,
     check_enough_sensors,
     silent_sensors,
     typical,
@@ -88,7 +85,6 @@ _EXPLAINS = 0.6  # of the median deviation without glue
 _MIN_CHANNELS = 3  # of which a median shows what is the amplifier's
 
 _MAX_GAIN = 3.0  # of all channels together; a factor either way is another quantity or unit
-_MAX_FREQUENCIES = 16  # ample for every check before a calibration
 _QUANTITIES = (
     ("g", f"multiply by {GRAVITY}", 1 / GRAVITY, 0),
     ("mm/s² per m", "divide by 1000", 1e3, 0),
@@ -562,36 +558,6 @@ def check_meaning(rig: Rig, observation: Measurement) -> None:
         raise InputError(found[0].rows[0].partition(": ")[2])
 
 
-def check_consistency(rig: Rig, responses: Measurement) -> Screening:
-    """Check that responses are what they claim to be, and screen them for a fit.
-
-    A fit can absorb almost any error of a measurement: gains take wrong units, springs a swapped
-    plug, outlier rejection whole sensors. Raises InputError that names the cause: too few sensors
-    or frequencies, another quantity or unit, a grain along the other side, the other meaning of a
-    resonance, conjugated phases, sensors at swapped places, swapped or inverted channels.
-    """
-    rows = np.unique(
-        np.linspace(0, len(responses.frequencies) - 1, _MAX_FREQUENCIES).round().astype(int)
-    )
-    observation = replace(
-        responses, frequencies=responses.frequencies[rows], values=responses.values[rows]
-    )
-    if observation.count and not (np.abs(observation.values) > 0).any():
-        raise InputError("measured responses must not all be zero; check that ERAs were driven")
-    # Values of the plate that are off are what a calibration is for.
-    verdict = diagnose(rig, observation, false_alarm=0.0, refuses=True)
-    _check_wiring(verdict)
-    best = verdict.hypotheses[0] if verdict.hypotheses else None
-    if best and best.key in ("plate.length", "plate.width") and best.match.error <= MAX_FIT_ERROR:
-        raise wrong_size(best.key, best.expected, best.value)
-    assert verdict.match is not None  # noqa: S101  some channels have the rig's gain
-    return Screening(
-        np.array(["dead" in channel.states for channel in verdict.channels]),
-        np.isin(responses.names, [each.of for each in verdict.of_kinds("silent", "mute")]),
-        verdict.match.fit.x[verdict.match.plate.numbers],
-    )
-
-
 def _check_quantity(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) -> None:
     """Raise InputError where gains of all channels are those of another quantity or unit."""
     model = plate.model.at(plate.moved(*shapes.start)).responses[..., shapes.nearest]
@@ -634,34 +600,6 @@ def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) 
             f"({100 * other.error:.1f} % unexplained instead of {100 * match.error:.1f} %); "
             "change them"
         )
-
-
-def _check_wiring(verdict: Verdict) -> None:
-    """Raise InputError for channels that drive another ERA or have the opposite sign."""
-    for cycle in cycles(verdict.channels):
-        raise InputError(
-            f"channels must drive the ERAs of the rig, got swapped ones: those of "
-            f"{_joined([each.era for each in cycle])} drive each other's ERA, as it looks; correct "
-            "the plugs, the names in the file, or the channels in the rig, or the sensors' "
-            "positions if they are mirrored, and measure again"
-        )
-    for channel in verdict.channels:
-        if "other ERA" in channel.states:
-            raise InputError(
-                f"channels must drive the ERAs of the rig, got ERA {channel.drives} driven by that "
-                f"of {channel.era}, as it looks; correct the plug or the names in the file"
-            )
-    inverted = [channel.era for channel in verdict.channels if "inverted" in channel.states]
-    if inverted:
-        raise InputError(
-            f"signs must be upwards positive for sensors and ERAs, got opposite ones of "
-            f"{_joined(inverted)}; swap the two wires of these, or turn the sensors over if it is "
-            "all of them"
-        )
-
-
-def _joined(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def verdict_rows(verdict: Verdict) -> list[str]:

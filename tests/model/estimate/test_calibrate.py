@@ -17,10 +17,9 @@ from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, 
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import Calibration, calibrate
+from model.estimate.calibrate import Calibration, calibrate, check_consistency
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.measurement import Measurement
-from model.estimate.rig_check import check_consistency
 from model.rig.rig import Rig
 from model.rig.rig_file import example_rig_path, load_rig
 from model.structure.attachments import PointLoad

@@ -24,10 +24,9 @@ from benchmarks.calibration.hidden_plates import (
 )
 from model.arrays import ComplexArray, FloatArray
 from model.estimate import findings
-from model.estimate.calibrate import calibrate
+from model.estimate.calibrate import calibrate, check_consistency
 from model.estimate.fit import SensedPlate, fit, sensed_plate
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.rig_check import check_consistency
 from model.estimate.space import KINDS, MASS_CELLS, reduced_modes
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig

@@ -17,7 +17,7 @@ from benchmarks.desk_plate.truth import draw_truth
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate
+from model.estimate.calibrate import calibrate, check_consistency
 from model.estimate.fit import sensed_plate
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
@@ -28,7 +28,6 @@ from model.estimate.measurement import (
     write_responses_csv,
     write_responses_uff,
 )
-from model.estimate.rig_check import check_consistency
 from model.fem import Mesh, assemble
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig

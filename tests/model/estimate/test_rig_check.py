@@ -27,7 +27,7 @@ from controller.plate_measurement import MeasuredPlate
 from long_form import shortly
 from model.errors import InputError
 from model.estimate import findings
-from model.estimate.calibrate import MAX_OUTLIERS, calibrate
+from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
 from model.estimate.findings import MAX_FIT_ERROR, TEXTS, ShapeMatch, match_plate
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
@@ -41,7 +41,6 @@ from model.estimate.rig_check import (
     Verdict,
     as_json,
     channel_table,
-    check_consistency,
     check_meaning,
     diagnose,
     judged_by_promises,

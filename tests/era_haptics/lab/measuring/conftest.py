@@ -4,13 +4,6 @@ import pytest
 
 from benchmarks.desk_plate.truth import Truth, draw_truth
 from model.rig.rig import Rig
-from model.rig.rig_file import example_rig_path, load_rig
-
-
-@pytest.fixture(scope="session")
-def rig() -> Rig:
-    """The paper's plate as its file has it."""
-    return load_rig(example_rig_path())
 
 
 @pytest.fixture(scope="session")

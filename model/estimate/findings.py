@@ -47,7 +47,7 @@ from model.estimate.fit import (
     without_outliers,
 )
 from model.estimate.identify import solved_for
-from model.estimate.measurement import Measurement, typical
+from model.estimate.measurement import Measurement
 from model.finger import Grid
 from model.quantities import in_display_unit, percent
 from model.rig.rig import Rig
@@ -376,9 +376,10 @@ class ShapeMatch:
     @cached_property
     def medians(self) -> FloatArray:
         """Medians of the MAC over frequency (n, n)."""
-        return np.array(
-            [[typical(column) for column in row] for row in self.mac.transpose(1, 2, 0)]
-        )
+        ordered, count = np.sort(self.mac, axis=0), np.isfinite(self.mac).sum(axis=0)
+        low = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)
+        high = np.take_along_axis(ordered, count[None] // 2, axis=0)  # NaN without any
+        return (low[0] + high[0]) / 2
 
     @cached_property
     def nearest(self) -> list[int]:

@@ -625,6 +625,7 @@ def url(origin: str) -> str:
     return f"{origin}/plate.html?gateway=http://127.0.0.1:1/#{TOKEN}"
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 async def test_page_plays_and_comes_back_after_every_loss(tmp_path: Path) -> None:
     """Armed and touched over a cut network; after a new daemon and gateway it follows, disarmed,

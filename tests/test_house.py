@@ -18,7 +18,6 @@ import pytest
 import changed_tests
 import vocabulary
 from changed_tests import ALSO, also, nearest
-from long_form import shortly
 from names import misleading_names
 from vocabulary import retired_identifiers
 
@@ -77,10 +76,8 @@ def importing(module: str) -> set[str]:
     return {path.relative_to(ROOT).as_posix() for path in found}
 
 
-@pytest.mark.parametrize(
-    "path",
-    shortly(["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"], ["sim/cli.py"]),
-)
+@pytest.mark.long
+@pytest.mark.parametrize("path", ["drivers/protocol/sets.py", "model/rig/air_gap.py", "sim/cli.py"])
 def test_tests_of_the_folder_come_before_those_that_import(path: str) -> None:
     """And those before all others, which only import what imports it.
 
@@ -127,6 +124,7 @@ def test_rows_name_what_there_is() -> None:
     assert also(["drivers/wires/can_frames.py"]) == ["make pages", "make fuzz"]
 
 
+@pytest.mark.long
 def test_tests_run_in_the_order_given_until_the_time_is_over(tmp_path: Path) -> None:
     """What has no time is counted apart, and its files are named."""
     for name in ("test_a.py", "test_b.py"):

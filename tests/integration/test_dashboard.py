@@ -208,6 +208,7 @@ async def test_field_is_drawn_at_the_frame_rate(page: Page, era: Client) -> None
     assert await page.until(colours, lambda count: count == 1)  # still again
 
 
+@pytest.mark.long
 async def test_each_finger_has_its_content_in_a_colour_of_its_own(
     tab: Page, tmp_path: Path
 ) -> None:

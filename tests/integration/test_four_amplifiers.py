@@ -218,7 +218,10 @@ RIG = make_rig("a", GuardLimits(20.0, 1000.0, 1.0))
 SERIAL = ["serial", "modbus+rtu", "can+slcan"]
 
 
-@pytest.mark.parametrize(("boots", "openings"), [(0.8, 1), (5.0, 1), (9.0, 2)])
+@pytest.mark.parametrize(
+    ("boots", "openings"),
+    [pytest.param(0.8, 1, marks=pytest.mark.long), (5.0, 1), (9.0, 2)],
+)
 @in_virtual_time
 async def test_daemon_reaches_it_at_the_first_opening(
     boots: float, openings: int, tmp_path: Path

@@ -379,7 +379,7 @@ class ShapeMatch:
         ordered, count = np.sort(self.mac, axis=0), np.isfinite(self.mac).sum(axis=0)
         low = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)
         high = np.take_along_axis(ordered, count[None] // 2, axis=0)  # NaN without any
-        return (low[0] + high[0]) / 2
+        return np.asarray((low[0] + high[0]) / 2)
 
     @cached_property
     def nearest(self) -> list[int]:

@@ -32,6 +32,12 @@ def least_gap(places: FloatArray) -> float:
     return float(gaps[np.triu_indices(len(places), 1)].min(initial=np.inf))
 
 
+def rms(values: ArrayLike) -> float:
+    """Root mean square, 0 of nothing."""
+    squares = np.square(values)
+    return float(np.sqrt(np.mean(squares))) if np.size(squares) else 0.0
+
+
 def nullable(values: ArrayLike | None) -> Any:
     """Numbers for JSON, an array as lists: None in place of what is not finite or not there."""
     found = np.asarray(values, dtype=float)

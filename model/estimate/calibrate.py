@@ -19,9 +19,9 @@ from itertools import compress
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from model.arrays import ComplexArray, FloatArray, Point, best_of
+from model.arrays import ComplexArray, FloatArray, Point, best_of, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.findings import MAX_FIT_ERROR
@@ -391,7 +391,7 @@ class Calibration:
         """Rms error at the values of a mask, relative to rows' rms; infinite for an empty mask."""
         values = self.fit.measurement.values
         error = np.abs(predicted - values) / row_rms(values)
-        return _rms(error[which]) if which.any() else math.inf
+        return rms(error[which]) if which.any() else math.inf
 
     @cached_property
     def is_clear(self) -> NDArray[np.bool_]:
@@ -509,7 +509,7 @@ class Calibration:
             if not all(one.is_identified for one, _ in of_kind):
                 return None
             shares = [math.hypot(e / one.value, theory) for one, e in of_kind if one.value > 0]
-            return _rms(shares or [0.0])
+            return rms(shares)
 
         fitted = {"place": self._place_error} | self._field_errors
         if (stiffness := relative("stiffness")) is not None:
@@ -523,7 +523,7 @@ class Calibration:
             if one.foot
         ]
         if feet:
-            fitted["supports"] = math.hypot(_rms(feet), _MODEL_ERROR)
+            fitted["supports"] = math.hypot(rms(feet), _MODEL_ERROR)
         # An error is hardly known better than to two digits.
         fitted = {key: float(f"{value:.2g}") for key, value in fitted.items()}
         if "damping" in fitted:
@@ -551,12 +551,12 @@ class Calibration:
         if not known.any(axis=0).all():
             return {}
         left = self.held_out.unexplained if self.held_out else 0.0
-        field = max(_rms(lacking[known]), left)
+        field = max(rms(lacking[known]), left)
         # The best gain of a field that is off by so much at n sensors: but at resonances, masses
         # and stiffness that are off change a field in phase with it.
         off = field / np.sqrt(self.fit.measurement.known.sum(axis=1)[known])
-        gain = _rms(np.hypot(off, magnitude[known]))
-        turned = _rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
+        gain = rms(np.hypot(off, magnitude[known]))
+        turned = rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
         return {
             "gain": max(gain, _LEAST),
             "phase_deg": math.degrees(max(turned, _LEAST)),
@@ -593,7 +593,7 @@ class Calibration:
         by_data = error < math.sqrt(0.5) * kind.std
         before = self.plate.rig.uncertainty.place
         of_each = np.where(by_data, np.hypot(np.hypot(kept, error), kind.theory), before)
-        return _rms(of_each)
+        return rms(of_each)
 
 
 def calibrate(
@@ -780,11 +780,6 @@ def _check_suspensions(found: Calibration) -> None:
 def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """Variances (f, n) of linear functions of parameters, by slopes (f, n, q) and covariance."""
     return np.asarray(((slopes @ covariance) * slopes).sum(axis=-1))
-
-
-def _rms(values: ArrayLike) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:

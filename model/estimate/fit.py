@@ -426,35 +426,6 @@ def noise_of(values: ComplexArray, residuals: FloatArray, left: FloatArray) -> F
     return np.asarray(np.sqrt(a2 + b2 * size**2 + floor**2))
 
 
-def prediction_errors(
-    found: Fit, hidden: NDArray[np.bool_], *, evaluations: int = 8
-) -> tuple[Fit, FloatArray, FloatArray]:
-    """Fit without some values, a mask (f, s, n), and predict these.
-
-    Returns that fit, and of each hidden value the squared error and its variance by uncertain
-    parameters, (m,).
-    """
-    shown = found.measurement.part(~hidden)
-    other = fit(found.model, shown, searched=found.searched, start=found.x, evaluations=evaluations)
-    own = np.flatnonzero(found.searched)
-    J = jacobian(other.plate, found.searched)[..., own][hidden]
-    covariance = other.stated_covariance[np.ix_(own, own)]
-    variance = ((J @ covariance) * J.conj()).sum(axis=1).real
-    squares = np.abs(other.plate.responses - found.measurement.values)[hidden] ** 2
-    return other, np.asarray(squares), np.asarray(variance)
-
-
-def relative_rms(squares: FloatArray, mean_squares: FloatArray) -> float:
-    """Root mean square of errors, each relative to the rms of its responses, by their squares.
-
-    0 where what was subtracted from the squares, such as noise, exceeds them; infinite without any
-    finite value.
-    """
-    share = squares / mean_squares
-    known = share[np.isfinite(share)]
-    return float(np.sqrt(max(known.mean(), 0.0))) if len(known) else np.inf
-
-
 def likeliest(found: Sequence[Fit]) -> Fit:
     """The fit of least cost, the first of those that are nearly equal."""
     return best_by(found, lambda each: -each.cost)

@@ -34,7 +34,7 @@ from functools import cached_property
 
 import numpy as np
 
-from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
+from model.arrays import ComplexArray, FloatArray, best_of, ranked_by, rms
 from model.config.document import KeyPath
 from model.errors import InputError
 from model.estimate.fit import (
@@ -45,8 +45,6 @@ from model.estimate.fit import (
     fit,
     likeliest,
     parameters_of,
-    prediction_errors,
-    relative_rms,
 )
 from model.estimate.forward import ForwardModel, Sensor, jacobian
 from model.estimate.measurement import Measurement
@@ -122,6 +120,7 @@ _THEORY = {
 
 _MAX_PREDICTION_STD = 0.1  # of the rms at a tone; less certain predictions are no test
 _MIN_PREDICTED = 16  # values
+_REFITTED = 8  # evaluations of a fit to the other paths
 _IN_COMMON = 2.0  # factor on standard deviations: what no path shows is wrong in all fits alike
 
 _UNKNOWN = 0.5
@@ -185,7 +184,7 @@ class Identification:
     @cached_property
     def mode_shift(self) -> float:
         """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
-        return _rms(self.fitted.x[self.fitted.space.of("mode_shifts")])
+        return rms(self.fitted.x[self.fitted.space.of("mode_shifts")])
 
     @property
     def is_explained(self) -> bool:
@@ -233,19 +232,19 @@ class Identification:
         """
         space, before = self.fitted.space, self.fitted.model.rig.uncertainty
         mean = _rows(space, "gain").mean(axis=0, keepdims=True)
-        rms = {kind: _rms(std) for kind, std in self.stds().items()}
+        by_kind = {kind: rms(std) for kind, std in self.stds().items()}
         return Uncertainty.clipped(
-            gain=math.hypot(rms["gain"], _DRIVE_GAIN),
-            phase_deg=math.hypot(math.degrees(rms["phase"]), _DRIVE_PHASE_DEG),
-            **Uncertainty.of_frequency(rms["frequency"]),
-            stiffness=rms["stiffness"],
-            damping=math.exp(max(rms["damping"], rms["loss"])),
+            gain=math.hypot(by_kind["gain"], _DRIVE_GAIN),
+            phase_deg=math.hypot(math.degrees(by_kind["phase"]), _DRIVE_PHASE_DEG),
+            **Uncertainty.of_frequency(by_kind["frequency"]),
+            stiffness=by_kind["stiffness"],
+            damping=math.exp(max(by_kind["damping"], by_kind["loss"])),
             fingertip=before.fingertip,
             common_gain=math.hypot(before.common_gain, std_of(mean, space, self.covariance)[0]),
             field=unexplained,
-            place=rms["place"],
+            place=by_kind["place"],
             harmonic=before.harmonic,
-            supports=_rms(self.std[space.groups["supports"]]),
+            supports=rms(self.std[space.groups["supports"]]),
         )
 
 
@@ -512,15 +511,12 @@ def std_of(combinations: FloatArray, space: Space, covariance: FloatArray) -> Fl
     return np.asarray(np.sqrt(np.einsum("mp,pq,mq->m", scaled, covariance, scaled)))
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
-
-
 def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
     """Predict paths from fits to the others; None where these do not determine enough of them."""
     measurement, model = found.measurement, found.model
     folds = (model.observed[:, None] + np.arange(len(model.rig.eras))) % HELD_OUT_FOLDS
     squares, variance = np.full((2, *measurement.values.shape), np.nan)
+    own = np.flatnonzero(found.searched)
     fits, noise = [], min(found.chi2, 1.0)  # readings may be better than they are stated
     for fold in range(HELD_OUT_FOLDS):
         progress(1 + fold, 1 + HELD_OUT_FOLDS)
@@ -529,7 +525,12 @@ def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
             continue
         if (hidden == measurement.known).all():
             return None
-        other, errors, variance[hidden] = prediction_errors(found, hidden)
+        shown = measurement.part(~hidden)
+        other = fit(model, shown, searched=found.searched, start=found.x, evaluations=_REFITTED)
+        J = jacobian(other.plate, found.searched)[..., own][hidden]
+        covariance = other.stated_covariance[np.ix_(own, own)]
+        variance[hidden] = ((J @ covariance) * J.conj()).sum(axis=1).real
+        errors = np.abs(other.plate.responses - measurement.values)[hidden] ** 2
         squares[hidden] = errors - 2 * noise * measurement.std[hidden] ** 2
         fits.append(other.x)
     mean_square = np.broadcast_to(measurement.tone_rms**2, variance.shape)
@@ -537,7 +538,8 @@ def hold_out(found: Fit, *, progress: Progress = unseen) -> HeldOutPaths | None:
     if predicted.sum() < _MIN_PREDICTED:
         return None
     total, unexplained = (
-        relative_rms(parts[predicted], mean_square[predicted])
+        # Noise that is subtracted may exceed the errors.
+        math.sqrt(max((parts[predicted] / mean_square[predicted]).mean(), 0.0))
         for parts in (squares, squares - variance)
     )
     share = (unexplained / total) ** 2 if unexplained else 0.0

@@ -5,6 +5,7 @@ valid by themselves are found here, and all problems of a file are reported at o
 """
 
 import hashlib
+import json
 import math
 import re
 from collections.abc import Mapping, Set
@@ -27,7 +28,7 @@ from model.config.units import LENGTH, RATIO, quantity
 from model.errors import InputError, expect_path, shown
 from model.fem import MITC4, Mesh, element_of
 from model.rig.actuator_keys import KINDS, stiff_mount_problems
-from model.rig.rig import SAME_POINT, Channel, Rig, canonical_json
+from model.rig.rig import SAME_POINT, Channel, Rig, canonical_json, physics_of
 from model.rig.sections import (
     ISOTROPIC,
     ORTHOTROPIC,
@@ -325,14 +326,14 @@ _BASE_KEYS = ("base", "base_fingerprint", "standard_errors")
 """Keys of a fitted rig beside those of a rig: they say what it differs from, and how surely."""
 
 _NAMED = ("eras", "supports", "amplifiers")  # sections whose entries a fit takes from the base
-_WIRING = ("amplifier", "channel")
 
 
 def with_base(document: Document) -> Document:
     """Merge a fitted rig's keys over those of the rig file that it names as its `base`.
 
     Another document is returned as it is. Raises ConfigError for a base that is missing, outside
-    the folder, fitted itself, or not as it was when it was fitted, and for names that it lacks.
+    the folder, fitted itself, invalid, or not as it was when it was fitted, and for names that it
+    lacks.
     """
     if "base" not in document.data or document.over is not None:
         return document
@@ -380,23 +381,15 @@ def own_keys(document: Document) -> dict[str, Value]:
 
 
 def base_fingerprint(base: Document) -> str:
-    """Sixteen digits that change with the plate, ERAs, masses and supports as a file states them.
+    """Sixteen digits that change with a rig's plate, ERAs, masses and supports.
 
-    Wiring, limits and thresholds may change: no fit depends on them.
+    Values count to twelve digits, in whatever unit a file states them. Wiring, limits and
+    thresholds may change: no fit depends on them. Raises ConfigError for an invalid rig.
     """
-    eras = base.data.get("eras")
-    own = {key: base.data.get(key) for key in ("plate", "masses", "supports")}
-    own["eras"] = (
-        eras
-        if not isinstance(eras, dict)
-        else {
-            name: {key: value for key, value in era.items() if key not in _WIRING}
-            if isinstance(era, dict)
-            else era
-            for name, era in eras.items()
-        }
-    )
-    return hashlib.sha256(canonical_json(own).encode()).hexdigest()[:16]
+    physics = physics_of(rig_of(base))
+    stated = canonical_json({key: physics[key] for key in ("plate", "eras", "masses")})
+    rounded = json.loads(stated, parse_float=lambda text: f"{float(text):.12g}")
+    return hashlib.sha256(canonical_json(rounded).encode()).hexdigest()[:16]
 
 
 def merged_keys(base: Value, over: Value, *, is_final: bool = True) -> Any:
@@ -445,12 +438,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
         check_is_rig(document)
     validation = Validation(document, RigSection)
     check_across(validation, mesh_given=mesh is not None)
-    try:
-        section = validation.finish()
-    except ConfigError:
-        if document.over is not None:
-            rig_of(read_document(base_path(document.over)), mesh=mesh)  # raises its own problems
-        raise
+    section = validation.finish()
     if mesh is not None:
         document = replace(document, text="", data=document.data | {"mesh": mesh}, lines={})
     plate = section.plate.made(frequency_max=section.limits.frequency[1])

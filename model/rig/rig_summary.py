@@ -368,12 +368,41 @@ def _check(document: Document) -> CheckedFile:
     return CheckedFile(_summary(rig) + line, [*warnings, *costs, *([note] if note else [])], more)
 
 
+_NEEDED = ("required", "oneOf", "dependentRequired", "minProperties")
+
+
+def _keys() -> dict[str, Any]:
+    """The JSON schema of a whole rig, and of a fitted one, which has what differs from its base."""
+    whole = RigSection.model_json_schema()
+    fitted = _partial(whole)
+    errors = {"type": "object", "description": "standard errors of values, by their keys"}
+    fitted["properties"] |= {"base": {"type": "string"}, "base_fingerprint": {"type": "string"}}
+    fitted["properties"]["standard_errors"] = errors
+    definitions = {**whole.pop("$defs"), "fitted": {"$defs": fitted.pop("$defs")}}
+    choice = {"if": {"required": ["base"]}, "then": fitted, "else": whole}
+    return {"$defs": definitions, "type": "object", **choice}
+
+
+def _partial(schema: Any) -> Any:
+    """A JSON schema of which nothing is needed, and where null leaves a key of the base out."""
+    if isinstance(schema, list):
+        return [_partial(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    found = {key: _partial(each) for key, each in schema.items() if key not in _NEEDED}
+    for key, each in found.get("properties", {}).items():
+        found["properties"][key] = {"anyOf": [each, {"type": "null"}]}
+    if "$ref" in found:
+        found["$ref"] = found["$ref"].replace("#/$defs", "#/$defs/fitted/$defs", 1)
+    return found
+
+
 RIG = ConfigKind(
     "A rig of era-haptics",
     recognises=lambda document: "plate" in document.data,
     check=_check,
     example_file=example_rig_path(),
-    keys=RigSection.model_json_schema,
+    keys=_keys,
 )
 
 

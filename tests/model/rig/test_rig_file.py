@@ -868,10 +868,17 @@ def test_what_a_fit_leaves_alone_is_that_of_the_base(tmp_path: Path) -> None:
 
 
 def test_a_base_may_be_wired_anew_but_not_built_anew(tmp_path: Path) -> None:
-    """URL, channels and limits of the base hold; another plate or ERA needs another fit."""
+    """URL, channels, limits and units of the base hold; another plate or ERA needs another fit."""
     *_, output = fitted(tmp_path, FLOW, other_values)
     base, text = tmp_path / "rig.yaml", FLOW.replace("sim://", "serial:///dev/ttyS9")
-    base.write_text(text.replace("channel: 2", "channel: 5"), "utf-8")
+    for one, other in (
+        ("2 mm", "0.002"),
+        ("[0.3, 0]", "[30 cm, 0 mm]"),
+        ("channel: 2", "channel: 5"),
+    ):
+        assert one in text
+        text = text.replace(one, other)
+    base.write_text(text, "utf-8")
     back = load_rig(output)
     assert back.amplifiers == {"m": "serial:///dev/ttyS9"}
     assert back.wiring["C"].number == 5

@@ -12,8 +12,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import jsonschema_rs
 import numpy as np
 import pytest
+import yaml
 
 import era_haptics
 import model
@@ -28,7 +30,7 @@ from model.reduction.free_plate import solve_free_plate
 from model.rig import sections
 from model.rig.actuator_keys import KINDS
 from model.rig.rig import Rig, differences
-from model.rig.rig_file import load_rig, parse_rig, rig_of
+from model.rig.rig_file import example_rig_path, load_rig, parse_rig, rig_of
 from model.rig.rig_summary import RIG, exciter_notes, excursion_notes, plate_summary
 from model.rig.rig_writing import stated as keys_of
 from model.rig.sections import PlateSection
@@ -410,6 +412,25 @@ def test_show_prints_exciters_and_what_they_reach(
     text = capsys.readouterr().out
     everywhere = "20 dB SL everywhere but 2 cm at the edges, under a finger"
     assert f"{everywhere}, by the board of the file: from 40 Hz" in text
+
+
+@pytest.mark.parametrize(
+    ("keys", "is_good"),
+    [
+        ({}, True),
+        ({"plate": {"length": 0.3}}, False),
+        ({"base": "rig.yaml", "base_fingerprint": "f0", "plate": {"thickness": 2e-3}}, True),
+        ({"base": "rig.yaml", "eras": {"SW": {"damping": 2.0, "damping_ratio": None}}}, True),
+        ({"base": "rig.yaml", "standard_errors": {"plate": {"thickness": 1e-5}}}, True),
+        ({"base": "rig.yaml", "plate": {"thickness": True}}, False),
+        ({"base": "rig.yaml", "eras": {"SW": {"stifness": 1.0}}}, False),
+        ({"base_fingerprint": "f0"}, False),
+    ],
+)
+def test_schema_knows_whole_rigs_and_fitted_ones(keys: dict[str, Any], is_good: bool) -> None:
+    """As a validator of another project reads it: the example, and what differs from a base."""
+    whole = {} if "base" in keys else yaml.safe_load(example_rig_path().read_text("utf-8"))
+    assert jsonschema_rs.is_valid(RIG.schema(), {**whole, **keys}) == is_good
 
 
 def test_config_check_warns_and_the_schema_knows_both_kinds() -> None:

@@ -197,9 +197,7 @@ def fit(
     low, high = space.lower[own], space.upper[own]
     mean, root = np.zeros(int(own.sum())), np.eye(int(own.sum()))
     if prior is not None:
-        mean, covariance = prior[0][own], prior[1][np.ix_(own, own)]
-        variances, axes = linalg.eigh(covariance)
-        root = (axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))).T
+        mean, root = prior[0][own], _inverse_root(prior[1][np.ix_(own, own)])
     last: dict[bytes, Fit] = {}
 
     def at(y: FloatArray) -> Fit:
@@ -232,6 +230,12 @@ def fit(
         xtol=_CONVERGED,
     )
     return replace(at(best.x), cost=float(best.cost))
+
+
+def _inverse_root(covariance: FloatArray) -> FloatArray:
+    """Matrix R (q, q) with R^T R = C^-1 of a covariance C, whose variances may be tiny."""
+    variances, axes = linalg.eigh(covariance)
+    return np.asarray((axes / np.sqrt(np.maximum(variances, _MIN_VARIANCE * variances[-1]))).T)
 
 
 def _linearised(

@@ -144,7 +144,6 @@ def check_rows(calibration: Calibration) -> list[str]:
 def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
     """All results for programs, units in the keys or beside the values."""
     held_out = calibration.held_out
-    frequencies = calibration.frequencies
     return {
         "parameters": [
             {
@@ -161,19 +160,7 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             }
             for fitted in calibration.parameters
         ],
-        "gains": {
-            era.name: {
-                "frequency_hz": [row[0] for row in era.gains],
-                "magnitude": [row[1] for row in era.gains],
-                "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
-                "standard_error": [
-                    float(error)
-                    for error in calibration.gains_error[:, number]
-                    if np.isfinite(error)
-                ],
-            }
-            for number, era in enumerate(calibration.rig.eras)
-        },
+        "gains": _gains_json(calibration),
         "moved_eras": [
             {
                 "era": name,
@@ -192,7 +179,7 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
             for name, (scale, error) in calibration.scales.items()
         },
         "sensors": list(calibration.sensors),
-        "drive_frequencies_hz": frequencies.tolist(),
+        "drive_frequencies_hz": calibration.frequencies.tolist(),
         "values": calibration.value_count,
         "outliers": calibration.outlier_count,
         "fit_error": calibration.error,
@@ -208,6 +195,19 @@ def calibration_json(calibration: Calibration, before: Rig) -> dict[str, Any]:
         "good": calibration.is_good,
         "fingerprint_before": before.fingerprint,
         "fingerprint_after": calibration.rig.fingerprint,
+    }
+
+
+def _gains_json(calibration: Calibration) -> dict[str, Any]:
+    """Gains of each ERA of the rig by its name."""
+    return {
+        era.name: {
+            "frequency_hz": [row[0] for row in era.gains],
+            "magnitude": [row[1] for row in era.gains],
+            "phase_deg": np.degrees([row[2] for row in era.gains]).tolist(),
+            "standard_error": errors[np.isfinite(errors)].tolist(),
+        }
+        for era, errors in zip(calibration.rig.eras, calibration.gains_error.T, strict=True)
     }
 
 

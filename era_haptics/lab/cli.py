@@ -1,6 +1,6 @@
 """The lab's share of the `era` command: to measure, judge, design, check and report.
 
-`era report` collects what a bug report needs in one file; `era figure` draws the founding paper's
+`era report` collects what a bug report needs in one folder; `era figure` draws the founding paper's
 figures.
 """
 
@@ -34,26 +34,26 @@ def report(
         list[Path] | None,
         typer.Argument(metavar="[CONFIG]...", help="Rig, layout and daemon files to include."),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="File to write.")] = Path(
-        "era-report.zip"
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to make.")] = Path(
+        "era-report"
     ),
     socket: Annotated[
         Path | None, typer.Option("--socket", help="Socket of the daemon; default: the usual path.")
     ] = None,
 ) -> None:
-    """Collect versions, files and daemon state for a bug report.
+    """Collect versions, files, daemon state and the end of its log in a folder for a bug report.
 
     Values of unknown keys, hosts, serial numbers and comments are hidden; look before you send it.
     """
 
-    from era_haptics.lab.report import collect, write_zip
+    from era_haptics.lab.report import collect, write_report
 
     for path in configs or ():
         if not path.exists():
             raise InputError(f"{path}: no such file; check its name and folder")
     home = Path(os.path.expanduser("~"))  # noqa: PTH111  Path.home raises where there is none
     collected = collect(configs or [], socket=socket, home=home)
-    write_zip(output, collected)
+    write_report(output, collected)
     for name, text in collected.files.items():
         print(f"  {name}: {len(text)} characters")
     for what in collected.missing:

@@ -113,7 +113,7 @@ WRITING = {
     "design rig.yaml -o design --layouts random:2": (
         "era_haptics.lab.design.design_run.rank_layouts"
     ),
-    "report rig.yaml -o out.zip": "era_haptics.lab.report.collect",
+    "report rig.yaml -o reported": "era_haptics.lab.report.collect",
 }
 """Commands that write a file, or several into a folder, each with its slow function."""
 

@@ -4,13 +4,12 @@ import json
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 import yaml
 
-from era_haptics.lab.report import MAX_DUMPS, collect, shown, versions
+from era_haptics.lab.report import MAX_DUMPS, MAX_FILE_SIZE, collect, shown, versions
 from model.rig.rig_file import example_rig_path
 
 HOME = Path("/home/user")
@@ -36,13 +35,17 @@ def test_report_hides_values_of_unknown_keys(text: str, expected: str) -> None:
     assert shown(text, home=HOME).rstrip() == expected
 
 
-def test_dump_shows_fields_of_messages() -> None:
-    """State and fault of a status, not the serial number of an identity or an unknown key."""
+def test_records_are_shown_but_for_secrets() -> None:
+    """State, fault and message, not a serial number, and neither a host nor a home in free text."""
     line = (
-        '{"link": "main", "content": {"state": 7, "fault": 1, "serial_number": "A-17", "pin": 4}}'
+        '"state": 7, "serial_number": "A-17", "access_token": 4, '
+        '"cause": "no tcp://me:1@amp # {}/x"'
     )
-    kept = shown(line, home=HOME, is_dump=True)
-    assert kept == line.replace('"A-17"', "hidden").replace('"pin": 4', '"pin": hidden')
+    kept = shown(line.replace("{}", str(HOME)), home=HOME, is_recorded=True)
+    assert kept == (
+        '"state": 7, "serial_number": hidden, "access_token": hidden, '
+        '"cause": "no tcp://hidden # ~/x"'
+    )
 
 
 def test_example_rig_is_shown_without_its_comments() -> None:
@@ -53,12 +56,15 @@ def test_example_rig_is_shown_without_its_comments() -> None:
 
 @pytest.mark.parametrize("given", [["d.yaml"], ["rig.yaml", "d.yaml"]])
 def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> None:
-    """Its rig, layout and last dumps once, but no table or other files; missing ones are listed."""
+    """Its rig, layout, log and last dumps once, and no table; missing files are listed."""
     (tmp_path / "rig.yaml").write_text(example_rig_path().read_text("utf-8"), "utf-8")
     (tmp_path / "d.yaml").write_text(
-        "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\ndumps: {folder: dumps}\n",
+        "rig: rig.yaml\nlayouts: {panel: none.yaml}\ntable: t.npz\ndumps: {folder: dumps}\n"
+        "log: {file: era.out}\n",
         "utf-8",
     )
+    begun = "x" * MAX_FILE_SIZE
+    (tmp_path / "era.out").write_text(f'{begun}\n{{"message": "link main: lost"}}\n', "utf-8")
     (tmp_path / "t.npz").write_bytes(b"x" * 100)
     (tmp_path / "dumps").mkdir()
     for number in range(MAX_DUMPS + 2):
@@ -66,7 +72,10 @@ def test_report_includes_files_of_daemon(tmp_path: Path, given: list[str]) -> No
     (tmp_path / "dumps" / "other.txt").write_text("x", "utf-8")
     report = collect([tmp_path / name for name in given], socket=tmp_path / "no.sock", home=HOME)
     dumps = [f"era-fault-2026-{number}.jsonl" for number in range(2, MAX_DUMPS + 2)]
-    assert set(report.files) == {"d.yaml", "rig.yaml", *dumps, "versions.json"}
+    assert set(report.files) == {"d.yaml", "rig.yaml", "era.out", *dumps, "versions.json"}
+    log = report.files["era.out"]
+    assert len(log) == MAX_FILE_SIZE
+    assert log.endswith('x\n{"message": "link main: lost"}\n')
     layout, daemon = report.missing
     assert "none.yaml" in layout
     assert "daemon" in daemon
@@ -94,26 +103,6 @@ def test_versions_list_packages_of_plug_ins(
     }
 
 
-def test_versions_list_what_requirements_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The valid requirements of PEP 508's own list, whatever follows the name."""
-    lines = [
-        "A",
-        "A.B-C_D",
-        "aa",
-        "name",
-        "name<=1",
-        "name>=3,<2",
-        "name@http://foo.com",
-        "name [fred,bar] @ http://foo.com ; python_version=='2.7'",
-        "name;os_name=='a'",
-        "numpy >=2 ; extra == 'x'",
-    ]
-    monkeypatch.setattr("era_haptics.lab.report.requires", lambda _: lines)
-    packages = versions()["packages"]
-    assert packages.pop("numpy")[0].isdigit()
-    assert packages == dict.fromkeys(["A", "A.B-C_D", "aa", "name"], "not installed")
-
-
 def test_report_includes_invalid_files(tmp_path: Path) -> None:
     """An invalid file may be the subject: it is included, shown like any other, and listed once."""
     (tmp_path / "broken.yaml").write_text("rig: [\napi_token: abc\n\tx", "utf-8")
@@ -125,13 +114,16 @@ def test_report_includes_invalid_files(tmp_path: Path) -> None:
     assert [sum(path.name in each for each in report.missing) for path in files] == [1, 1, 1]
 
 
-def test_report_command_writes_new_file_for_owner_only(tmp_path: Path) -> None:
-    """And no other file."""
+def test_report_command_writes_new_folder_for_owner_only(tmp_path: Path) -> None:
+    """And no other file; a folder that is there is left as it is."""
     era = Path(sys.executable).with_name("era")
-    command = [str(era), "report", "-o", "r.zip", "--socket", "no.sock"]
+    command = [str(era), "report", "-o", "r", "--socket", "no.sock"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert (tmp_path / "r.zip").stat().st_mode & 0o777 == 0o600
-    with zipfile.ZipFile(tmp_path / "r.zip") as archive:
-        assert set(archive.namelist()) == {"versions.json", "missing.txt"}
-    assert os.listdir(tmp_path) == ["r.zip"]  # noqa: PTH208
+    assert (tmp_path / "r").stat().st_mode & 0o777 == 0o700
+    assert set(os.listdir(tmp_path / "r")) == {"versions.json", "missing.txt"}  # noqa: PTH208
+    assert os.listdir(tmp_path) == ["r"]  # noqa: PTH208
+    (tmp_path / "r" / "missing.txt").write_text("mine", "utf-8")
+    again = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert (tmp_path / "r" / "missing.txt").read_text("utf-8") == "mine"

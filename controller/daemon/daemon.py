@@ -116,7 +116,7 @@ class Daemon:
             layouts=self._layouts,
             inputs=lambda: self._inputs.event,
             learning=lambda: self.learning,
-            noted=self._dumps.decisions.append,
+            noted=self._dumps.note,
         )
         self.learning: Learning | None = None
         """What learns the plate, if anything is to be learned."""

@@ -1,7 +1,7 @@
 """Fault dumps: what happened last before the plate was stopped, as files of JSON lines.
 
 Messages of the amplifiers, calls of clients, decisions of the control loop and transitions are kept
-unformatted; a thread writes them, since a disk may be slow or gone.
+unformatted in one ring; a thread writes them, since a disk may be slow or gone.
 """
 
 import json
@@ -10,7 +10,6 @@ import math
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -27,10 +26,7 @@ DUMP_PATTERN = "era-fault-*.jsonl"
 """File names of dumps of faults and losses; those of stops have `stop` for `fault`."""
 
 MAX_DUMPS = 20  # files of a kind in a folder; the oldest are deleted
-MAX_RECORDS = 400  # over all lines: the last seconds under load, ten seconds at rest
-MAX_REQUESTS = 60  # methods of clients
-MAX_DECISIONS = 200  # the last second of many moving fingers
-_MAX_TRANSITIONS = 20
+MAX_RECORDS = 700  # of all kinds: the last seconds under load, ten seconds at rest
 MAX_LINE = 8192  # characters; a longer record is left out, and says so
 _MAX_TEXT = 400  # characters of a cause
 _MIN_INTERVAL = 1.0  # s; one dump for faults that come together
@@ -47,14 +43,17 @@ class FaultDumps:
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
-        self.records: deque[Mapping[str, object]] = deque(maxlen=MAX_RECORDS)
-        """Messages of the amplifiers."""
-        self.decisions: deque[Mapping[str, object]] = deque(maxlen=MAX_DECISIONS)
-        """Decisions of the control loop."""
-        self._requests: dict[tuple[str, str], dict[str, Any]] = {}  # by client and method
-        self._transitions: deque[Mapping[str, object]] = deque(maxlen=_MAX_TRANSITIONS)
+        self._ring: dict[object, Mapping[str, Any]] = {}  # by client and method, or by number
+        self._count = 0
         self._written_at = dict.fromkeys(("fault", "stop"), -math.inf)
         self._writer: threading.Thread | None = None
+
+    def note(self, record: Mapping[str, Any], key: object = None) -> None:
+        """Keep a record, which has `time_s`, in place of the one of the same key, if it has one."""
+        self._count += 1
+        self._ring[self._count if key is None else key] = record
+        if len(self._ring) > MAX_RECORDS:
+            del self._ring[next(iter(self._ring))]
 
     def follow(self, amplifiers: Mapping[str, Amplifier]) -> None:
         """Record from now on the messages of amplifiers, by name, unless there is no folder."""
@@ -78,7 +77,7 @@ class FaultDumps:
         """Record a message of an amplifier or line; never raises, since stops pass here."""
         try:
             where = {"time_s": threads.now(), "link": names.get(address, line)}
-            self.records.append({**where, "way": way, "message": message, "content": content})
+            self.note({**where, "way": way, "message": message, "content": content})
         except Exception:
             _logger.exception("recorder failed")
 
@@ -89,8 +88,8 @@ class FaultDumps:
         that endless repetition does not displace other requests. Parameters, such as a lease, are
         not kept.
         """
-        before = self._requests.pop((client, method), {"times": 0, "refused": ""})
-        record = self._requests[client, method] = {
+        before = self._ring.pop((client, method), {"times": 0, "refused": ""})
+        record = {
             "time_s": at,
             "request": method or "not read",
             "client": client,
@@ -98,15 +97,14 @@ class FaultDumps:
             "outcome": "not replied yet",
             "refused": before["refused"],
         }
-        if len(self._requests) > MAX_REQUESTS:
-            del self._requests[next(iter(self._requests))]
+        self.note(record, (client, method))
         return record
 
     def state_changed(self, old: Operation, new: Operation) -> None:
         """Write a dump at a fault, a loss, or a stop of an armed plate, once a second at most."""
         now, folder, kind = threads.now(), self._folder, "fault"
         change = {"time_s": now, "state": f"{old.state} -> {new.state}", "cause": new.cause}
-        self._transitions.append(change)
+        self.note(change)
         if new.state is DaemonState.QUICK_STOP_ACTIVE and old.state in ENERGISED:
             kind = "stop"
         elif new.state not in _DUMPED:
@@ -117,8 +115,7 @@ class FaultDumps:
         if self._writer is not None and self._writer.is_alive():
             _logger.warning("dump in %s skipped: previous dump still being written", folder)
             return
-        requests = map(dict, self._requests.values())  # whose outcome may come meanwhile
-        records = [*self.records, *requests, *self.decisions, *self._transitions]
+        records = [*map(dict, self._ring.values())]  # a request's outcome may come meanwhile
 
         def write() -> None:
             try:

@@ -7,7 +7,6 @@ import logging
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -268,15 +267,14 @@ def test_latency_percentiles_are_values_that_occurred() -> None:
 async def test_failing_recorder_prevents_no_stop(tmp_path: Path) -> None:
     """The wire gets the Stop, and the caller its outcome."""
 
-    class Full(deque[Mapping[str, object]]):
-        def append(self, record: Mapping[str, object]) -> None:
-            raise MemoryError
+    def fail(record: Mapping[str, object]) -> None:
+        raise MemoryError
 
     recorder = FaultDumps(tmp_path)
     async with set_chain(connected=recorder.follow) as chain:
         await chain.open()
-        assert recorder.records
-        recorder.records = Full()
+        assert recorder._ring
+        vars(recorder)["note"] = fail
         assert (await chain.controller.stop())["main"].is_confirmed
         assert chain.far_end.requests("Stop")
         await chain.close()

@@ -28,10 +28,8 @@ from controller.cli.main import BAD_INPUT, run
 from controller.demo.demonstration import layout_of_people
 from controller.effects.strengths import MAX_NAMES
 from controller.operation.fault_dumps import (
-    MAX_DECISIONS,
     MAX_LINE,
     MAX_RECORDS,
-    MAX_REQUESTS,
     FaultDumps,
     write_dump,
 )
@@ -145,15 +143,15 @@ def test_what_is_kept_for_a_dump_is_bounded(tmp_path: Path) -> None:
     """Whatever comes, in number and in length; a client that repeats itself leaves the others."""
     dumps, long = FaultDumps(tmp_path), "x" * 70_000
     dumps.requested("other", "arm", 0.0)
-    for _ in range(10 * MAX_REQUESTS):
+    for _ in range(10 * MAX_RECORDS):
         dumps.requested("me", "touch", 1.0)["outcome"] = long
-    assert [each["times"] for each in dumps._requests.values()] == [1, 10 * MAX_REQUESTS]
-    for number in range(10 * MAX_RECORDS):
+    assert [each["times"] for each in dumps._ring.values()] == [1, 10 * MAX_RECORDS]
+    for number in range(MAX_RECORDS):
         dumps.requested(f"client {number}", "stop", 2.0)
-        dumps.records.append({"time_s": 2.0, "message": long})
-        dumps.decisions.append({"time_s": math.inf, "contacts": [long]})
-    kept = [*dumps.records, *dumps._requests.values(), *dumps.decisions]
-    assert len(kept) <= MAX_RECORDS + MAX_REQUESTS + MAX_DECISIONS
+        dumps.note({"time_s": 2.0, "message": long})
+        dumps.note({"time_s": math.inf, "contacts": [long]})
+    kept = [*dumps._ring.values()]
+    assert len(kept) == MAX_RECORDS
     lines = write_dump(tmp_path, kept, cause="").read_text("utf-8").splitlines()
     assert max(map(len, lines)) <= MAX_LINE
     assert "Infinity" not in "".join(lines)

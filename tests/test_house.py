@@ -36,6 +36,7 @@ def imported(file: Path) -> set[str]:
     return names
 
 
+@pytest.mark.long
 def test_no_circle_of_programs() -> None:
     """Modules of one name in several folders count as one: none of them is in a circle either."""
     graph: dict[str, set[str]] = {}

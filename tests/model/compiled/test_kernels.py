@@ -119,6 +119,7 @@ def test_library_unsafe_or_not_whole_is_compiled_again(folder: Path) -> None:
     assert seven(folder) == 8
 
 
+@pytest.mark.long
 def test_folder_in_which_others_write_is_not_used(folder: Path) -> None:
     """Neither the folder nor one above it, unless it is sticky as /tmp; no library is left."""
     assert seven(folder) == 7
@@ -133,6 +134,7 @@ def test_folder_in_which_others_write_is_not_used(folder: Path) -> None:
     assert seven(folder) == 8
 
 
+@pytest.mark.long
 def test_link_in_a_folder_of_others_is_not_followed(folder: Path) -> None:
     """They could lead it to any library that the user keeps; one of the user's own is followed."""
     kept = folder.parents[1] / "kept"

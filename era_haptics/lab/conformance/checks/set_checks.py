@@ -539,7 +539,8 @@ def sets_expire(subject: Subject) -> Rows:
     ]
 
 
-_AROUND, _NEAR = 0.015, 0.0005  # s; of a moment, in which statuses are dense; that may be either
+# s; of a moment, in which statuses are dense; that may be either: levels of 0.2 ms before, a sample
+_AROUND, _NEAR = 0.015, 0.0003
 _SLOWEST, _FASTEST = QUANTITIES["rate"].minimum, QUANTITIES["rate"].maximum
 _STAGING_LONG, _BEHIND = (
     0.2,

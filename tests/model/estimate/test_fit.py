@@ -53,8 +53,8 @@ def measured(rig: Rig) -> ComplexArray:
 def fit_a_rig() -> None:
     """Search with gains free, and with a prior that holds the mean of all scales."""
     plate = sensed_plate(RIG, sensors_at(POINTS), FREQUENCIES, has_form=True)
-    places = sensors_at(POINTS, NAMES)
-    measurement = Measurement(places, FREQUENCIES, measured(RIG).swapaxes(1, 2))
+    values = measured(RIG).swapaxes(1, 2)
+    measurement = Measurement(sensors_at(POINTS, NAMES), FREQUENCIES, values)
     space, count = plate.model.space, len(POINTS)
     covariance, own = np.eye(space.size), np.arange(space.size)[space.groups["sensor_scale"]]
     covariance[np.ix_(own, own)] += 1e2 * (np.eye(count) - 1 / count)
@@ -167,8 +167,7 @@ def _mounted(rig: Rig, *, stiffness: float, damping: float, mass: float) -> Rig:
 def test_responses_are_those_of_a_new_solve(solved, other, within):
     """Relative L2 over frequencies, ERAs and points; shear and rotary inertia limit thickness."""
     found = solved.of(other).responses()
-    places = solved.model.sensors
-    exact = sensed_plate(other, places, SENSED_PLATE_FREQUENCIES).responses()
+    exact = sensed_plate(other, solved.model.sensors, SENSED_PLATE_FREQUENCIES).responses()
     assert np.linalg.norm(found - exact) / np.linalg.norm(exact) < within
 
 

@@ -413,15 +413,14 @@ def test_responses_per_volt_are_of_exciters(responses, coarse_rig, tmp_path, end
     )
     rig = replace(coarse_rig, eras=exciters)
     path = tmp_path / f"measured.{ending}"
-    masses = (2e-3, 2e-3, 1.5e-3)
-    weighed = with_masses(responses, masses)
+    weighed = with_masses(responses, (2e-3, 2e-3, 1.5e-3))
     WRITERS[ending](path, weighed, rig, setting="level 0.1, rig 1a2b3c4d")
     measured = read_measured(path)
     assert {each.setting for each in measured} == {"level 0.1, rig 1a2b3c4d"}
     back = measurement_of(measured, rig)
     order = [back.names.index(name) for name in responses.names]
     np.testing.assert_allclose(back.values[:, order], responses.values, rtol=1e-11)
-    np.testing.assert_allclose([back.sensors[n].mass for n in order], masses)
+    assert [back.sensors[n].mass for n in order] == pytest.approx([2e-3, 2e-3, 1.5e-3])
     with pytest.raises(InputError, match=f"measured.{ending}.*per displacement of the base"):
         measurement_of(measured, coarse_rig)
 

@@ -31,8 +31,8 @@ from benchmarks.promise.heard import STRONGEST, Heard, Log, Span
 from benchmarks.setting import random_contacts, support
 from controller.play.intent import HapticIntent, Target
 from controller.play.layer_contents import Prediction
-from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.planner import PlayReport
+from controller.play.slots import CROSSFADE, FALL_AFTER
 from model.answer.answer_report import Timing
 from model.finger import FINGERTIP_RADIUS
 from registry import threads

@@ -24,8 +24,9 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from controller.play.layer_contents import LayerContent, Prediction
+from controller.play.layer_contents import Prediction
 from controller.play.planner import Observers, PlayReport, SilenceReport
+from controller.play.slots import Slot
 from controller.process.child import ended
 from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
@@ -598,7 +599,7 @@ def _significance(pattern: _PlayedPattern) -> tuple[int, float, float]:
     return len(applied.contents), min(pattern.duration, STEADY_DURATION), applied.time
 
 
-def _content_of(felt: Prediction, applied: PlayReport) -> LayerContent:
+def _content_of(felt: Prediction, applied: PlayReport) -> Slot:
     """What plays for a finger, its own or the one that it shares."""
     return next(
         played

@@ -11,9 +11,9 @@ from contextlib import suppress
 from typing import Any, ParamSpec
 
 from controller.play.intent import IntentSource
-from controller.play.layers import RELEASE_RAMP
 from controller.play.planner import Observers, Plan, Planner, play_report, silence_report
 from controller.play.routing import limits_of, playback_capabilities
+from controller.play.slots import RELEASE_RAMP
 from controller.sources.touch import Change, ContactTracker, RejectCounter, TouchFrame
 from drivers.errors import (
     CommandError,
@@ -164,7 +164,7 @@ class Cycle:
         try:
             if sets.silence is not None:
                 sent_at = await self.group.silence(sets.silence)
-                planner.layers.may_play = frozenset()
+                planner.slots.may_play = frozenset()
                 return sent_at
             if self.group.sets.is_in_doubt:
                 await self.group.silence(RELEASE_RAMP)  # before the next pattern
@@ -212,7 +212,7 @@ class Cycle:
             raise CommandError("controller must be open; call open() first")
         self._is_armed_anew = True
         if not was_armed:
-            self.planner.layers.may_play = frozenset()
+            self.planner.slots.may_play = frozenset()
         self.planner.replace_limits(limits)
         self._schedule_expiry()  # fingers may have rested since before
         self.feed_at_once()
@@ -287,7 +287,7 @@ class Cycle:
         """Report what plays after a plan, or silence; sent_at [s]: None if nothing was sent."""
         now = threads.now()
         if plan.selection.contents and plan.sets.silence is None:
-            playing, timing = planner.layers.contents, planner.timing
+            playing, timing = planner.slots.contents, planner.slots.timing
             applied = play_report(plan, playing, sent_at=sent_at, now=now, timing=timing)
             _report(self.observers.pattern_applied, applied)
             return
@@ -304,7 +304,7 @@ class Cycle:
             until = min(until, self.planner.due)
         if self.group.is_armed:
             until = min(until, self._heartbeat_due, self.group.members.lost_from)
-            if self.planner is not None and now < (due := self.planner.layers.ending_due):
+            if self.planner is not None and now < (due := self.planner.slots.ending_due):
                 until = min(until, due)
         pause = max(0.0, until - now)
         timer = asyncio.get_running_loop().call_later(pause, self._wake.set)

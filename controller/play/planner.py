@@ -9,19 +9,18 @@ import logging
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 from controller.play.intent import IntentSource, Pulse
 from controller.play.layer_contents import (
-    LayerContent,
     Prediction,
     Selection,
     no_layer_free,
     not_served,
 )
-from controller.play.layers import RELEASE_RAMP, RETRY, Check, Layers, Sets
 from controller.play.routing import CountedClocks, Drive, PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
+from controller.play.slots import RELEASE_RAMP, RETRY, Check, Sets, Slot, Slots
 from controller.sources.touch import Change, Contact, ContactKey, ContactTracker
 from drivers.errors import CommandRefused
 from drivers.host.joint_sets import PlayedSet
@@ -101,16 +100,14 @@ class Planner:
         self.capabilities = capabilities
         """The capabilities of the amplifiers together."""
         self._tracker, self._intent_source = tracker, intent_source
-        self.timing = timing
-        """Shapes the patterns of the table."""
-        self.layers = Layers(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
-        """The layers of the amplifiers."""
+        self.slots = Slots(rig, capabilities, timing, check=check, expiry_of=tracker.expiry_of)
+        """What each layer plays."""
         self.clocks = CountedClocks(rig, clock_errors)
         """The clock errors of the amplifiers, as answers count them."""
         self._selector = Selector(
-            Chooser(table, self.layers.builder.shape),
+            Chooser(table, partial(capabilities.envelope_support.shape, timing)),
             arrived=self._note_answer,
-            may_lead=self.layers.may_lead,
+            may_lead=self.slots.may_lead,
         )
         self._selected: Selection | None = None  # the last, before limits left contents out of it
         self._unplayed: Mapping[ContactKey | None, float] = {}  # answered by what was refused
@@ -127,9 +124,9 @@ class Planner:
 
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays is kept until all rest."""
-        self.timing, layers = timing, self.layers
-        layers.builder = replace(layers.builder, timing=timing)
-        self._answer_by(Chooser(self.clocks.counted_by(table), layers.builder.shape))
+        self.slots.timing = timing
+        shape = partial(self.capabilities.envelope_support.shape, timing)
+        self._answer_by(Chooser(self.clocks.counted_by(table), shape))
 
     def replace_limits(self, limits: Limits) -> None:
         """Answer within other limits from now on: an amplifier was identified again."""
@@ -152,7 +149,7 @@ class Planner:
         """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""
         selector = self._selector
         selector.chooser = chooser
-        if at_once or not (self.layers.may_play or selector.is_choosing):
+        if at_once or not (self.slots.may_play or selector.is_choosing):
             selector.choose_anew()
         self.look_again()
 
@@ -162,7 +159,7 @@ class Planner:
         The table without clock errors, by which statuses say what leaks, shares all of that with
         the one with them. Raises InputError for a table without a pattern for these amplifiers.
         """
-        mode, timing = self.capabilities.drive_mode, self.timing
+        mode, timing = self.capabilities.drive_mode, self.slots.timing
         prepare_answers(self._selector.chooser.table, mode)
         self._count_clocks()
         table = self._selector.chooser.table
@@ -191,7 +188,7 @@ class Planner:
     @property
     def is_silence_pending(self) -> bool:
         """Whether the last contact has lifted and silence has not been commanded yet."""
-        return not self._tracker.contacts and not self.layers.is_silent
+        return not self._tracker.contacts and not self.slots.is_silent
 
     def note_lifts(self, up: Sequence[Contact]) -> None:
         """Note that contacts have lifted."""
@@ -206,7 +203,7 @@ class Planner:
     def forget(self) -> None:
         """Discard the known playback: the next plan has a set; fingers keep their layers."""
         self._plan, self._retry_at = None, math.inf
-        self.layers.forget()
+        self.slots.forget()
 
     def not_played(self, plan: Plan) -> None:
         """Discard what plays, since a plan has not been played; its fingers wait for the next."""
@@ -236,27 +233,27 @@ class Planner:
                     self._too_late(1)
                 pulse.started_at = played.starts_at
                 self._intent_due = min(self._intent_due, pulse.end)
-        self.layers.confirm(sets, played, now)
+        self.slots.confirm(sets, played, now)
 
     def refused(self, plan: Plan, refusal: CommandRefused, *, now: float) -> Plan:
         """Return silence in place of a plan that amplifiers refused though the ledgers admit it.
 
         It is planned again when the refusal ends, or after RETRY where that is unknown.
         """
-        if not plan.is_reported and self.layers.contents:
-            self.layers.not_renewed(plan.sets, refusal)
+        if not plan.is_reported and self.slots.contents:
+            self.slots.not_renewed(plan.sets, refusal)
             return replace(plan, sets=Sets())
         if refusal.until is None or refusal.until > now:  # not of a wire that is too slow or busy
             self._awaited.clear()
         until = now + RETRY if refusal.until is None else refusal.until
         self._retry_at = max(until, now + HEARTBEAT)
         self._unplayed = plan.answered
-        silence = replace(self.layers.silence(FADE_RAMP, now), reason=str(refusal))
+        silence = replace(self.slots.silence(FADE_RAMP, now), reason=str(refusal))
         return replace(plan, sets=silence, is_reported=True)
 
     def plan(self, now: float) -> Plan | None:
         """Plan at a time [s], for the contacts as of `expire`; None if nothing changes."""
-        for each in self.layers.contents.values():
+        for each in self.slots.contents.values():
             if each.drive:
                 self._played_until = now
         for number, pulse in [*self._awaited.items()]:
@@ -288,7 +285,7 @@ class Planner:
                 self._unplayed = {}
             selection, sets = self._playable(selected), Sets()
             if is_felt := len(selection.contents) > 0:
-                sets = self.layers.plan(selection.contents, now)
+                sets = self.slots.plan(selection.contents, now)
                 if sets.skipped:
                     selection = selection.without(sets.skipped, sets.reason)
         except Exception as error:
@@ -299,7 +296,7 @@ class Planner:
                 return None
             _logger.exception("loop: plan failed, silencing all channels")
         self._retry_at, self._selected = sets.retry_at, selected
-        is_awaited = not is_felt and selected.is_pending and not self.layers.may_play
+        is_awaited = not is_felt and selected.is_pending and not self.slots.may_play
         if not (is_felt or is_awaited):
             sets = self._end(contacts, now, has_failed=has_failed)
         for pulse in self._pulses(sets.started):
@@ -313,13 +310,13 @@ class Planner:
 
     def _go_on(self, plan: Plan, now: float) -> Plan | None:
         """Plan what is due where nothing changes: contents have ended or are to be prolonged."""
-        if now < self.layers.due:
+        if now < self.slots.due:
             return None
-        if contents := self.layers.ended(now):
+        if contents := self.slots.ended(now):
             selection = plan.selection.without(contents, ENDED)
             self._plan = replace(plan, selection=selection, sets=Sets(), made_at=now, answered={})
             return self._plan
-        renewal = self.layers.renewal(now)
+        renewal = self.slots.renewal(now)
         return replace(plan, sets=renewal, is_reported=False) if renewal else None
 
     def _note_answer(self) -> None:
@@ -328,11 +325,11 @@ class Planner:
 
     def _playable(self, selection: Selection) -> Selection:
         """Return a selection without what has ended by itself, and what has no layer."""
-        if over := self.layers.over_of(selection.contents):
+        if over := self.slots.over_of(selection.contents):
             selection = selection.without(over, ENDED)
         count = self.capabilities.layers
         if len(selection.contents) > count:  # of each content all voices have one, or none
-            served = [*self.layers.numbered(selection.contents).values()]
+            served = [*self.slots.numbered(selection.contents).values()]
             lacking = [each.targets for each in selection.contents if each not in served]
             left = [each for each in selection.contents if each.targets in lacking]
             selection = selection.without(left, no_layer_free(count))
@@ -341,10 +338,10 @@ class Planner:
     def _end(self, contacts: tuple[Contact, ...], now: float, *, has_failed: bool) -> Sets:
         """Return the sets that end all that plays; along endings only under fingers that stay."""
         if not contacts:
-            return self.layers.silence(RELEASE_RAMP, now)
-        if has_failed or not self.layers.have_settled(now):
-            return self.layers.silence(FADE_RAMP, now)
-        return self.layers.plan((), now)
+            return self.slots.silence(RELEASE_RAMP, now)
+        if has_failed or not self.slots.have_settled(now):
+            return self.slots.silence(FADE_RAMP, now)
+        return self.slots.plan((), now)
 
     def _answered(self, started: Collection[int]) -> dict[ContactKey | None, float]:
         """Return when [s] the fingers changed that are answered; None: the first that lifted.
@@ -360,7 +357,7 @@ class Planner:
         else:
             keys, lasts = set[ContactKey | None]([None]), False
             for number in started:
-                for contact, target in self.layers.contents[number].content.targets:
+                for contact, target in self.slots.contents[number].content.targets:
                     lasts = lasts or not target.is_short
                     keys |= {contact.key} if target.is_short else set()
             answered = {key: at for key, at in answered.items() if key in keys}
@@ -378,7 +375,7 @@ class Planner:
         """Return the pulses that play in layers."""
         pulses = []
         for number in numbers:
-            for _, target in self.layers.contents[number].content.targets:
+            for _, target in self.slots.contents[number].content.targets:
                 if target.pulse is not None:
                     pulses.append(target.pulse)
         return pulses
@@ -400,8 +397,8 @@ class PlayReport:
     quiet: tuple[Contact, ...]
     quiet_levels: Mapping[ContactKey, Sequence[float]]
     """Foreign levels at quiet contacts (`Selection.foreign_levels`)."""
-    contents: Mapping[int, LayerContent]
-    """Contents as they are played, by layer, the newest one last."""
+    contents: Mapping[int, Slot]
+    """Copies of the slots as they are played, by layer, the newest one last."""
     latency: float | None
     """Time [s] from the touch frame to the last byte of the command; None if none was needed."""
     time: float
@@ -417,7 +414,7 @@ class PlayReport:
     timing: Timing = field(repr=False, compare=False)
 
     @property
-    def newest(self) -> LayerContent:
+    def newest(self) -> Slot:
         """The content that changed last."""
         return [*self.contents.values()][-1]
 
@@ -473,7 +470,7 @@ class SilenceReport:
 
 def play_report(
     plan: Plan,
-    playing: Mapping[int, LayerContent],
+    playing: Mapping[int, Slot],
     *,
     sent_at: float | None,
     now: float,
@@ -492,7 +489,7 @@ def play_report(
         quiet_levels={
             each.key: selection.foreign_levels.get(each.key, ()) for each in selection.quiet
         },
-        contents={number: playing[number] for number in order},
+        contents={number: replace(playing[number]) for number in order},
         latency=None if sent_at is None else sent_at - plan.since,
         time=now if sent_at is None else sent_at,
         from_rest=plan.from_rest,

@@ -36,7 +36,7 @@ from model import vibration as physics
 from model.answer import answer, stimulus
 from model.answer.answer import Limits, amplitudes_of
 from model.answer.answer_report import Timing
-from model.answer.stimulus import FADE_RAMP, Course, Placement
+from model.answer.stimulus import Course, Placement
 from model.drive_modes import DRIVE_MODES, playable_drive_modes
 from model.ensemble.draws import EXACT_CLOCKS, MAX_HELD, ClockErrors
 from model.errors import InputError
@@ -101,6 +101,33 @@ class EnvelopeSupport:
     """Knots of an onset; 0: ramps."""
     ending_knots: int = 0
     """Knots of an ending; 0: ramps."""
+
+    def shape(
+        self,
+        timing: Timing,
+        placement: Placement,
+        layer: answer.Layer,
+        is_continued: bool,
+        *,
+        adds_ending: bool = True,
+    ) -> answer.Layer:
+        """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
+
+        timing: shapes it; is_continued: whether it needs no onset; adds_ending: whether the ending
+        is added, too.
+        """
+        has_onset = self.onset_knots > 0 and not is_continued
+        has_ending = self.ending_knots > 0
+        layer = replace(
+            layer,
+            onset=layer.onset if has_onset else None,
+            ending=layer.ending if has_ending else None,
+        )
+        adds_onset = has_onset and layer.onset is None
+        adds_ending = adds_ending and has_ending and layer.ending is None
+        if not (adds_onset or adds_ending):
+            return layer
+        return timing.with_envelopes(layer, placement, onset=adds_onset, ending=adds_ending)
 
 
 RAMPS_ONLY = EnvelopeSupport(0)
@@ -356,27 +383,12 @@ class CountedClocks:
         del self._held_since[name]
 
 
-@dataclass(frozen=True)
-class Piece:
-    """A part of a course: shares at equal steps [s], the first one a step after its start."""
-
-    step: float
-    shares: tuple[float, ...]
-
-    @property
-    def duration(self) -> float:
-        """Time of its last share [s]."""
-        return self.step * len(self.shares)
-
-    @property
-    def has_knots(self) -> bool:
-        """Whether it is more than a ramp."""
-        return len(self.shares) > 1
-
-
-def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first: bool) -> Piece:
+def piece_of(
+    course: Course, pulse: Pulse, since: float, *, knots: int, is_first: bool
+) -> tuple[float, list[float]]:
     """Return the piece of a course that is played from a time [s] after the start of its pulse on.
 
+    A piece is a step [s] and shares, the first one a step after its start; a single one is a ramp.
     The course begins anew until the pulse ends, at 0. knots: most of an envelope, 0 for ramps;
     is_first: whether the piece is the first of its layer.
     """
@@ -391,188 +403,7 @@ def piece_of(course: Course, pulse: Pulse, since: float, *, knots: int, is_first
     times = since + step * np.arange(1, count + 1)
     shares = np.asarray(course.at(np.mod(times, course.duration)))
     shares[times > pulse.duration - _ROUNDING] = 0.0
-    return Piece(step, tuple(shares.tolist()))
-
-
-@dataclass(frozen=True)
-class SetBuilder:
-    """Builds the sets of one rig.
-
-    timing: shapes patterns; ramp_max: longest ramp [s] of all amplifiers.
-    """
-
-    rig: Rig
-    support: EnvelopeSupport
-    ramp_max: float
-    timing: Timing
-
-    def shape(
-        self,
-        placement: Placement,
-        layer: answer.Layer,
-        is_continued: bool,
-        *,
-        adds_ending: bool = True,
-    ) -> answer.Layer:
-        """Add the onset and the ending of a pattern, unless it has them; takes milliseconds.
-
-        is_continued: whether it needs no onset; adds_ending: whether the ending is added, too.
-        """
-        has_onset = self.support.onset_knots > 0 and not is_continued
-        has_ending = self.support.ending_knots > 0
-        layer = replace(
-            layer,
-            onset=layer.onset if has_onset else None,
-            ending=layer.ending if has_ending else None,
-        )
-        adds_onset = has_onset and layer.onset is None
-        adds_ending = adds_ending and has_ending and layer.ending is None
-        if not (adds_onset or adds_ending):
-            return layer
-        return self.timing.with_envelopes(layer, placement, onset=adds_onset, ending=adds_ending)
-
-    def build_pattern(
-        self,
-        number: int,
-        layer: answer.Layer,
-        placement: Placement,
-        *,
-        playing: Drive,
-        valid_for: float,
-        is_led: bool = False,
-        is_shaped: bool = True,
-        among: int = 1,
-    ) -> tuple[PlateLayer, answer.Layer]:
-        """Build the set of a pattern in a layer; returns it and the pattern as it is played.
-
-        playing: what each ERA plays now in this layer; a tone that continues needs no onset, nor
-        does one that is led along its ramp, though an ERA joins it.
-        valid_for [s]: for how long it plays unless it is renewed. is_shaped: whether it may have an
-        onset; its ending follows (`build_ending`). among: layers that change at once, which share
-        the time on the wires.
-        """
-        tones, ramp = layer.excitation, min(layer.ramp, self.ramp_max)
-        onset = None
-        restarted = restarted_by(tones, playing)
-        if is_shaped:
-            is_continued = is_led or not restarted.issuperset(
-                [tone.frequency for tone in tones.values()]
-            )
-            onset = self.shape(placement, layer, is_continued, adds_ending=False).onset
-            if onset:
-                onset = thinned(onset, knots=max(1, self.support.onset_knots // among))
-        layers = route(
-            tones,
-            self.rig,
-            ramp=ramp,
-            number=number,
-            playing=playing,
-            restarted=restarted,
-            valid_for=valid_for,
-            onset=onset,
-        )
-        ramp = next(iter(layers.values())).ramp
-        return layers, replace(layer, ramp=ramp, onset=onset, ending=None)
-
-    def build_ending(
-        self,
-        number: int,
-        layer: answer.Layer,
-        placement: Placement,
-        *,
-        playing: Drive,
-        valid_for: float,
-    ) -> tuple[PlateLayer, answer.Layer]:
-        """Build the set that gives an ending to a pattern, which plays on as it is.
-
-        playing: what each ERA plays now in this layer; valid_for [s]: as of a pattern.
-        """
-        layer = self.shape(placement, layer, is_continued=True)
-        layers = route(
-            layer.excitation,
-            self.rig,
-            ramp=layer.ramp,
-            number=number,
-            playing=playing,
-            restarted=frozenset(),
-            valid_for=valid_for,
-            ending=layer.ending,
-        )
-        return layers, layer
-
-    def build_piece(
-        self,
-        number: int,
-        layer: answer.Layer,
-        piece: Piece,
-        *,
-        playing: Drive,
-        valid_for: float,
-        is_after: bool,
-    ) -> tuple[PlateLayer, answer.Layer]:
-        """Build the set of a piece of a course in a layer; returns it and what is played.
-
-        The piece starts from wherever its tones are. is_after: whether it waits for the end of the
-        piece before; playing: as of a pattern; valid_for [s]: from its start on.
-        """
-        tones, ramp = layer.excitation, min(FADE_RAMP, self.ramp_max)
-        onset: dict[str, BaseEnvelope] | None = None
-        if piece.has_knots:
-            onset = {}
-            for name, tone in tones.items():
-                knots = tuple([share * tone.phasor for share in piece.shares])
-                onset[name] = BaseEnvelope(tone.frequency, 0.0, knots, piece.step)
-        layers = route(
-            {
-                n: replace(tone, amplitude=piece.shares[-1] * tone.amplitude)
-                for n, tone in tones.items()
-            },
-            self.rig,
-            ramp=ramp if onset else min(piece.step, self.ramp_max),
-            number=number,
-            playing=playing,
-            restarted=frozenset(),
-            valid_for=valid_for,
-            onset=onset,
-        )
-        ramp = next(iter(layers.values())).ramp
-        after = {name: replace(each, after=is_after) for name, each in layers.items()}
-        return after, replace(layer, ramp=ramp, onset=onset, ending=None)
-
-    def build_renewal(self, number: int, *, ramp: float, valid_for: float) -> PlateLayer:
-        """Build the set that prolongs a layer, which fades along its ramp [s], for a time [s]."""
-        layer = AmplifierLayer(number, ramp=ramp, valid_for=valid_for, renew=True)
-        return dict.fromkeys(self.rig.amplifiers, layer)
-
-    def build_fall(
-        self, number: int, excitation: physics.Excitation, *, ramp: float, playing: Drive
-    ) -> PlateLayer:
-        """Build the set by which a layer falls along a ramp [s] to below any threshold, and ends.
-
-        It does not fall to silence, since no later set could end that sooner, as where a finger
-        lifts. playing: tones in this layer now, by ERA.
-        """
-        least = _LEVEL.from_wire(1)
-        faint = {
-            name: replace(tone, amplitude=least * self.rig.full_levels[name])
-            for name, tone in excitation.items()
-        }
-        ramp = min(ramp, self.ramp_max)
-        return route(
-            faint,
-            self.rig,
-            ramp=ramp,
-            number=number,
-            playing=playing,
-            restarted=frozenset(),
-            valid_for=ramp,
-        )
-
-    def build_end(self, number: int, ramp: float, *, has_endings: bool) -> PlateLayer:
-        """Build the set that ends a layer along its endings, or along a ramp [s]."""
-        if has_endings:
-            return dict.fromkeys(self.rig.amplifiers, AmplifierLayer(number, ramp=ramp))
-        return route({}, self.rig, ramp=ramp, number=number)
+    return step, shares.tolist()
 
 
 def route(

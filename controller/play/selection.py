@@ -37,8 +37,8 @@ from controller.play.layer_contents import (
     no_layer_free,
     not_served,
 )
-from controller.play.layers import CROSSFADE, FALL_AFTER
 from controller.play.routing import PlaybackCapabilities
+from controller.play.slots import CROSSFADE, FALL_AFTER
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import APART_HZ, Answer
 from model.answer.plan import MAX_SEPARATE, scaled

@@ -144,7 +144,7 @@ class Fingers(Chain):
         self, why: str, is_refused: Callable[[Sequence[AmplifierLayer]], bool]
     ) -> list[float]:
         """Let the ledger refuse some layers for a reason; returns when [s] it does."""
-        layers, refused = self.controller.cycle.planner.layers, list[float]()
+        layers, refused = self.controller.cycle.planner.slots, list[float]()
         check = layers.check
 
         def refuse(asked: Mapping[str, Sequence[AmplifierLayer]]) -> CommandRefused | None:

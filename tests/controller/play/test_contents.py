@@ -19,10 +19,10 @@ from controller.effects.effect import Region
 from controller.effects.kinds import Buzz, Click, File
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
-from controller.play.layer_contents import Content, LayerContent, Selection
-from controller.play.layers import Layers, Sets
+from controller.play.layer_contents import Content, Selection
 from controller.play.routing import PlaybackCapabilities
 from controller.play.selection import Chooser, Selector
+from controller.play.slots import Sets, Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from model.answer.answer import Layer
 from model.answer.answer_report import Timing
@@ -170,10 +170,9 @@ def test_a_shared_content_that_changes_beside_a_click_of_its_finger_keeps_its_la
     lasting = Content((shared[0][0].key, 0), shared, Placement((LEFT,)), pattern)
     alone = ((contacts[0], click),)
     clicking = Content((contacts[0].key, 0), alone, Placement((LEFT,)), pattern)
-    playing = Layers(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
+    playing = Slots(smooth_rig(), playable(4), Timing(table()), expiry_of=lambda key: 0.0)
     contents = {
-        number: LayerContent(one, pattern, drive={})
-        for number, one in ((1, clicking), (0, lasting))
+        number: Slot(one, pattern, drive={}) for number, one in ((1, clicking), (0, lasting))
     }
     playing.start(Sets(started=frozenset({0})), contents, 0.0)
     numbers = playing.numbered([lasting, clicking])

@@ -12,10 +12,9 @@ from controller.daemon.messages import PlateView
 from controller.effects.kinds import Buzz, Click
 from controller.effects.layout import SurfaceLayout
 from controller.play.intent import HapticIntent, Pulse, Target
-from controller.play.layer_contents import LayerContent
-from controller.play.layers import Layers, Sets
 from controller.play.planner import ENDED, PlayReport
 from controller.play.selection import Chooser, Selector
+from controller.play.slots import Sets, Slot, Slots
 from controller.sources.touch import Contact, ContactKey
 from drivers.errors import CommandRefused
 from drivers.protocol.sets import LayerSet
@@ -216,15 +215,15 @@ async def test_the_end_of_one_layer_by_itself_is_said_while_the_other_plays(
 
     Nor does it count as felt once one of the others lifts.
     """
-    renewal = Layers.renewal
+    renewal = Slots.renewal
     async with fingers_on(table(), LAYOUT, at={1: LEFT, 2: RIGHT, 3: ABOVE}, held=1.8) as fingers:
         layers = {_id(one): n for n, one in fingers.applied[-1].contents.items()}
 
-        def not_one(all_layers: Layers, now: float) -> Sets:
-            due = renewal(all_layers, now).layers
+        def not_one(all_slots: Slots, now: float) -> Sets:
+            due = renewal(all_slots, now).layers
             return Sets({n: each for n, each in due.items() if n != layers[1]})
 
-        monkeypatch.setattr(Layers, "renewal", not_one)
+        monkeypatch.setattr(Slots, "renewal", not_one)
         count = len(fingers.applied)
         await fingers.hold(2.5)
         (applied,) = fingers.applied[count:]
@@ -602,5 +601,5 @@ def _worst(applied: PlayReport) -> float:
     return min(each.promised_contrast_db or 0.0 for each in applied.targets)
 
 
-def _id(one: LayerContent) -> int:
+def _id(one: Slot) -> int:
     return one.content.targets[0][0].key.id

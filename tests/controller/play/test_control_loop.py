@@ -24,7 +24,6 @@ from controller.effects.layout import SurfaceLayout, default_effects
 from controller.play.intent import CLICK, HapticIntent, Pulse, Target
 from controller.play.layer_contents import (
     BEING_CHOSEN,
-    LayerContent,
     Prediction,
     Selection,
     sums_db,
@@ -32,6 +31,7 @@ from controller.play.layer_contents import (
 from controller.play.loop import Controller
 from controller.play.planner import Observers, PlayReport
 from controller.play.selection import BLOCKED, GIVEN_UP, Chooser, Selector
+from controller.play.slots import Slot
 from controller.sources.touch import Contact, ContactKey, Touch, TouchFrame
 from courses import Acted, courses, follow
 from drivers.errors import LinkError
@@ -162,7 +162,7 @@ def by_finger(report: PlayReport) -> dict[int, Prediction]:
     return {each.contact.key.id: each for each in report.targets}
 
 
-def short(report: PlayReport) -> list[LayerContent]:
+def short(report: PlayReport) -> list[Slot]:
     """The clicks that play."""
     return [one for one in report.contents.values() if one.content.key[1] == CLICK]
 

@@ -31,8 +31,8 @@ from controller.play.joint_answers import (
     selection_of,
     with_ways,
 )
-from controller.play.layers import CROSSFADE
 from controller.play.planner import PlayReport
+from controller.play.slots import CROSSFADE
 from controller.sources.touch import AT_REST, Contact, ContactKey, Motion
 from drivers.errors import CommandRefused
 from drivers.host.group import Group
@@ -197,11 +197,11 @@ async def test_fingers_that_rest_are_served_once_a_ledger_admits_them() -> None:
     async with two_fingers() as (chain, _):
         planner = chain.controller.cycle.planner
         assert planner is not None
-        check = planner.layers.check
-        planner.layers.check = lambda layers: CommandRefused("duty limit reached")
+        check = planner.slots.check
+        planner.slots.check = lambda layers: CommandRefused("duty limit reached")
         await chain.hold(0.5)
         assert served(chain) == 0
-        planner.layers.check = check
+        planner.slots.check = check
         await chain.hold(1.2)
         assert served(chain) == 2
 
@@ -501,7 +501,7 @@ async def test_a_click_amid_a_crossfade_keeps_from_all_that_sounds() -> None:
 async def test_where_no_layer_is_free_nothing_is_led_over() -> None:
     """Of two layers both play, and stay as they are."""
     async with fingers_on(paper_table(), WHOLE) as fingers:
-        fingers.controller.cycle.planner.layers._count = 2
+        fingers.controller.cycle.planner.slots._count = 2
         count = await apart(fingers, then=1.5)
         sent = [one for _, _, layers in fingers.committed[count:] for one in layers]
         assert all(one.renew or one.ramp < 300 for one in sent)

@@ -1,4 +1,4 @@
-"""The layers of the amplifiers: contents in, sets out; what each layer plays, and until when.
+"""The slots of a plate: contents in, sets out; what each layer plays, and until when.
 
 The ledgers are asked before a set is made: what they do not admit is played along plain ramps, then
 without the newest content, and nothing is played where none is left. A vibration ends by itself if
@@ -11,10 +11,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 from controller.play.intent import CLICK, FADED_AFTER, Pulse
-from controller.play.layer_contents import Content, LayerContent
+from controller.play.layer_contents import Content
 from controller.play.routing import (
     BESIDE_CLICK,
     HELD,
@@ -22,9 +21,11 @@ from controller.play.routing import (
     Drive,
     PlateLayer,
     PlaybackCapabilities,
-    SetBuilder,
     full_drive,
     piece_of,
+    restarted_by,
+    route,
+    thinned,
     tones_by_era,
 )
 from controller.sources.touch import MAX_CONTACT_TIMEOUT, ContactKey
@@ -37,6 +38,8 @@ from model.answer import answer
 from model.answer.answer_report import Timing
 from model.answer.stimulus import FADE_RAMP, Course
 from model.rig.rig import Rig
+from model.transients.base_motion import BaseEnvelope
+from model.vibration import Tone
 
 MIN_LEFT = 0.001
 """Shortest remaining time [s] of a pulse."""
@@ -66,7 +69,7 @@ _MIN_VALID_FOR = 2.0
 _MARGIN = 0.2  # s; after the contact is lifted, for late frames
 _SURELY_SETTLED = 0.005  # s; by which a set starts later than its last reply, and clocks differ
 _MIN_RATE = 10.0  # sets/s; a lower limit leaves no turn to an ending: a touch would wait for it
-_VALID_FOR = QUANTITIES["valid_for"]
+_VALID_FOR, _LEVEL = QUANTITIES["valid_for"], QUANTITIES["level"]
 
 Check = Callable[[Mapping[str, Sequence[AmplifierLayer]]], CommandRefused | None]
 """Returns why the ledgers would refuse layers, by amplifier, now; None if they would admit them."""
@@ -111,10 +114,49 @@ class Sets:
         return bool(self.layers) or self.silence is not None
 
 
-class Layers:
-    """The layers of all amplifiers of a rig; times are arguments.
+@dataclass
+class Slot:
+    """A content in its layer; it starts, plays, gets its ending or pieces, is renewed, falls, ends.
 
-    check: asks the ledgers; expiry_of: returns when [s] a contact is lifted unless a frame arrives.
+    What is due at one is due at `due`. `replace` makes a copy that does not change.
+    """
+
+    content: Content
+    layer: answer.Layer
+    """With the ramp, onset and ending of its sets."""
+    drive: Drive = field(default_factory=dict)
+    """By ERA, as confirmed; empty while it starts, and once it has ended."""
+    settled_at: float = math.inf
+    """When [s] its onset has ended."""
+    is_shaped: bool = False
+    """Whether it may have an ending; until it has one, it fades."""
+    ending_due: float = math.inf
+    """When [s] its ending is sent, once the onset has ended, or the next piece of its course, or
+    when it falls."""
+    confirmed_until: float = math.inf
+    """When [s] its first target would have been lifted, as known when it was sent."""
+    renewal_due: float = math.inf
+    """When [s] it is renewed, if all targets have been confirmed since it was sent."""
+    renewable_until: float = math.inf
+    """When [s] it is too late for that."""
+    ends_at: float = math.inf
+    """When [s] it has ended by itself unless it was renewed."""
+    is_falling: bool = False
+    """Whether another content takes its place along a cross-fade; it is not renewed."""
+    course_until: float = -math.inf
+    """When [s] what has been sent of its course ends."""
+
+    @property
+    def due(self) -> float:
+        """When [s] its ending, its renewal or its end is due."""
+        return min(self.ending_due, self.renewal_due, self.ends_at if self.drive else math.inf)
+
+
+class Slots:
+    """The slots of all layers of a rig; times are arguments.
+
+    timing: shapes patterns; check: asks the ledgers; expiry_of: returns when [s] a contact is
+    lifted unless a frame arrives.
     """
 
     def __init__(
@@ -126,24 +168,18 @@ class Layers:
         check: Check = lambda layers: None,
         expiry_of: Callable[[ContactKey], float],
     ) -> None:
-        self._rig, self._count = rig, capabilities.layers
+        self._rig, self._count, self.timing = rig, capabilities.layers, timing
         self.check, self._expiry_of = check, expiry_of
-        self.builder = SetBuilder(rig, capabilities.envelope_support, capabilities.ramp_max, timing)
-        """Makes the sets."""
-        has_endings = capabilities.envelope_support.ending_knots > 0
-        self._may_follow = has_endings and rig.limits.rate >= _MIN_RATE
+        self._support, self._ramp_max = capabilities.envelope_support, capabilities.ramp_max
+        self._may_follow = self._support.ending_knots > 0 and rig.limits.rate >= _MIN_RATE
         # A limit of slew lengthens ramps.
         knots = capabilities.course_knots if math.isinf(rig.limits.slew) else 0
         self._course_knots = knots  # of a piece, 0 for ramps
         if not knots:
             why = "without envelopes" if math.isinf(rig.limits.slew) else "with a limit of slew"
             _logger.debug("loop: files follow in ramps of %g s, %s", PLAIN_STEP, why)
-        self.contents: Mapping[int, LayerContent] = {}
+        self.contents: dict[int, Slot] = {}
         """What plays, by layer."""
-        self.due = math.inf
-        """When [s] the next content is renewed, gets its ending, or has ended by itself."""
-        self.ending_due = math.inf
-        """When [s] the next content gets its ending, or the next piece of its course."""
         self.may_play: frozenset[int] = frozenset()
         """Layers that may play; empty once all are silent for certain."""
         self.is_silent = False
@@ -152,6 +188,16 @@ class Layers:
         self._over: tuple[Content, ...] = ()  # ended by themselves
         # By finger and voice, also where what plays is unknown.
         self._layer_of: Mapping[tuple[ContactKey, int], int] = {}
+
+    @property
+    def due(self) -> float:
+        """When [s] the next content is renewed, gets its ending, or has ended by itself."""
+        return min([one.due for one in self.contents.values()], default=math.inf)
+
+    @property
+    def ending_due(self) -> float:
+        """When [s] the next content gets its ending, or the next piece of its course."""
+        return min([one.ending_due for one in self.contents.values()], default=math.inf)
 
     def plan(self, contents: Sequence[Content], now: float) -> Sets:
         """Return the sets by which layers play these contents and no others from a time [s] on.
@@ -197,7 +243,7 @@ class Layers:
         """Return the sets that silence all layers along a ramp [s]; empty if they are silent."""
         if self.is_silent:
             return Sets()
-        self._replace({})
+        self.contents = {}
         self.is_silent, self._layer_of, self._fades_until = True, {}, now + FADED_AFTER
         return Sets(silence=ramp)
 
@@ -210,33 +256,19 @@ class Layers:
         """
         layers: dict[int, PlateLayer] = {}
         endings: dict[int, answer.Layer] = {}
-        due = [one for one in self.contents.values() if one.ending_due <= now]
-        urgent = min([one.course_until for one in due if one.content.course], default=math.inf)
-        for number, one in self.contents.items():
-            if one.ending_due <= now and (led := one.content.course) is not None:
-                if now < self._confirmed_until(one.content):
-                    layers[number], endings[number] = self._piece(
-                        number, one.content, *led, now, among=len(due), before=one
-                    )
-            elif one.ending_due <= now and one.is_falling:
-                layers[number] = self.builder.build_fall(
-                    number, one.layer.excitation, ramp=CROSSFADE, playing=self._drive_of(number)
+        due = {number: one for number, one in self.contents.items() if one.ending_due <= now}
+        urgent = min(
+            [one.course_until for one in due.values() if one.content.course], default=math.inf
+        )
+        for number, one in due.items():
+            if (led := one.content.course) is None:
+                build = self._fall if one.is_falling else self._ending
+                layers[number], endings[number] = build(number, one, now)
+            elif now < self._confirmed_until(one.content):
+                layers[number], endings[number] = self._piece(
+                    number, one.content, *led, now, among=len(due), before=one
                 )
-                endings[number] = one.layer
-            elif one.ending_due <= now:
-                content = one.content
-                layers[number], endings[number] = self.builder.build_ending(
-                    number,
-                    replace(content.layer, ramp=one.layer.ramp),
-                    content.placement,
-                    playing=self._drive_of(number),
-                    valid_for=self._lasts(content, _all_left(content, now), now),
-                )
-        sets = Sets(layers, endings=endings, preempted_until=urgent - HELD / 2)
-        if layers and (refusal := self.check(sets.by_amplifier)) is not None:
-            self.not_renewed(sets, refusal)
-            return Sets()
-        return sets
+        return self._admitted(Sets(layers, endings=endings, preempted_until=urgent - HELD / 2))
 
     def renewal(self, now: float) -> Sets:
         """Return the sets that prolong what plays, where that is due at a time [s].
@@ -245,31 +277,31 @@ class Layers:
         """
         if endings := self.endings(now):
             return endings
-        sets = {
-            number: self.builder.build_renewal(
-                number,
-                ramp=one.layer.ramp,
-                valid_for=self._lasts(content, _all_left(content, now), now),
-            )
-            for number, one in self.contents.items()
-            for content in (one.content,)
-            if one.renewal_due <= now < one.renewable_until
-            and self._confirmed_until(content) > one.confirmed_until
-        }
-        renewal = Sets(sets)
-        if sets and (refusal := self.check(renewal.by_amplifier)) is not None:
-            self.not_renewed(renewal, refusal)
+        sets = dict[int, PlateLayer]()
+        for number, one in self.contents.items():
+            is_due = one.renewal_due <= now < one.renewable_until
+            if is_due and self._confirmed_until(one.content) > one.confirmed_until:
+                lasts = self._lasts(one.content, now)
+                layer = AmplifierLayer(number, ramp=one.layer.ramp, valid_for=lasts, renew=True)
+                sets[number] = dict.fromkeys(self._rig.amplifiers, layer)
+        return self._admitted(Sets(sets))
+
+    def _admitted(self, sets: Sets) -> Sets:
+        """Return sets by which nothing starts, or none if a ledger refuses them."""
+        if sets.layers and (refusal := self.check(sets.by_amplifier)) is not None:
+            self.not_renewed(sets, refusal)
             return Sets()
-        return renewal
+        return sets
 
     def not_renewed(self, renewal: Sets, refusal: CommandRefused) -> None:
         """Note that layers are not prolonged; after a refusal for good they end."""
         due = math.inf if refusal.until is None else refusal.until
-        for number in renewal.endings:
-            has_course = self.contents[number].content.course is not None
-            self._change(number, ending_due=due if has_course else math.inf)
-        for number in renewal.layers.keys() - renewal.endings.keys():
-            self._change(number, renewal_due=due)
+        for number in renewal.layers:
+            one = self.contents[number]
+            if number not in renewal.endings:
+                one.renewal_due = due
+            else:
+                one.ending_due = math.inf if one.content.course is None else due
 
     def have_settled(self, now: float) -> bool:
         """Whether all that may play has settled, so that endings lead from there."""
@@ -279,38 +311,40 @@ class Layers:
     def confirm(self, sets: Sets, played: PlayedSet, now: float) -> None:
         """Note what the amplifiers play of sets that were committed by now [s].
 
-        A content that a ledger has shortened is not renewed: that would circumvent its limit.
+        A content that a ledger has shortened is not renewed: that would circumvent its limit. The
+        second piece of a course is sent at once, each later one when half of that before has been
+        played.
         """
         going_on = sets.layers.keys() & self.contents.keys()
         self.may_play = self.may_play.difference(sets.layers).union(going_on)
         for number in going_on:
             one, lasts = self.contents[number], _shortest(played, number)
             since = max(now, one.course_until)  # a piece waits for the one before
-            if one.content.course is not None:
+            if (led := one.content.course) is not None:
+                piece = sets.endings.get(number, one.layer)
                 starts = max(played.starts_at, one.course_until)
-                piece, is_first = sets.endings.get(number, one.layer), number in sets.started
-                self._confirm_piece(number, piece, starts, now, is_first=is_first)
+                until = one.course_until = starts + _settled_after(piece)
+                due = now + MIN_LEFT if number in sets.started else (starts + until) / 2
+                is_over = until > led[1].end - MIN_LEFT
+                one.ending_due = math.inf if is_over else due if piece.onset else until
+                one.drive = full_drive(one.content.layer.excitation, self._rig)
             elif number in sets.started:
-                drive = tones_by_era(played.layers, self._rig, number)
-                settled_at = now + one.settled_after
-                due = settled_at + _SURELY_SETTLED
+                one.drive = tones_by_era(played.layers, self._rig, number)
+                one.settled_at = now + _settled_after(one.layer)
+                due = one.settled_at + _SURELY_SETTLED
                 has_ending = one.is_shaped and due < now + lasts and self._may_follow
-                due = due if has_ending else math.inf
-                self._change(number, drive=drive, settled_at=settled_at, ending_due=due)
+                one.ending_due = due if has_ending else math.inf
             elif number in sets.endings:
-                layer = replace(one.layer, ending=sets.endings[number].ending)
-                self._change(number, layer=layer, ending_due=math.inf)
-            self._change(
-                number,
-                confirmed_until=self._confirmed_until(one.content),
-                renewal_due=math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2,
-                renewable_until=now + lasts - _MARGIN / 2,
-                ends_at=since + lasts,
-            )
+                one.layer = replace(one.layer, ending=sets.endings[number].ending)
+                one.ending_due = math.inf
+            one.confirmed_until = self._confirmed_until(one.content)
+            one.renewal_due = math.inf if lasts < _MIN_VALID_FOR else now + lasts / 2
+            one.renewable_until = now + lasts - _MARGIN / 2
+            one.ends_at = since + lasts
 
     def forget(self) -> None:
         """Discard what plays, which is unknown; fingers keep their layers."""
-        self._replace({})
+        self.contents = {}
         self.is_silent, self._over = False, ()
 
     def ended(self, now: float) -> tuple[Content, ...]:
@@ -318,25 +352,21 @@ class Layers:
 
         Those of which a piece is due, for which the host was late, go on.
         """
-        over = [
-            number
-            for number, one in self.contents.items()
-            if one.drive and now >= one.ends_at and not self._goes_on(one, now)
-        ]
-        fallen = {number for number in over if self.contents[number].is_falling}
-        self.may_play -= fallen
-        self._replace({n: one for n, one in self.contents.items() if n not in fallen})
-        over = [number for number in over if number not in fallen]
-        for number in over:
-            self._change(number, drive={}, ending_due=math.inf)
-        contents = tuple(self.contents[number].content for number in over)
-        self._over = (*self._over, *contents)
-        return contents
-
-    def _goes_on(self, one: LayerContent, now: float) -> bool:
-        """Whether a piece of its course is due."""
-        is_due = one.content.course is not None and one.ending_due <= now
-        return is_due and now < self._confirmed_until(one.content)
+        over = list[Content]()
+        for number, one in [*self.contents.items()]:
+            goes_on = one.content.course is not None and one.ending_due <= now
+            if goes_on and now < self._confirmed_until(one.content):
+                continue
+            if not (one.drive and now >= one.ends_at):
+                continue
+            if one.is_falling:
+                self.may_play -= {number}
+                del self.contents[number]
+            else:
+                one.drive, one.ending_due = {}, math.inf
+                over.append(one.content)
+        self._over = (*self._over, *over)
+        return tuple(over)
 
     def over_of(self, contents: Sequence[Content]) -> tuple[Content, ...]:
         """Return which of the wanted contents have ended by themselves."""
@@ -391,12 +421,11 @@ class Layers:
                 changed.append(number)
         return changed
 
-    def start(self, sets: Sets, playing: Mapping[int, LayerContent], now: float) -> None:
+    def start(self, sets: Sets, playing: dict[int, Slot], now: float) -> None:
         """Note that sets are sent at a time [s], and what all layers play."""
         if self._fades(sets):
             self._fades_until = now + FADED_AFTER
-        self._replace(playing)
-        self.is_silent = False
+        self.contents, self.is_silent = playing, False
         self._layer_of = {
             one.content.key: number for number, one in playing.items() if not one.is_falling
         }
@@ -404,50 +433,114 @@ class Layers:
 
     def _sets(
         self, contents: Sequence[Content], now: float, *, is_shaped: bool
-    ) -> tuple[Sets, dict[int, LayerContent]]:
+    ) -> tuple[Sets, dict[int, Slot]]:
         """Return the sets for these contents, and what all layers play then."""
         numbers = self.numbered(contents)
         starting = self.starting(numbers)
         layers: dict[int, PlateLayer] = {}
-        playing: dict[int, LayerContent] = {}
+        playing: dict[int, Slot] = {}
         for number, one in self.contents.items():
             if number in numbers and number not in starting:
                 content = numbers[number]
                 playing[number] = one if one.content is content else replace(one, content=content)
-        settled = [0.0]
+        settled, among = [0.0], len(starting)
         for number in starting:
             content = numbers[number]
-            if (led := content.course) is not None:
-                layers[number], played = self._piece(
-                    number, content, *led, now, among=len(starting)
+            led = content.course
+            is_long = is_shaped and led is None and not content.targets[0][1].is_short
+            if led is not None:
+                layers[number], played = self._piece(number, content, *led, now, among=among)
+            else:
+                layers[number], played = self._pattern(
+                    number, content, now, among=among, is_shaped=is_long
                 )
-                playing[number] = LayerContent(content, played)
-                settled.append(playing[number].settled_after)
-                continue
-            left, fade = _all_left(content, now), self._fade_of(number, content)
-            layers[number], played = self.builder.build_pattern(
-                number,
-                replace(content.layer, ramp=fade) if fade else content.layer,
-                content.placement,
-                playing=self._drive_of(number),
-                valid_for=self._lasts(content, left, now),
-                is_led=fade > 0,
-                is_shaped=is_shaped and not content.targets[0][1].is_short,
-                among=len(starting),
-            )
-            may_end = is_shaped and not content.targets[0][1].is_short
-            playing[number] = LayerContent(content, played, is_shaped=may_end)
-            settled.append(playing[number].settled_after)
+            playing[number] = Slot(content, played, is_shaped=is_long)
+            settled.append(_settled_after(played))
         is_clicking = any(content.targets[0][1].is_short for content in contents)
-        ramp = min(BESIDE_CLICK if is_clicking else FADE_RAMP, self.builder.ramp_max)
+        ramp = min(BESIDE_CLICK if is_clicking else FADE_RAMP, self._ramp_max)
         for number in self.may_play - numbers.keys():
             if is_shaped and (falling := self._falling(number, contents, now)) is not None:
                 playing[number] = falling
                 continue
-            has_endings = is_shaped and self._may_end_shaped(number, now)
-            layers[number] = self.builder.build_end(number, ramp, has_endings=has_endings)
+            if is_shaped and self._may_end_shaped(number, now):
+                end = AmplifierLayer(number, ramp=ramp)
+                layers[number] = dict.fromkeys(self._rig.amplifiers, end)
+            else:
+                layers[number] = route({}, self._rig, ramp=ramp, number=number)
             settled.append(ramp)
         return Sets(layers, frozenset(starting), settled_after=max(settled)), playing
+
+    def _pattern(
+        self, number: int, content: Content, now: float, *, among: int, is_shaped: bool
+    ) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set of a pattern in a layer, and the pattern as it is played.
+
+        A tone that continues needs no onset, nor does one that is led along its ramp, though an ERA
+        joins it. among: layers that change at once, which share the time on the wires; is_shaped:
+        whether it may have an onset; its ending follows (`_ending`).
+        """
+        fade, layer = self._fade_of(number, content), content.layer
+        tones, playing, onset = layer.excitation, self._drive_of(number), None
+        restarted = restarted_by(tones, playing)
+        if is_shaped:
+            frequencies = [tone.frequency for tone in tones.values()]
+            is_continued = fade > 0 or not restarted.issuperset(frequencies)
+            shaped = self._support.shape(
+                self.timing, content.placement, layer, is_continued, adds_ending=False
+            )
+            if onset := shaped.onset:
+                onset = thinned(onset, knots=max(1, self._support.onset_knots // among))
+        layers = route(
+            tones,
+            self._rig,
+            ramp=min(fade or layer.ramp, self._ramp_max),
+            number=number,
+            playing=playing,
+            restarted=restarted,
+            valid_for=self._lasts(content, now),
+            onset=onset,
+        )
+        ramp = next(iter(layers.values())).ramp
+        return layers, replace(layer, ramp=ramp, onset=onset, ending=None)
+
+    def _ending(self, number: int, one: Slot, now: float) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set that gives an ending to a pattern, which plays on as it is, and both."""
+        content = one.content
+        layer = replace(content.layer, ramp=one.layer.ramp)
+        layer = self._support.shape(self.timing, content.placement, layer, is_continued=True)
+        layers = route(
+            layer.excitation,
+            self._rig,
+            ramp=layer.ramp,
+            number=number,
+            playing=self._drive_of(number),
+            restarted=frozenset(),
+            valid_for=self._lasts(content, now),
+            ending=layer.ending,
+        )
+        return layers, layer
+
+    def _fall(self, number: int, one: Slot, now: float) -> tuple[PlateLayer, answer.Layer]:
+        """Return the set by which a layer falls to below any threshold, and ends; and its layer.
+
+        It does not fall to silence, since no later set could end that sooner, as where a finger
+        lifts.
+        """
+        least, ramp = _LEVEL.from_wire(1), min(CROSSFADE, self._ramp_max)
+        faint = {
+            name: replace(tone, amplitude=least * self._rig.full_levels[name])
+            for name, tone in one.layer.excitation.items()
+        }
+        layers = route(
+            faint,
+            self._rig,
+            ramp=ramp,
+            number=number,
+            playing=self._drive_of(number),
+            restarted=frozenset(),
+            valid_for=ramp,
+        )
+        return layers, one.layer
 
     def _piece(
         self,
@@ -458,55 +551,44 @@ class Layers:
         now: float,
         *,
         among: int,
-        before: LayerContent | None = None,
+        before: Slot | None = None,
     ) -> tuple[PlateLayer, answer.Layer]:
         """Return the set of the next piece of a content's course in a layer, and what is played.
 
         The piece starts where the pulse is at a time [s], or when the piece before ends if that has
-        not ended yet. among: pieces that are sent together; before: the layer with the piece
-        before, None for the first.
+        not ended yet, and from wherever its tones are. among: pieces that are sent together;
+        before: the slot with the piece before, None for the first.
         """
-        is_after, knots, starts = False, self._course_knots, now
+        is_after, starts, playing = False, now, self._drive_of(number)
+        knots = self._course_knots
         if before is None:
-            knots = min(knots, self.builder.support.onset_knots)
-        elif now < before.course_until:
-            is_after, starts = True, before.course_until
-        piece = piece_of(
-            course,
-            pulse,
-            0.0 if pulse.started_at is None else starts - pulse.started_at,
-            knots=max(knots // among, 1) if knots else 0,
-            is_first=before is None,
+            knots = min(knots, self._support.onset_knots)
+        else:
+            is_after, starts = now < before.course_until, max(now, before.course_until)
+            playing = {} if now >= before.ends_at else playing
+        since = 0.0 if pulse.started_at is None else starts - pulse.started_at
+        knots = max(knots // among, 1) if knots else 0
+        step, shares = piece_of(course, pulse, since, knots=knots, is_first=before is None)
+        onset: dict[str, BaseEnvelope] = {}
+        last, tones = dict[str, Tone](), content.layer.excitation
+        for name, tone in tones.items():
+            last[name] = replace(tone, amplitude=shares[-1] * tone.amplitude)
+            if len(shares) > 1:  # else a ramp
+                motions = tuple([share * tone.phasor for share in shares])
+                onset[name] = BaseEnvelope(tone.frequency, 0.0, motions, step)
+        layers = route(
+            last,
+            self._rig,
+            ramp=min(FADE_RAMP if onset else step, self._ramp_max),
+            number=number,
+            playing=playing,
+            restarted=frozenset(),
+            valid_for=step * len(shares) + HELD,
+            onset=onset or None,
         )
-        has_ended = before is not None and now >= before.ends_at
-        return self.builder.build_piece(
-            number,
-            content.layer,
-            piece,
-            playing={} if has_ended else self._drive_of(number),
-            valid_for=piece.duration + HELD,
-            is_after=is_after and piece.has_knots,
-        )
-
-    def _confirm_piece(
-        self, number: int, played: answer.Layer, since: float, now: float, *, is_first: bool
-    ) -> None:
-        """Note that a piece of a layer's course is confirmed, which starts at a time [s].
-
-        The second piece is sent at once, each later one when half of that before has been played.
-        """
-        one = self.contents[number]
-        until = since + replace(one, layer=played).settled_after
-        due = now + MIN_LEFT if is_first else (since + until) / 2
-        due = due if played.onset else until
-        pulse = one.content.targets[0][1].pulse
-        is_over = pulse is not None and until > pulse.end - MIN_LEFT
-        self._change(
-            number,
-            drive=full_drive(one.content.layer.excitation, self._rig),
-            course_until=until,
-            ending_due=math.inf if is_over else due,
-        )
+        ramp, is_after = next(iter(layers.values())).ramp, is_after and bool(onset)
+        after = {name: replace(each, after=is_after) for name, each in layers.items()}
+        return after, replace(content.layer, ramp=ramp, onset=onset or None, ending=None)
 
     def _fade_of(self, number: int, content: Content) -> float:
         """Return the time [s] in which a content takes the place of another; 0 where it begins."""
@@ -519,14 +601,14 @@ class Layers:
         is_led = self._led_from(content) is not None and same[0] == same[-1]
         return CROSSFADE if is_led else 0.0
 
-    def _led_from(self, content: Content) -> LayerContent | None:
+    def _led_from(self, content: Content) -> Slot | None:
         """Return what a content that is led to takes the place of, if anything."""
         one = self.contents.get(self._layer_of.get(content.key, -1))
         if one is None or not content.is_led or one.content == content:
             return None
         return None if one.content.targets[0][1].is_short else one
 
-    def _falling(self, number: int, contents: Sequence[Content], now: float) -> LayerContent | None:
+    def _falling(self, number: int, contents: Sequence[Content], now: float) -> Slot | None:
         """Return a layer as it gives way to one of these contents; None if it ends at once."""
         if (one := self.contents.get(number)) is None:
             return None
@@ -556,17 +638,6 @@ class Layers:
             ends.append(now)
         return max(ends, default=now + RETRY) + FADED_AFTER
 
-    def _change(self, number: int, **values: Any) -> None:
-        """Give what plays in a layer other values of its fields."""
-        self._replace({**self.contents, number: replace(self.contents[number], **values)})
-
-    def _replace(self, contents: Mapping[int, LayerContent]) -> None:
-        self.contents, self.due, self.ending_due = contents, math.inf, math.inf
-        for one in contents.values():
-            self.ending_due = min(self.ending_due, one.ending_due)
-            self.due = min(self.due, one.renewal_due, one.ends_at if one.drive else math.inf)
-        self.due = min(self.due, self.ending_due)
-
     def _confirmed_until(self, content: Content) -> float:
         """Return when [s] the first target of a content is lifted unless a frame arrives."""
         until = math.inf
@@ -574,14 +645,14 @@ class Layers:
             until = min(until, self._expiry_of(contact.key))
         return until
 
-    def _lasts(self, content: Content, left: Sequence[float], now: float) -> float:
+    def _lasts(self, content: Content, now: float) -> float:
         """Return for how long [s] a content may last by itself from a time [s] on.
 
-        left: time [s] of each target; the amplifiers end the content with the last pulse.
+        The amplifiers end the content with the last pulse.
         """
         until = self._confirmed_until(content)
         unlimited = min(max(until - now + _MARGIN, _MIN_VALID_FOR), MAX_CONTACT_TIMEOUT)
-        return min(unlimited, max(left, default=math.inf))
+        return min(unlimited, max([_left(target.pulse, now) for _, target in content.targets]))
 
     def _may_end_shaped(self, number: int, now: float) -> bool:
         """Whether a layer has settled, so that its endings lead from what plays."""
@@ -599,24 +670,23 @@ class Layers:
         return drive
 
 
-def _requested_at(one: LayerContent) -> float:
+def _requested_at(one: Slot) -> float:
     """When [s] a content was requested, by its pulse or its contact."""
     contact, target = one.content.targets[0]
     return contact.since if target.pulse is None else target.pulse.requested_at
 
 
-def _all_left(content: Content, now: float) -> list[float]:
-    """Return how long [s] each target is driven from a time [s]; infinite without a pulse."""
-    left = []
-    for _, target in content.targets:
-        pulse = target.pulse
-        if pulse is None:
-            left.append(math.inf)
-        elif pulse.started_at is None:
-            left.append(pulse.duration)
-        else:
-            left.append(max(pulse.end - now, MIN_LEFT))
-    return left
+def _left(pulse: Pulse | None, now: float) -> float:
+    """Return how long [s] a target is driven from a time [s]; infinite without a pulse."""
+    if pulse is None:
+        return math.inf
+    return pulse.duration if pulse.started_at is None else max(pulse.end - now, MIN_LEFT)
+
+
+def _settled_after(layer: answer.Layer) -> float:
+    """Return how long [s] after the commit the ramp or onset of a layer has ended."""
+    last = next(iter(layer.onset.values())).duration if layer.onset else 0.0
+    return max(layer.ramp, last)
 
 
 def _shortest(played: PlayedSet, number: int) -> float:

@@ -134,10 +134,10 @@ _NO_BUS = (
 )
 
 _HEADING = (
-    f"{'':51}{'felt contrast':^13}  {'contrast / dB':^13}  {'level':^13} {'latency':>7}\n"
-    f"{'':51}{'/ dB':^13}  {'first 100 ms':^13}  {'/ dB SL':^13} {'/ ms':>7}\n"
+    f"{'':51}{'felt contrast':^13}  {'level':^13} {'latency':>7}\n"
+    f"{'':51}{'/ dB':^13}  {'/ dB SL':^13} {'/ ms':>7}\n"
     f" time  target / cm  others  {'ERAs':22} "
-    f"{'prom.':>6} {'meas.':>6}  {'pred.':>6} {'meas.':>6}  {'prom.':>6} {'meas.':>6}\n"
+    f"{'prom.':>6} {'meas.':>6}  {'prom.':>6} {'meas.':>6}\n"
 )
 
 
@@ -156,7 +156,6 @@ def _line(row: "TouchRow") -> str:
     eras = ", ".join(f"{_named(some)} {hertz:g} Hz" for hertz, some in by_frequency.items())
     pairs = (
         (row.promised_contrast_db, row.measured_contrast_db),
-        (row.predicted_transient_contrast_db, row.measured_transient_contrast_db),
         (row.predicted_level_db_sl, row.measured_level_db_sl),
     )
     figures = "  ".join(f"{_number(one):>6s} {_number(other):>6s}" for one, other in pairs)

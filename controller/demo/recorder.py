@@ -32,8 +32,7 @@ from controller.sources.touch import Change, Contact, ContactKey
 from drivers.errors import LinkError
 from model.answer.answer import HELD_BACK, Layer
 from model.arrays import FloatArray
-from model.finger import DEFAULT_THRESHOLD, contrast_db, mean_level_db_sl, sensation_level
-from model.transients.shaping import ONSET_WINDOW
+from model.finger import DEFAULT_THRESHOLD, mean_level_db_sl, sensation_level
 from registry import threads
 from registry.wording import first_problem
 
@@ -51,8 +50,6 @@ class FingerVibration:
     """Frequencies (f,) [Hz]."""
     amplitudes: FloatArray
     """Amplitudes (f, p) [m/s²] of the steady part."""
-    peaks: FloatArray
-    """Largest accelerations (p,) [m/s²], transients included."""
     weights: FloatArray
     """Weights (p,) of the points in the mean over the tip."""
     threshold: str = DEFAULT_THRESHOLD
@@ -102,8 +99,7 @@ class TouchRow:
     fingertips by id [m]; pattern; levels_db_sl by id: of the target the mean over its tip, of any
     other finger its loudest point, whose least difference is the contrast. Contrasts are None for
     a finger alone, and measured ones if the pattern was too short: predicted ones are of the
-    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels;
-    transient ones are in accelerations, over the first 100 ms of the touch's first pattern.
+    table's plate, promised ones what nine of ten plates within the uncertainty give, in levels.
     drive: as the amplifiers achieved it, by ERA; latency_ms: from touch frame to last byte on the
     wire; reason: why nothing played, if so. fingers: of several contents, each; contrasts are then
     to the contents of others at this finger; contents: their patterns, in the order of layers.
@@ -117,15 +113,12 @@ class TouchRow:
     reason: str | None = None
     drive: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mode: str | None = None
-    shaped_onset: bool = False
     latency_ms: float | None = None
     played_s: float = 0.0
     steady: bool = False
     predicted_contrast_db: float | None = None
     promised_contrast_db: float | None = None
     measured_contrast_db: float | None = None
-    predicted_transient_contrast_db: float | None = None
-    measured_transient_contrast_db: float | None = None
     predicted_level_db_sl: float | None = None
     measured_level_db_sl: float | None = None
     pattern: Layer | None = None
@@ -159,12 +152,6 @@ def steady_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]
     if not quiet:
         return None
     return target.level_db_sl - max(finger.loudest_db_sl for finger in quiet)
-
-
-def peak_contrast_db(target: FingerVibration, quiet: Sequence[FingerVibration]) -> float:
-    """Contrast of the peaks [dB], as `model.transients.shaping` predicts for an onset."""
-    others = np.concatenate([finger.peaks for finger in quiet])
-    return float(contrast_db([target.peaks], others, [target.weights]))
 
 
 WATCHDOG = 2.0
@@ -214,9 +201,8 @@ class SimulatedPlate:
             id: FingerVibration(
                 frequencies=np.array(felt.frequencies_hz),
                 amplitudes=np.array(felt.amplitude_m_s2).reshape(
-                    len(felt.frequencies_hz), len(felt.peak_m_s2)
+                    len(felt.frequencies_hz), len(felt.weights)
                 ),
-                peaks=np.array(felt.peak_m_s2),
                 weights=np.array(felt.weights),
                 threshold=self._threshold,
             )
@@ -249,7 +235,6 @@ class _FingerRecord(BaseModel):
 
     frequencies_hz: list[float]
     amplitude_m_s2: list[list[float]]
-    peak_m_s2: list[float]
     weights: list[float]
 
 
@@ -346,9 +331,6 @@ MARGIN = 0.005
 STEADY_DURATION = 0.4
 """Shortest pattern [s] that counts as steady; the plate rings for 50 ms to 1 s."""
 
-MAX_ONSET_AGE = 9.0
-"""Longest pattern [s] whose onset the plate still has when it ends; it keeps ten seconds."""
-
 Measured: TypeAlias = asyncio.Task[dict[str, FingerVibration]]
 
 _NOT_THE_TARGET = "another finger came down at the same moment and was the target"
@@ -378,8 +360,6 @@ class _PlayedPattern:
     until: float = math.inf
     steady: Measured | None = None
     """Vibration by finger over the longest time in which no finger moved."""
-    onset: Measured | None = None
-    """Vibration by finger over the first 100 ms."""
 
     @property
     def duration(self) -> float:
@@ -476,23 +456,19 @@ class TouchRecorder:
                 touch.reason = silenced.reason
 
     def _end_pattern(self, now: float, *, is_measured: bool = True) -> None:
-        """Close the playing pattern and measure its end, and its onset beside quiet fingers."""
+        """Close the playing pattern and measure its end."""
         ended, self._playing = self._playing, None
         if ended is None:
             return
         ended.until = now
         # Its end is reported with the reply to what ended it, some time after the fingers changed.
-        began, settled = ended.applied.time, ended.applied.time + ended.applied.layer.ramp
+        settled = ended.applied.time + ended.applied.layer.ramp
         changes = [each for each in self._changes if settled < each < now]
         start, end = max(pairwise([settled, *changes, now]), key=lambda rest: rest[1] - rest[0])
         since, until = max(start, end - STEADY_WINDOW) + MARGIN, end - MARGIN
         self._changes = changes
         if is_measured and since < until:
             ended.steady = self._tasks.create_task(self._plate.vibration(since, until))
-        is_whole = ONSET_WINDOW <= ended.duration < MAX_ONSET_AGE
-        if is_measured and is_whole and ended.applied.from_rest and ended.applied.quiet:
-            onset = self._plate.vibration(began, began + ONSET_WINDOW)
-            ended.onset = self._tasks.create_task(onset)
         for touch in ended.touches:
             self._complete(touch)
 
@@ -538,7 +514,7 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
     """The row with the last steady pattern of most contents, or the longest of them.
 
     It is the same pattern for all fingers that it serves, so that their rows are of one moment.
-    Latency and onset are of the touch's first pattern.
+    Latency is of the touch's first pattern.
     """
     first, main_part = touch.patterns[0], max(touch.patterns, key=_significance)
     key = touch.contact.key
@@ -557,7 +533,6 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
             for era, each in played.drive.items()
         },
         mode=pattern.drive_mode,
-        shaped_onset=bool(_content_of(predicted, first.applied).layer.onset),
         latency_ms=None if first.applied.latency is None else 1000 * first.applied.latency,
         played_s=main_part.duration,
         steady=main_part.duration >= STEADY_DURATION,
@@ -580,15 +555,9 @@ async def _played(touch: _Touch, row: TouchRow) -> TouchRow:
             contents=[each.layer for each in applied.contents.values()],
         )
     target, quiet = _fingers(vibration, predicted, applied.quiet)
-    onset_vibration = await first.onset if first.onset else {}
-    onset_target, onset_quiet = _fingers(onset_vibration, predicted, first.applied.quiet)
     return replace(
         row,
         measured_contrast_db=steady_contrast_db(target, quiet) if target else None,
-        predicted_transient_contrast_db=first.applied.transient_contrast_db,
-        measured_transient_contrast_db=(
-            peak_contrast_db(onset_target, onset_quiet) if onset_target and onset_quiet else None
-        ),
         measured_level_db_sl=target.level_db_sl if target else None,
     )
 

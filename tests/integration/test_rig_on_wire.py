@@ -373,7 +373,7 @@ class LearningBench:
         self.far.bench.advance(threads.now())
         felt = self.far.bench.felt(threads.now() - _FELT, threads.now())
         *quiet, target = [
-            FingerVibration(np.array(f.frequencies), f.amplitude, f.peak, f.weights)
+            FingerVibration(np.array(f.frequencies), f.amplitude, f.weights)
             for f in (felt[name] for name in named)
         ]
         await self.era.touch([])

@@ -419,7 +419,11 @@ def test_show_prints_exciters_and_what_they_reach(
     [
         ({}, True),
         ({"plate": {"length": 0.3}}, False),
-        ({"base": "rig.yaml", "base_fingerprint": "f0", "plate": {"thickness": 2e-3}}, True),
+        pytest.param(
+            {"base": "rig.yaml", "base_fingerprint": "f0", "plate": {"thickness": 2e-3}},
+            True,
+            id="fitted",
+        ),
         ({"base": "rig.yaml", "eras": {"SW": {"damping": 2.0, "damping_ratio": None}}}, True),
         ({"base": "rig.yaml", "standard_errors": {"plate": {"thickness": 1e-5}}}, True),
         ({"base": "rig.yaml", "eras": {"NE": {"force_factor": 4.2}}}, True),

@@ -31,8 +31,12 @@ from model.rig.rig import Rig, Uncertainty
 from model.table.table import LocalizationTable
 from model.table.table_file import table_following
 
-MAX_MEMORY = 1 << 30
-"""Bytes that an estimator may take; one that needs more ends, and another starts."""
+MAX_MEMORY = 384 << 20
+"""Bytes that an estimator may take; one that needs more ends, and another starts.
+
+With a daemon of sixteen ERAs, 0.4 GB, and its dashboard, 0.1 GB, that stays below the `MemoryMax`
+of the service's unit, at which the system would end the daemon as well.
+"""
 
 _NICE = 10  # above that of the daemon, whose loop comes first
 _IDENTIFIED = 0.5  # of the thickness error of a plate that was not measured

@@ -26,6 +26,7 @@ from model.answer.answer_report import Timing
 from model.errors import InputError
 from model.estimate.following import LearnedTable, SettledPattern
 from model.estimate.forward import Sensor
+from model.rig.rig_file import example_rig_path
 from model.table.table import LocalizationTable
 from plates import make_paper_rig, small_table
 from virtual_lines import in_virtual_time
@@ -578,7 +579,10 @@ async def test_worker_that_dies_is_reported() -> None:
 
 @pytest.mark.real_time
 async def test_worker_may_not_take_all_memory() -> None:
-    """Twice its limit is refused to it, and it goes on; half of it is not."""
+    """Twice its limit is refused to it, and it goes on; the unit leaves 0.6 GB to the daemon."""
+    unit = (example_rig_path().parent / "systemd" / "era-haptics.service").read_text("utf-8")
+    assert "\nMemoryMax=1G\n" in unit
+    assert estimator_module.MAX_MEMORY <= 2**30 - 0.6e9
     async with working() as worker:
         with pytest.raises(MemoryError):
             await worker.call(60.0, Busy.grow, 2 * estimator_module.MAX_MEMORY)

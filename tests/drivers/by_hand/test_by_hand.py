@@ -38,6 +38,18 @@ ADDRESSED = [wire for wire in WORD_WIRES if not wire.endswith(OF_CONNECTIONS)]
 """Wires whose far end lasts: the others have one for each connection, at the first addresses."""
 
 
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boards that run already: what does not reply is given up after 0.5 s instead of six."""
+    for place in (
+        "by_hand.actions.BOOT_TIME",
+        "wires.modbus.BOOT_TIME",
+        "wires.serial_line.SerialAddress.boot_time",
+        "wires.can_bus.SlcanAddress.boot_time",
+    ):
+        monkeypatch.setattr(f"drivers.{place}", 0.5)
+
+
 async def leave_playing(far: WordFarSide, number: int = 1) -> None:
     """Play at half level, as a host that then ends without a word."""
     lines = Lines()
@@ -69,6 +81,7 @@ async def test_stop_is_sent_before_anything_is_read(wire: str, tmp_path: Path) -
 
 
 @pytest.mark.real_time
+@pytest.mark.usefixtures("started")
 async def test_stop_of_a_mute_amplifier_may_play() -> None:
     """Nothing replies at its address, so nothing confirms that it is silent."""
     async with WORD_WIRES["serial"](1) as far:
@@ -176,6 +189,7 @@ async def test_drive_after_a_stop_names_the_clear_command() -> None:
 
 
 @pytest.mark.real_time
+@pytest.mark.usefixtures("started")
 @pytest.mark.parametrize("wire", shortly(ADDRESSED, ["serial", "modbus+rtu"]))
 async def test_amplifier_takes_another_address(wire: str) -> None:
     """It replies there, nobody where it was, and the other amplifier where it is."""
@@ -191,6 +205,7 @@ async def test_amplifier_takes_another_address(wire: str) -> None:
 
 
 @pytest.mark.real_time
+@pytest.mark.usefixtures("started")
 async def test_armed_amplifier_keeps_its_address() -> None:
     """So does one of another serial number; a wire without addresses has none to set."""
     async with WORD_WIRES["serial"](1) as far:

@@ -288,11 +288,7 @@ class ApiServer:
         """Stop listening and close all connections after their pending output."""
         if self._listening is None:
             return
-        for each in self._listening.sockets:
-            asyncio.get_running_loop().remove_reader(each)
-        for _ in range(3):  # iterations in which what was accepted is opened
-            await asyncio.sleep(0)
-        self._listening.close()
+        await threads.stop_accepting(self._listening)
         for end in (Connection.close, Connection.abort):
             for client in list(self.clients):
                 end(client)

@@ -47,7 +47,7 @@ from controller.gateway.gateway_settings import GatewaySettings
 from controller.gateway.metrics import exposition
 from controller.process.daemon_process import allow_many_descriptors
 from model.errors import InputError
-from registry.threads import no_long_collections
+from registry.threads import no_long_collections, stop_accepting
 
 HTTP_METHODS = {name: method for name, method in METHODS.items() if method.over_http}
 """Methods available over HTTP: notifications need a WebSocket."""
@@ -171,13 +171,14 @@ class Gateway:
         self._files = {file.name: file.read_bytes() for file in _PAGE.iterdir()}
         self._files["openapi.json"] = json.dumps(openapi()).encode()
         self.app = web.Application(middlewares=[self._answer], client_max_size=MAX_BODY)
+        later: dict[str, Any] = {"expect_handler": _continue_later}
         self.app.add_routes(
             [
                 web.get("/api/v1/{file:openapi.json}", self._file),
-                web.get("/api/v1/ws", self._serve, allow_head=False),
+                web.get("/api/v1/ws", self._serve, allow_head=False, **later),
                 web.options("/api/v1/{method}", self._access.preflight),
-                web.post("/api/v1/{method}", self._call),
-                web.get("/metrics", self._metrics),
+                web.post("/api/v1/{method}", self._call, **later),
+                web.get("/metrics", self._metrics, **later),
                 web.get("/{file:[^/]*}", self._file),
             ]
         )
@@ -317,6 +318,10 @@ class Gateway:
                 )
 
 
+async def _continue_later(_: web.Request) -> None:
+    """Leave 100 Continue to `_body`: aiohttp would send it before the token is checked."""
+
+
 async def _body(request: web.Request) -> bytes:
     """A request's body on one line, by default an empty object; raises RpcError, web.HTTPException.
 
@@ -327,6 +332,9 @@ async def _body(request: web.Request) -> bytes:
         raise web.HTTPUnsupportedMediaType(text="the content type must be application/json")
     if (request.content_length or 0) > MAX_BODY:
         raise web.HTTPRequestEntityTooLarge(MAX_BODY)
+    if request.headers.get("Expect", "").lower() == "100-continue":
+        await request.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+        request.writer.output_size = 0
     try:
         async with asyncio.timeout(CLIENT_TIMEOUT):
             body = await request.read()
@@ -380,7 +388,7 @@ async def serve(settings: GatewaySettings, *, announce: Callable[[int], None]) -
     announce(listening.getsockname()[1])
     with no_long_collections():  # of connections that a storm leaves, nothing else is visited
         await over.wait()
-    serving.close()
+    await stop_accepting(serving)
     await runner.cleanup()
     own.cancel()
     with contextlib.suppress(asyncio.CancelledError):

@@ -374,6 +374,13 @@ def test_http_body_may_have_line_feeds(gateway: GatewayProcess, daemon: Scripted
     assert daemon.calls == [(name, RequestedBy(client="a")) for name in ("stop", "forget")]
 
 
+def test_http_body_may_wait_for_100_continue(gateway: GatewayProcess) -> None:
+    """RFC 9110 10.1.1: the interim response comes first, then that to the request."""
+    response = http(gateway, "/api/v1/stop", body=b"{}", more=["Expect: 100-continue"])
+    assert response.status == 100
+    assert response.body.startswith(b"HTTP/1.1 200 ")
+
+
 def test_http_error_has_line_and_column_of_the_body(gateway: GatewayProcess) -> None:
     """Not those of the line that the daemon would receive."""
     response = http(gateway, body=b'{"owner": "me",\n  lease_s: 5}')

@@ -134,6 +134,7 @@ ATTACKS: dict[str, tuple[dict[str, Any], set[int]]] = {
     "token twice": ({"token": [TOKEN, TOKEN]}, {401}),
     "right and wrong token": ({"token": [TOKEN, "x"]}, {401}),
     "token in the query": ({"token": [], "target": f"/api/v1/arm?token={TOKEN}"}, {401}),
+    "token awaited with the body": ({"token": [], "more": ["Expect: 100-continue"]}, {401}),
     "token in a cookie": ({"token": [], "more": [f"Cookie: token={TOKEN}"]}, {401}),
     "token as a password": ({"token": [], "more": [f"Authorization: Basic {TOKEN}"]}, {401}),
     "forwarded address": ({"token": [], "more": ["X-Forwarded-For: 127.0.0.1"]}, {401}),

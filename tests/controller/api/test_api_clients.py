@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import inspect
 import json
 import math
 import os
@@ -30,7 +29,7 @@ from controller.api.link import (
     check_peer,
     find_socket,
 )
-from controller.api.methods import METHODS, LogEvent
+from controller.api.methods import LogEvent
 from daemons import (
     PLACE,
     daemon_at,
@@ -210,16 +209,6 @@ async def test_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
             await until_state(era, READY)
             await asyncio.to_thread(exec, code, {})
             await until_state(era, READY)
-
-
-def test_clients_have_the_same_methods() -> None:
-    """Every method of the API, with the same parameters and result in both clients."""
-    for name in METHODS:
-        own = inspect.signature(getattr(Client, name))
-        other = inspect.signature(getattr(AsyncClient, name))
-        assert own == other
-        fields = METHODS[name].params.model_fields.values()
-        assert list(own.parameters)[1:] or not any(field.is_required() for field in fields)
 
 
 HELLO = b'{"jsonrpc":"2.0","id":1,"result":{"api_version":"1.0"}}\n'

@@ -1,7 +1,6 @@
 """The API's server and its lines: refusals, the order of service, and which touches count."""
 
 import asyncio
-import inspect
 import json
 import socket
 from contextlib import suppress
@@ -26,8 +25,6 @@ from controller.api.jsonrpc import (
 from controller.api.methods import METHODS, ArmParams, StatusResult, SubscribeParams
 from controller.api.schema import ApiMessage, Empty
 from controller.api.server import ApiServer
-from controller.api.summaries import SUMMARIES
-from controller.daemon.handlers import ApiService
 from daemons import PATIENCE, ServedApi, request, serving
 from virtual_lines import feed
 
@@ -398,12 +395,3 @@ def test_params_of_any_shape_are_valid_or_refused(method: str, params: dict[str,
     except RpcError as error:
         text = str(error)
     assert text == "" or text.isprintable()
-
-
-def test_table_has_what_is_registered_where_it_is_handled() -> None:
-    """Names, parameters, results, treatment and help of all handlers, in their order."""
-    handlers = {name: each for name, each in vars(ApiService).items() if hasattr(each, "method")}
-    assert {name: each.method for name, each in handlers.items()} == METHODS
-    assert [*SUMMARIES] == [*handlers]
-    for name, each in handlers.items():
-        assert inspect.cleandoc(each.__doc__).split() == SUMMARIES[name].split()

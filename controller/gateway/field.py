@@ -94,6 +94,7 @@ class FieldSolver:
         return response
 
 
+@lru_cache(1)
 def _solver(rig_text: str) -> FieldSolver:
     from model.rig.rig_file import parse_rig  # slow to import
 
@@ -112,7 +113,6 @@ class DrawnField:
         self._changed = asyncio.Event()
         self._due = asyncio.Event()
         self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and drives by layer
-        self._solver = lru_cache(1)(_solver)
         self._problem = ""
 
     async def frames(self) -> AsyncIterator[bytes]:
@@ -172,7 +172,7 @@ class DrawnField:
 
     def _drawn(self, rig_text: str, layers: Mapping[str, Any]) -> bytes:
         """The frame of what plays, without what a later daemon may add to it."""
-        return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
+        return _solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
     def _note(self, what: str, error: Exception) -> None:
         """Log a problem, once while it lasts."""

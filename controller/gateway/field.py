@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -19,9 +19,9 @@ from controller.api.link import DaemonLink, Notification, read_line, result_of
 from controller.api.schema import PlayedTone
 from model.arrays import ComplexArray, lattice
 from model.finger import detection_threshold
-
-if TYPE_CHECKING:  # slow to import
-    from model.rig.rig import Rig
+from model.reduction.free_plate import solve_free_plate
+from model.rig.rig import Rig
+from model.rig.rig_file import parse_rig
 
 _COLUMNS = 64  # grid points along the longer side; several per bending wavelength
 _MAX_FREQUENCIES = 64  # in the cache
@@ -37,9 +37,7 @@ _logger = logging.getLogger(__name__)
 class FieldSolver:
     """Draws the vibration of one rig's plate, which is solved once, and once per frequency."""
 
-    def __init__(self, rig: "Rig") -> None:
-        from model.reduction.free_plate import solve_free_plate  # slow to import
-
+    def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._free = solve_free_plate(rig.plate, rig.mesh, frequency_max=rig.limits.frequency_max)
         sides = rig.plate.length, rig.plate.width
@@ -94,13 +92,6 @@ class FieldSolver:
         return response
 
 
-@lru_cache(1)
-def _solver(rig_text: str) -> FieldSolver:
-    from model.rig.rig_file import parse_rig  # slow to import
-
-    return FieldSolver(parse_rig("the daemon's rig", rig_text))
-
-
 class DrawnField:
     """The vibration of the plate as it plays, drawn once for all browsers; see `run`.
 
@@ -113,6 +104,7 @@ class DrawnField:
         self._changed = asyncio.Event()
         self._due = asyncio.Event()
         self._plays: tuple[str, Mapping[str, Any]] | None = None  # a rig file, and drives by layer
+        self._solver = lru_cache(1)(lambda text: FieldSolver(parse_rig("the daemon's rig", text)))
         self._problem = ""
 
     async def frames(self) -> AsyncIterator[bytes]:
@@ -172,7 +164,7 @@ class DrawnField:
 
     def _drawn(self, rig_text: str, layers: Mapping[str, Any]) -> bytes:
         """The frame of what plays, without what a later daemon may add to it."""
-        return _solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
+        return self._solver(rig_text).frame(_LAYERS.validate_python(layers, extra="ignore"))
 
     def _note(self, what: str, error: Exception) -> None:
         """Log a problem, once while it lasts."""

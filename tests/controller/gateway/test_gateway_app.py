@@ -577,6 +577,7 @@ def test_websocket_receives_the_field_of_the_drive(
         )
         while True:
             opcode, payload = ws.next()
+            assert opcode != 8, payload
             if opcode == 2 and struct.unpack_from("<H", payload, 4) == (1,):
                 break
     columns, rows, count, zero = struct.unpack_from("<4H", payload)

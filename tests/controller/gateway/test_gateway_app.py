@@ -86,8 +86,8 @@ async def test_metrics_follow_status(tmp_path: Path) -> None:
     assert read["era_lost_events_total", "log"] == 5
 
 
-async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
-    """Nothing of the machine is told to a network without it."""
+async def test_network_needs_the_token_and_no_foreign_page(tmp_path: Path) -> None:
+    """Metrics are given with the token alone, and to pages of the gateway's own origin."""
     settings = GatewaySettings(
         socket=tmp_path / "era.sock",
         host="192.0.2.7",
@@ -95,12 +95,13 @@ async def test_metrics_need_the_token_elsewhere(tmp_path: Path) -> None:
         extra_hosts=("panel.local",),
     )
     access = Access(settings)
-    for path, token, expected in (
-        ("/metrics", "wrong", 401),
-        ("/metrics%0A", "wrong", 400),
-        ("/metrics", settings.token, 200),
+    for path, token, origin, expected in (
+        ("/metrics", "wrong", "http://panel.local", 401),
+        ("/metrics%0A", "wrong", "http://panel.local", 400),
+        ("/metrics", settings.token, "http://evil.example", 403),
+        ("/metrics", settings.token, "http://panel.local", 200),
     ):
-        headers = {"Host": "panel.local", "Authorization": f"Bearer {token}"}
+        headers = {"Host": "panel.local", "Authorization": f"Bearer {token}", "Origin": origin}
         status = 200
         try:
             access.check(make_mocked_request("GET", path, headers=headers))

@@ -24,7 +24,7 @@ from benchmarks.setting import use_one_thread
 from benchmarks.weekend.chain import FOLDER, BuiltBoard
 from model.arrays import ComplexArray, FloatArray
 from model.estimate.measurement import Measurement
-from model.estimate.rig_check import SENSORS, Verdict, diagnose, judged_by_promises
+from model.estimate.rig_check import Verdict, diagnose, judged_by_promises
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
 
@@ -121,9 +121,7 @@ def _mistakes() -> Iterator[tuple[str, Mistake]]:
     yield (
         "the sensor upside down at a place",
         Mistake(
-            lambda verdict, e: (
-                [each.of for each in verdict.of_kinds(*SENSORS)] == [f"P{2 * e + 1}"]
-            ),
+            lambda verdict, e: [each.of for each in verdict.about("sensor")] == [f"P{2 * e + 1}"],
             change=lambda v, e: _negated(v, exciter=slice(None), place=2 * e),
         ),
     )

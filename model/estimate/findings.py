@@ -18,7 +18,7 @@ the rig is fitted within its priors. Where it fits, loads are sought where each 
 and each kind of form error is judged by its sum of squares at an equal share of the false alarms.
 
 A new kind of fault is a function here that returns a `Finding`, which `model.estimate.rig_check`
-calls, and its row in `TEXTS`.
+calls, and its entry in `KINDS`.
 """
 
 import math
@@ -119,67 +119,142 @@ _FORM = {
     "poisson": "Poisson's ratio",
 }
 
-TEXTS = {
-    "mirrored": "PLACES: places of sensors must be from the corner from which those of ERAs are, "
-    "got ones mirrored in {of}: {coarse}; correct the positions of all{or_plugs}",
-    "reversed": "PLACES: frequencies must be those of their responses, got reversed ones: {coarse}",
-    "exchanged": "PLACES: sensors must be at their places, got responses that fit exchanged ones: "
-    "{of}; correct their positions or names",
-    "grain": "GRAIN: plate.grain must be {along}, got {as_written}: with the grain along its "
-    "{along} a coarse fit leaves {percent} of the responses unexplained, along its {as_written} "
-    "{percent_as_written}; look at the veneer of its faces, and correct the rig",
-    "resonance": "RESONANCE: resonance_is of {of} must be {which}, got {as_written}: with it "
-    "{which} a glued magnet resonates at {value:.0f} Hz, and gains vary by a factor of "
-    "{factor:.2g} over frequency, as written by {factor_as_written:.2g}; correct the rig",
-    "swapped": "SWAPPED: {one} drives ERA {second}, and {other} drives ERA {first} (confidence "
-    "{confidence:.3f}): exchange the two plugs, or the channels in the rig",
-    "cycle": "SWAPPED in a cycle: the channels of {of} each drive the next one's ERA (confidence "
-    "{confidence:.3f}): correct the plugs",
-    "all strong or weak": "{state}: the channels of {of} play {least:.2f} to {value:.2f} of the "
-    "commanded amplitude: check the sensors' sensitivity first, which makes all of them so "
-    "together; then the amplifier's volume",
-    "all inverted": "INVERTED: all channels have the sign that is opposite to the sensors': turn "
-    "the sensors over, swap the two wires of every ERA, or check the sign convention of phases",
-    "dead": "DEAD: {wiring} does not move the plate: check its supply, its cable and the "
-    "amplifier's channel",
-    "loose": "LOOSE: {wiring} acts on the plate with a part of its contact only, as an exciter "
-    "whose glue is off: press it on or glue it anew, and measure again",
-    "weak": "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
-    "volume and mounting, or measure its gain with `era calibrate`",
-    "strong": "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
-    "volume, or correct its stroke or gains in the rig",
-    "other ERA": "WRONG ERA: {wiring} drives ERA {drives} instead of {of} (MAC {mac_found:.3f}, "
-    "with its own ERA {mac_own:.3f}; confidence {confidence:.3f}): correct the plug, or the rig's "
-    "channels",
-    "inverted": "INVERTED: {wiring} has the opposite sign of the others: swap its two wires",
-    "out of phase": "OUT OF PHASE: {wiring} is off by {phase:+.0f}°: measure its gains with `era "
-    "calibrate`",
-    "silent": "SENSOR {of} reads nothing: left out",
-    "mute": "SENSOR {of} reads {value:.2f} of what the others say: check that it is where its line "
-    "says, and its cable: left out",
-    "upside down": "SENSOR {of} is upside down (reads {value:.2f} of what the others say): turn it "
-    "over: left out",
-    "off scale": "SENSOR {of} reads {value:.2f} of what the others say: left out",
-    "plate": "PLATE: the rig does not match the plate: {why}\n{hypotheses}",
-    "outliers": "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
-    "contacts if they are many",
-    "mass": "MASS: {grams} at ({x_m:.2f}, {y_m:.2f}) m: remove it, or write it to the rig's masses",
-    "finger": "FINGER: the plate is touched at ({x_m:.2f}, {y_m:.2f}) m: take away what rests "
-    "there, and measure again",
-    "thickness": "THICKNESS: the plate is {along_x} thicker at the end of x and {along_y} at that "
-    "of y than in its middle, by what its sensors read: check it, or the sensors' scales",
-    "unnamed": "UNNAMED: the plate is as written, but for something that has no name here: {said}; "
-    "check its thickness, what is bonded to it and the sensors' scales, and measure for `era "
-    "calibrate`",
-    "promise": "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
-    "by {value:.1f} dB or more",
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of finding."""
+
+    text: str
+    """Its line, filled in with the fields and details of a finding: what is wrong, what to do."""
+    about: str = "channel"
+    """What it is about: `file` (what the rig's file says the wrong way round), `channel`, `sensor`
+    (which is left out), `plate`, `load` (what lies on the plate) or `form` (a deviation that no key
+    of a rig names)."""
+    is_fault: bool = True
+    """Whether it fails the check."""
+
+
+KINDS = {
+    "mirrored": Kind(
+        "PLACES: places of sensors must be from the corner from which those of ERAs are, "
+        "got ones mirrored in {of}: {coarse}; correct the positions of all{or_plugs}",
+        "file",
+    ),
+    "reversed": Kind(
+        "PLACES: frequencies must be those of their responses, got reversed ones: {coarse}", "file"
+    ),
+    "exchanged": Kind(
+        "PLACES: sensors must be at their places, got responses that fit exchanged ones: "
+        "{of}; correct their positions or names",
+        "file",
+    ),
+    "grain": Kind(
+        "GRAIN: plate.grain must be {along}, got {as_written}: with the grain along its {along} a "
+        "coarse fit leaves {percent} of the responses unexplained, along its {as_written} "
+        "{percent_as_written}; look at the veneer of its faces, and correct the rig",
+        "file",
+    ),
+    "resonance": Kind(
+        "RESONANCE: resonance_is of {of} must be {which}, got {as_written}: with it "
+        "{which} a glued magnet resonates at {value:.0f} Hz, and gains vary by a factor of "
+        "{factor:.2g} over frequency, as written by {factor_as_written:.2g}; correct the rig",
+        "file",
+    ),
+    "swapped": Kind(
+        "SWAPPED: {one} drives ERA {second}, and {other} drives ERA {first} (confidence "
+        "{confidence:.3f}): exchange the two plugs, or the channels in the rig"
+    ),
+    "cycle": Kind(
+        "SWAPPED in a cycle: the channels of {of} each drive the next one's ERA (confidence "
+        "{confidence:.3f}): correct the plugs"
+    ),
+    "all strong or weak": Kind(
+        "{state}: the channels of {of} play {least:.2f} to {value:.2f} of the "
+        "commanded amplitude: check the sensors' sensitivity first, which makes all of them so "
+        "together; then the amplifier's volume"
+    ),
+    "all inverted": Kind(
+        "INVERTED: all channels have the sign that is opposite to the sensors': turn "
+        "the sensors over, swap the two wires of every ERA, or check the sign convention of phases"
+    ),
+    "dead": Kind(
+        "DEAD: {wiring} does not move the plate: check its supply, its cable and the "
+        "amplifier's channel"
+    ),
+    "loose": Kind(
+        "LOOSE: {wiring} acts on the plate with a part of its contact only, as an exciter "
+        "whose glue is off: press it on or glue it anew, and measure again"
+    ),
+    "weak": Kind(
+        "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
+        "volume and mounting, or measure its gain with `era calibrate`"
+    ),
+    "strong": Kind(
+        "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
+        "volume, or correct its stroke or gains in the rig"
+    ),
+    "other ERA": Kind(
+        "WRONG ERA: {wiring} drives ERA {drives} instead of {of} (MAC {mac_found:.3f}, with its "
+        "own ERA {mac_own:.3f}; confidence {confidence:.3f}): correct the plug, or the rig's "
+        "channels"
+    ),
+    "inverted": Kind("INVERTED: {wiring} has the opposite sign of the others: swap its two wires"),
+    "out of phase": Kind(
+        "OUT OF PHASE: {wiring} is off by {phase:+.0f}°: measure its gains with `era calibrate`"
+    ),
+    "silent": Kind("SENSOR {of} reads nothing: left out", "sensor", is_fault=False),
+    "mute": Kind(
+        "SENSOR {of} reads {value:.2f} of what the others say: check that it is where its line "
+        "says, and its cable: left out",
+        "sensor",
+        is_fault=False,
+    ),
+    "upside down": Kind(
+        "SENSOR {of} is upside down (reads {value:.2f} of what the others say): turn it "
+        "over: left out",
+        "sensor",
+        is_fault=False,
+    ),
+    "off scale": Kind(
+        "SENSOR {of} reads {value:.2f} of what the others say: left out", "sensor", is_fault=False
+    ),
+    "plate": Kind("PLATE: the rig does not match the plate: {why}\n{hypotheses}", "plate"),
+    "outliers": Kind(
+        "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
+        "contacts if they are many",
+        "plate",
+        is_fault=False,
+    ),
+    "mass": Kind(
+        "MASS: {grams} at ({x_m:.2f}, {y_m:.2f}) m: remove it, or write it to the rig's masses",
+        "load",
+    ),
+    "finger": Kind(
+        "FINGER: the plate is touched at ({x_m:.2f}, {y_m:.2f}) m: take away what rests "
+        "there, and measure again",
+        "load",
+    ),
+    "thickness": Kind(
+        "THICKNESS: the plate is {along_x} thicker at the end of x and {along_y} at that "
+        "of y than in its middle, by what its sensors read: check it, or the sensors' scales",
+        "form",
+    ),
+    "unnamed": Kind(
+        "UNNAMED: the plate is as written, but for something that has no name here: {said}; "
+        "check its thickness, what is bonded to it and the sensors' scales, and measure for `era "
+        "calibrate`",
+        "form",
+    ),
+    "promise": Kind(
+        "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
+        "by {value:.1f} dB or more",
+        "plate",
+    ),
 }
-"""Line of a finding by its kind: what is wrong, and what to do."""
+"""Every kind of finding by its name."""
 
 Load: TypeAlias = PointLoad | FingertipLoad
 """What may lie on a plate."""
-
-_NO_FAULT = ("silent", "mute", "upside down", "off scale", "outliers")
 
 
 @dataclass(frozen=True)
@@ -187,21 +262,31 @@ class Finding:
     """Something that a check found."""
 
     kind: str
-    """Key of `TEXTS`."""
+    """Key of `KINDS`."""
     of: str
     """What it is of, by name."""
     value: float = 0.0
     """How large it is, as its text says."""
     confidence: float = 1.0
     """Confidence 0..1 in it."""
+    chance: float = 1.0
+    """Share of plates as written that look as far off or further."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """Further values, of which the text is made."""
+    json: Mapping[str, Any] = field(default_factory=dict)
+    """What it adds to the JSON of the plate: of a `file` its key, of a load or form what is known
+    of it."""
+
+    @property
+    def about(self) -> str:
+        """What it is about, as `Kind.about`."""
+        return KINDS[self.kind].about
 
     @property
     def rows(self) -> list[str]:
         """Lines for people: what is wrong, and what to do."""
         own = {"of": self.of, "value": self.value, "confidence": self.confidence}
-        return TEXTS[self.kind].format(**{**self.details, **own}).splitlines()
+        return KINDS[self.kind].text.format(**{**self.details, **own}).splitlines()
 
     @property
     def problem(self) -> str:
@@ -211,7 +296,7 @@ class Finding:
     @property
     def is_fault(self) -> bool:
         """Whether it fails the check."""
-        return self.kind not in _NO_FAULT
+        return KINDS[self.kind].is_fault
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +315,8 @@ class Match:
     """Measurement of the ERAs that the channels drive, with gains (f, s, n)."""
     outliers: NDArray[np.bool_]
     """Mask of values that no error counts (f, s, n)."""
+    model_error: float
+    """Error of the model by which the values were weighted, relative to the rms of their row."""
 
     @cached_property
     def rig(self) -> Rig:
@@ -330,6 +417,7 @@ def match_plate(
         model_error * np.abs(left),
         np.where(used, predicted * np.exp(beside), np.nan),
         outliers,
+        model_error,
     )
 
 
@@ -482,8 +570,8 @@ def reversed_axes(
     )
     or_plugs = ", or plug the channels as the rig has them" if are_plugs else ""
     kind = "reversed" if axes == ("frequency",) else "mirrored"
-    details = {"json": {"reversed_axes": [*axes]}, "coarse": coarse, "or_plugs": or_plugs}
-    return Finding(kind, names, details=details), rig, right
+    details, changed = {"coarse": coarse, "or_plugs": or_plugs}, {"reversed_axes": [*axes]}
+    return Finding(kind, names, details=details, json=changed), rig, right
 
 
 def exchanged_sensors(
@@ -508,7 +596,7 @@ def exchanged_sensors(
     if not pairs:
         return None
     said = ", ".join(f"{name} at that of {place}" for name, place in pairs.items())
-    found = Finding("exchanged", said, details={"json": {"exchanged_sensors": pairs}})
+    found = Finding("exchanged", said, json={"exchanged_sensors": pairs})
     return found, observation.moved(points)
 
 
@@ -540,13 +628,12 @@ def turned_grain(
     found: dict[str, Any] = {"expected": rig.grain, "found": along}
     found |= {"unexplained": error, "unexplained_as_written": as_written}
     details = {
-        "json": {"grain": found},
         "along": along,
         "as_written": rig.grain,
         "percent": percent(error),
         "percent_as_written": percent(as_written),
     }
-    return Finding("grain", "plate.grain", details=details), turned
+    return Finding("grain", "plate.grain", details=details, json={"grain": found}), turned
 
 
 def misread_resonance(
@@ -578,13 +665,14 @@ def misread_resonance(
         if found < _CLEARLY_STEADIER * as_written:
             glued = next(e.magnet_frequency for e in exciters_of(other) if e.name in meant)
             details = {
-                "json": {"resonance_is": meant},
                 "which": _OTHER_MEANING[which],
                 "as_written": which,
                 "factor": math.exp(found),
                 "factor_as_written": math.exp(as_written),
             }
-            return Finding("resonance", ", ".join(meant), glued, details=details), other
+            changed = {"resonance_is": meant}
+            finding = Finding("resonance", ", ".join(meant), glued, details=details, json=changed)
+            return finding, other
     return None
 
 
@@ -832,28 +920,29 @@ def match_with_form(
         for words, z in own.items()
     }
     farthest = best_by([*chances], lambda words: -chances[words])
-    details: dict[str, Any] = {"error": best.error, "chance": 1.0}
-    if chances[farthest] >= FALSE_ALARM:
-        said = f"{percent(best.error)} of the response is unexplained"
-        unnamed = [Finding("unnamed", "response", best.error, details=details | {"said": said})]
-        return best, unnamed if best.error > MAX_FORM_ERROR else []
+    chance, error = chances[farthest], {"unexplained": best.error}
+    if chance >= FALSE_ALARM:
+        said = {"said": f"{percent(best.error)} of the response is unexplained"}
+        unnamed = Finding("unnamed", "response", best.error, details=said, json=error)
+        return best, [unnamed] if best.error > MAX_FORM_ERROR else []
     deviation = float(np.sqrt((own[farthest] ** 2).mean()))
-    details |= {"chance": chances[farthest], "farthest": farthest}
-    details["standard_deviations"] = deviation
+    known = {"farthest": farthest, "standard_deviations": deviation, **error}
     if farthest == _THICKNESS:
-        details |= {"of_x": x, "of_y": y}
-        details |= {"along_x": f"{100 * x:+.1f} %", "along_y": f"{100 * y:+.1f} %"}
-        return best, [Finding(_THICKNESS, "ends", deviation, details=details)]
-    said = f"{farthest} are off by {deviation:.1f} standard deviations of their tolerance"
-    return best, [Finding("unnamed", farthest, deviation, details=details | {"said": said})]
+        along = {"along_x": f"{100 * x:+.1f} %", "along_y": f"{100 * y:+.1f} %"}
+        known |= {"thicker_at_end_of_x": x, "thicker_at_end_of_y": y}
+        return best, [Finding(_THICKNESS, "ends", deviation, 1.0, chance, along, known)]
+    said = {"said": f"{farthest} are off by {deviation:.1f} standard deviations of their tolerance"}
+    return best, [Finding("unnamed", farthest, deviation, 1.0, chance, said, known)]
 
 
 def _load_finding(load: Load, error: float) -> Finding:
-    at: dict[str, Any] = {"x_m": load.x, "y_m": load.y, "error": error, "chance": 1.0}
+    at, known = {"x_m": load.x, "y_m": load.y}, {"unexplained": error}
     if isinstance(load, FingertipLoad):
-        return Finding("finger", "plate", details=at)
-    at |= {"mass_kg": load.mass, "grams": in_display_unit(load.mass, "kg")}
-    return Finding("mass", "plate", load.mass, details=at)
+        place = {**at, "mass_kg": None}
+        return Finding("finger", "plate", details=at, json={"loads": [place], **known})
+    place = {**at, "mass_kg": load.mass}
+    details = {**at, "grams": in_display_unit(load.mass, "kg")}
+    return Finding("mass", "plate", load.mass, details=details, json={"loads": [place], **known})
 
 
 def _along_plate(

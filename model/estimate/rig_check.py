@@ -103,12 +103,6 @@ _QUANTITIES = (
 They are factor * (i omega)^power times acceleration per displacement.
 """
 
-_CORRECTIONS = ("mirrored", "reversed", "exchanged", "grain", "resonance")
-SENSORS = ("silent", "mute", "upside down", "off scale")
-"""Kinds of findings of sensors that are left out."""
-
-_BEYOND = ("mass", "finger", "thickness", "unnamed")
-
 
 @dataclass(frozen=True)
 class ChannelVerdict:
@@ -168,6 +162,10 @@ class Verdict:
         """The findings of some kinds."""
         return [each for each in self.findings if each.kind in kinds]
 
+    def about(self, *what: str) -> list[Finding]:
+        """The findings about some of what `Kind.about` names."""
+        return [each for each in self.findings if each.about in what]
+
     @property
     def wiring_matches(self) -> bool:
         """Whether every driven channel drives its ERA as the rig says."""
@@ -201,24 +199,8 @@ def diagnose(
     error; skipped: findings of sensors that were left out before. Raises InputError for fewer than
     three usable sensors or four frequencies.
     """
-    if not np.isfinite(observation.values).any():
-        raise InputError("no channel was driven; drive each in turn and measure again")
-    check_enough_sensors(np.ones(len(observation.names), dtype=bool), observation)
-    if len(observation.frequencies) < _LEAST_FREQUENCIES:
-        raise InputError(
-            f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
-            f"{len(observation.frequencies)}"
-        )
-    plate = plate_of(rig, observation)
-    dead = _dead_channels(plate, observation.values)
-    alive = observation.values[:, :, ~dead]
-    if np.isfinite(alive).any():
-        silent = silent_sensors(replace(observation, values=alive))
-        check_enough_sensors(~silent, observation)
-        skipped += tuple(Finding("silent", n) for n in compress(observation.names, silent))
-        if silent.any():
-            observation = observation.without(silent)
-            plate = plate_of(rig, observation)
+    plate, observation, dead, silent = _heard(rig, observation)
+    skipped += silent
 
     def again(correction: Finding, rig: Rig, observation: Measurement, has_form: bool) -> Verdict:
         if refuses:
@@ -266,37 +248,94 @@ def diagnose(
             has_form=has_form,
             skipped=(*skipped, *off),
         )
+    return _judged(
+        match,
+        replace(observation, values=values),
+        drives,
+        dead,
+        false_alarm=false_alarm,
+        has_form=has_form,
+        skipped=skipped,
+    )
+
+
+def _heard(
+    rig: Rig, observation: Measurement
+) -> tuple[SensedPlate, Measurement, NDArray[np.bool_], tuple[Finding, ...]]:
+    """Leave out silent sensors.
+
+    Returns the rig's plate at the others, what these measured, a mask (n,) of dead channels and the
+    findings of the silent ones. Raises InputError where too little is left to say anything.
+    """
+    if not np.isfinite(observation.values).any():
+        raise InputError("no channel was driven; drive each in turn and measure again")
+    check_enough_sensors(np.ones(len(observation.names), dtype=bool), observation)
+    if len(observation.frequencies) < _LEAST_FREQUENCIES:
+        raise InputError(
+            f"a diagnosis needs at least {_LEAST_FREQUENCIES} frequencies, got "
+            f"{len(observation.frequencies)}"
+        )
+    plate = plate_of(rig, observation)
+    dead = _dead_channels(plate, observation.values)
+    alive = observation.values[:, :, ~dead]
+    if not np.isfinite(alive).any():
+        return plate, observation, dead, ()
+    silent = silent_sensors(replace(observation, values=alive))
+    if not silent.any():
+        return plate, observation, dead, ()
+    check_enough_sensors(~silent, observation)
+    found = tuple(Finding("silent", name) for name in compress(observation.names, silent))
+    observation = observation.without(silent)
+    return plate_of(rig, observation), observation, dead, found
+
+
+def _judged(
+    match: Match,
+    live: Measurement,
+    drives: Sequence[int],
+    dead: NDArray[np.bool_],
+    *,
+    false_alarm: float,
+    has_form: bool,
+    skipped: Sequence[Finding],
+) -> Verdict:
+    """Judge the plate of a match, then the channels by the plate that explains them best.
+
+    live: what was measured of the channels that are not dead; further parameters as `diagnose`.
+    """
+    plate, values = match.plate, live.values
+    rig, model_error = plate.rig, match.model_error
     beyond: list[Finding] = []
     if has_form:
-        with_form, beyond = match_with_form(plate, observation, values, drives)
+        with_form, beyond = match_with_form(plate, live, values, drives)
         match = with_form if with_form.error <= MAX_FORM_ERROR else match
     # Values that stand in for a form error that is less likely say nothing of themselves.
-    limit = min([false_alarm, *(each.details["chance"] for each in beyond)])
+    limit = min([false_alarm, *(each.chance for each in beyond)])
     matches = match.error <= MAX_FIT_ERROR and match.chance >= limit
     hypotheses: list[Hypothesis] = []
     if not matches:
-        hypotheses = compared(plate, observation, values, drives=drives, model_error=error)
+        hypotheses = compared(plate, live, values, drives=drives, model_error=model_error)
     fitted = best_by([match, *(each.match for each in hypotheses)], lambda each: -each.fit.cost)
-    channels = _channels(rig, observation, values, drives, fitted, dead)
+    channels = _channels(rig, live, values, drives, fitted, dead)
     if not matches:
         channels = tuple(_loose(each, rig, match, hypotheses) for each in channels)
-    behind_glue = _behind_glue(fitted, values, drives)
     channels = tuple(
-        _as_loose(each) if off else each for each, off in zip(channels, behind_glue, strict=True)
+        _as_loose(each) if is_behind else each
+        for each, is_behind in zip(channels, _behind_glue(fitted, values, drives), strict=True)
     )
     findings = [*_channel_findings(channels), *skipped]
     if not matches and not any("loose" in each.states for each in channels):
         findings.append(plate_finding(match, hypotheses))
     elif match.outliers.any():
         by_sensor = match.outliers.sum(axis=(0, 2))
-        worst, count = best_of(by_sensor), counted(int(by_sensor.sum()), "value")
-        name = observation.names[worst]
-        findings.append(Finding("outliers", name, int(by_sensor[worst]), details={"count": count}))
+        worst, of_worst = best_of(by_sensor), int(by_sensor.max())
+        details = {"count": counted(int(by_sensor.sum()), "value")}
+        findings.append(Finding("outliers", live.names[worst], of_worst, details=details))
     return Verdict(
         channels,
         (*findings, *(beyond if matches else ())),
-        observation.names,
-        observation.frequencies,
+        live.names,
+        live.frequencies,
         matches,
         match,
         tuple(hypotheses),
@@ -530,7 +569,7 @@ def _channel_findings(channels: Sequence[ChannelVerdict]) -> Iterator[Finding]:
         values = {**vars(each), "wiring": each.wiring}
         for state in each.states:
             if state not in known:
-                yield Finding(state, each.era, each.gain or 0.0, each.confidence, values)
+                yield Finding(state, each.era, each.gain or 0.0, each.confidence, details=values)
 
 
 def judged_by_promises(verdict: Verdict, rig: Rig) -> Verdict:
@@ -605,7 +644,7 @@ def _check_phases(plate: SensedPlate, shapes: ShapeMatch, values: ComplexArray) 
 def verdict_rows(verdict: Verdict) -> list[str]:
     """Lines of findings with their remedies, or one that all is well."""
     rows = [row for each in verdict.findings for row in each.rows]
-    if not verdict.is_well or verdict.of_kinds(*SENSORS):
+    if not verdict.is_well or verdict.about("sensor"):
         return rows
     if difference_rows(verdict):
         return [*rows, "WIRING WELL: every channel that was driven drives its ERA as the rig says"]
@@ -624,7 +663,7 @@ def difference_rows(verdict: Verdict) -> list[str]:
         if abs(change) >= _MIN_CHANGE
     )
     within = "within tolerances, but not as written: " if verdict.plate_matches else ""
-    if verdict.of_kinds("thickness", "unnamed"):
+    if verdict.about("form"):
         within, changes = "", "by what has no name"
     return [
         f"PLATE DIFFERS: {within}{changes or 'single ERAs or bolts'}; it keeps "
@@ -650,15 +689,15 @@ def channel_table(verdict: Verdict) -> list[str]:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """Verdict as JSON; units are in the keys."""
-    match, beyond = verdict.match, verdict.of_kinds(*_BEYOND)
+    match, beyond = verdict.match, verdict.about("load", "form")
     corrections: dict[str, Any] = {
         "grain": None,
         "resonance_is": {},
         "exchanged_sensors": {},
         "reversed_axes": [],
     }
-    for each in verdict.of_kinds(*_CORRECTIONS):
-        corrections |= each.details["json"]
+    for each in verdict.about("file"):
+        corrections |= each.json
     return {
         "all_well": verdict.is_well,
         "channels": [
@@ -713,7 +752,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
             ],
         },
         "bad_sensors": [
-            {"sensor": each.of, "problem": each.problem} for each in verdict.of_kinds(*SENSORS)
+            {"sensor": each.of, "problem": each.problem} for each in verdict.about("sensor")
         ],
         "sensor_count": len(verdict.sensors),
         "drive_frequencies_hz": verdict.frequencies.tolist(),
@@ -722,17 +761,12 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def _beyond_json(found: Sequence[Finding]) -> dict[str, Any]:
-    first = found[0].details
     return {
         "kind": found[0].kind,
-        "loads": [
-            {key: each.details.get(key) for key in ("x_m", "y_m", "mass_kg")}
-            for each in found
-            if "x_m" in each.details
-        ],
-        "thicker_at_end_of_x": first.get("of_x"),
-        "thicker_at_end_of_y": first.get("of_y"),
-        "farthest": first.get("farthest") or None,
-        "standard_deviations": first.get("standard_deviations") or None,
-        "unexplained": first["error"],
+        "thicker_at_end_of_x": None,
+        "thicker_at_end_of_y": None,
+        "farthest": None,
+        "standard_deviations": None,
+        **found[0].json,
+        "loads": [load for each in found for load in each.json.get("loads", ())],
     }

@@ -28,7 +28,7 @@ from long_form import shortly
 from model.errors import InputError
 from model.estimate import findings
 from model.estimate.calibrate import MAX_OUTLIERS, calibrate, check_consistency
-from model.estimate.findings import MAX_FIT_ERROR, TEXTS, ShapeMatch, match_plate
+from model.estimate.findings import KINDS, MAX_FIT_ERROR, ShapeMatch, match_plate
 from model.estimate.fit import sensed_plate, without_outliers
 from model.estimate.measurement import (
     Measurement,
@@ -326,7 +326,7 @@ def _are_placed(beyond: Mapping[str, Any], case: Mapping[str, Any]) -> None:
 def test_every_kind_of_finding_has_a_scenario_or_a_test() -> None:
     """A new row of text comes with a scenario; a promise takes a table, which others build."""
     shown = {kind for case in SCENARIOS for each in case["finds"] for kind in each}
-    assert TEXTS.keys() - shown == {"promise"}
+    assert KINDS.keys() - shown == {"promise"}
 
 
 @pytest.fixture(scope="module")

@@ -303,6 +303,11 @@ def test_read_measured_reads_csv_of_spreadsheets(responses, coarse_rig, tmp_path
         ("m s-2", 1.0, "\n", "utf-8-sig"),
         ("g", 9.80665, "\r\n", "utf-16"),
         ("mm/s2", 1e-3, "\r\n", "latin-1"),
+        pytest.param("in/s2", 0.0254, "\n", "latin-1", id="inches"),
+        pytest.param("mm/s/s over mm", 1.0, "\n", "latin-1", id="mm"),
+        pytest.param("gn over um", 9.80665e6, "\n", "latin-1", id="um"),
+        pytest.param("g over µm", 9.80665e6, "\n", "utf-8", id="micro"),
+        pytest.param("in/s/s over in", 1.0, "\n", "latin-1", id="over inches"),
     ],
 )
 def test_read_measured_reads_uff_of_analysers(
@@ -314,7 +319,9 @@ def test_read_measured_reads_uff_of_analysers(
     """
     path = tmp_path / "measured.uff"
     write_responses_uff(path, responses, coarse_rig)
-    text = path.read_text("ascii").replace("m/s^2".ljust(20), label.ljust(20))
+    above, _, below = label.partition(" over ")
+    text = path.read_text("ascii").replace("m/s^2".ljust(20), above.ljust(20))
+    text = text.replace(" m".ljust(21), f" {below or 'm'}".ljust(21))
     lines = text.splitlines()
     for number, line in enumerate(lines):
         if re.fullmatch(r"( +-?\d\.\d+e[+-]\d+){3}", line):

@@ -14,7 +14,7 @@ import logging
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
 
@@ -56,16 +56,44 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Intention:
-    """The targets among the contacts on the plate."""
+class Question:
+    """The targets that contents are to be chosen for, among all contacts, and what plays."""
 
     contacts: tuple[Contact, ...]
+    """All on the plate."""
     lasting: Targets
     """Targets of contents that last."""
     short: Targets
     """Targets of short pulses."""
     protected: frozenset[ContactKey] = frozenset()
     """Contacts that must not notice the contents of others."""
+    before: Mapping[tuple[ContactKey, int], Content] = field(default_factory=dict)
+    """Contents that are felt now, by finger and voice."""
+    kept: tuple[Selection, ...] = ()
+    """Selections that play on beside the new ones."""
+    is_rested: bool = False
+    """Whether what plays would do, too, but may be led to what promises more."""
+    now: float = math.inf
+    """[s]"""
+    fading: Selection = _NOTHING
+    """What played before a cross-fade that goes on."""
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether what lasts is one, steady, beside no other finger that is protected."""
+        if len(self.lasting) != 1:
+            return False
+        ((contact, target),) = self.lasting
+        return self.protected <= {contact.key} and target.modulation_hz is None
+
+    @property
+    def takes_long(self) -> bool:
+        """Whether what lasts takes longer than the control loop may wait."""
+        if not self.lasting or self.is_alone:
+            return any(
+                each.course is not None and each.course.duration > _SOON for _, each in self.lasting
+            )
+        return True
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""
@@ -74,32 +102,26 @@ class Intention:
             quiet.remove(contact)
         return tuple(quiet)
 
+    def silent(self, targets: Targets, reason: str) -> Selection:
+        """Return the selection of targets that feel nothing, for a reason."""
+        skipped = tuple(not_served(contact, reason) for contact, _ in targets)
+        quiet = self.quiet_beside(targets)
+        return Selection(targets, quiet, (), reason, skipped, protected=self.protected)
 
-@dataclass(frozen=True)
-class ChoiceRequest:
-    """The targets that contents are to be chosen for, and what plays."""
-
-    intended: Intention
-    """All contacts, and only those targets that are to be chosen for."""
-    before: Mapping[tuple[ContactKey, int], Content]
-    """Contents that are felt now, by finger and voice."""
-    kept: tuple[Selection, ...]
-    """Selections that play on beside the new ones."""
-    takes_long: bool = False
-    """Whether what lasts takes longer than the control loop may wait."""
-    is_rested: bool = False
-    """Whether what plays would do, too, but may be led to what promises more."""
-    now: float = math.inf
-    """[s]"""
-    fading: Selection = _NOTHING
-    """What played before a cross-fade that goes on."""
+    def unanswered(self, reason: str) -> "Choice":
+        """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
+        return Choice(
+            self,
+            None if self.is_rested else self.silent(self.lasting, reason),
+            {each[0].key: self.silent((each,), reason) for each in self.short},
+        )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The selections made for a request."""
+    """The selections made for a question."""
 
-    requested: ChoiceRequest
+    question: Question
     lasting: Selection | None
     short: Mapping[ContactKey, Selection]
     """Selections of short pulses, by finger."""
@@ -116,56 +138,55 @@ class Chooser:
     table: LocalizationTable
     shape: Shape | None = None
 
-    def choose(self, requested: ChoiceRequest, capabilities: PlaybackCapabilities) -> Choice:
-        """Choose for the targets of a request, those that last first."""
-        if requested.is_rested:
-            return Choice(requested, None, {}, steps=self._steps(requested, capabilities))
-        kept, lasting, is_limited = [*requested.kept], None, False
-        if requested.intended.lasting:
-            lasting, is_limited = self._lasting(requested, capabilities)
+    def choose(self, question: Question, capabilities: PlaybackCapabilities) -> Choice:
+        """Choose for the targets of a question, those that last first."""
+        if question.is_rested:
+            return Choice(question, None, {}, steps=self._steps(question, capabilities))
+        kept, lasting, is_limited = [*question.kept], None, False
+        if question.lasting:
+            lasting, is_limited = self._lasting(question, capabilities)
             kept.append(lasting)
         short: dict[ContactKey, Selection] = {}
-        for each in requested.intended.short:
-            beside = [*kept, requested.fading]
+        for each in question.short:
+            beside = [*kept, question.fading]
             left = self._left_by(_contents(beside), capabilities)
-            found = self._chosen(requested, (each,), left, beside)
+            found = self._chosen(question, (each,), left, beside)
             kept.append(found)
-            short[each[0].key] = found.beside([requested.fading], self.table)
-        return Choice(requested, lasting, short, is_limited)
+            short[each[0].key] = found.beside([question.fading], self.table)
+        return Choice(question, lasting, short, is_limited)
 
     def _lasting(
-        self, requested: ChoiceRequest, capabilities: PlaybackCapabilities
+        self, question: Question, capabilities: PlaybackCapabilities
     ) -> tuple[Selection, bool]:
         """Choose what lasts, and whether it is limited by pulses that play.
 
         Beside these what it replaces fades, too.
         """
-        targets = requested.intended.lasting
-        free = self._chosen(requested, targets, capabilities)
-        pulses = _contents(requested.kept) if requested.kept else []
+        targets = question.lasting
+        free = self._chosen(question, targets, capabilities)
+        pulses = _contents(question.kept) if question.kept else []
         if not pulses:
             return free, False
         fading = [
             one
-            for (finger, _), one in requested.before.items()
+            for (finger, _), one in question.before.items()
             if finger in free.target_keys and one not in pulses
         ]
         left = self._left_by([*pulses, *fading], capabilities)
         total = [each.layer for each in free.contents]
         if left.limits.factor_within(total, self.table) >= 1 - NEARLY:
             return free, False
-        limited = self._chosen(requested, targets, left)
+        limited = self._chosen(question, targets, left)
         if not limited.contents:
-            limited = silent(requested.intended, targets, _USED_UP)
+            limited = question.silent(targets, _USED_UP)
         return limited, True
 
     def _steps(
-        self, requested: ChoiceRequest, capabilities: PlaybackCapabilities
+        self, question: Question, capabilities: PlaybackCapabilities
     ) -> tuple[Selection, ...]:
         """Choose the steps from what plays to what promises more; none on any failure."""
-        intended = requested.intended
-        targets, quiet = intended.lasting, intended.quiet_beside(intended.lasting)
-        given = self.table, targets, quiet, capabilities, requested.before, intended.protected
+        targets, quiet = question.lasting, question.quiet_beside(question.lasting)
+        given = self.table, targets, quiet, capabilities, question.before, question.protected
         try:
             return Crossfades(*given, shape=self.shape).steps()
         except Exception as error:
@@ -182,7 +203,7 @@ class Chooser:
 
     def _chosen(
         self,
-        requested: ChoiceRequest,
+        question: Question,
         targets: Targets,
         capabilities: PlaybackCapabilities,
         beside: Sequence[Selection] = (),
@@ -191,12 +212,12 @@ class Chooser:
 
         beside: selections that a pulse is felt beside.
         """
-        table, intended, before = self.table, requested.intended, requested.before
+        table, before = self.table, question.before
         raised = tuple([(contact, _over(target, contact, beside)) for contact, target in targets])
         excitations = [content.layer.excitation.values() for content in _contents(beside)]
         avoided = [*{tone.frequency for tones in excitations for tone in tones}]
-        quiet, protected = intended.quiet_beside(targets), intended.protected
-        is_long = requested.takes_long and not targets[0][1].is_short
+        quiet, protected = question.quiet_beside(targets), question.protected
+        is_long = question.takes_long and not targets[0][1].is_short
         try:
             answer = answered(
                 table,
@@ -206,7 +227,7 @@ class Chooser:
                 before=before,
                 protected=protected,
                 keeps=is_long or _is_step(targets, before),
-                now=requested.now if is_long else math.inf,
+                now=question.now if is_long else math.inf,
                 avoided_hz=avoided,
             )
             if not is_long:
@@ -222,23 +243,15 @@ class Chooser:
                 is_in_phase=is_long,
             )
             if avoided:
-                found = _among(intended, found, avoided)
+                found = _among(question, found, avoided)
         except Exception as error:
             if isinstance(error, InputError):
                 reason = str(error)
             else:
                 _logger.error("loop: table failed, silencing its targets", exc_info=error)
                 reason = failure_text(error)
-            found = silent(intended, targets, reason)
+            found = question.silent(targets, reason)
         return found
-
-
-def is_alone(targets: Targets, protected: frozenset[ContactKey]) -> bool:
-    """Whether targets are one, steady, beside no other finger that is protected."""
-    if len(targets) != 1:
-        return False
-    ((contact, target),) = targets
-    return protected <= {contact.key} and target.modulation_hz is None
 
 
 def _is_step(targets: Targets, before: Mapping[tuple[ContactKey, int], Content]) -> bool:
@@ -275,14 +288,14 @@ def _over(target: Target, contact: Contact, beside: Sequence[Selection]) -> Targ
     return replace(target, level_db_sl=level)
 
 
-def _among(intended: Intention, found: Selection, frequencies: Sequence[float]) -> Selection:
+def _among(question: Question, found: Selection, frequencies: Sequence[float]) -> Selection:
     """Return the selection for a pulse among vibrations of some frequencies [Hz].
 
     It is mixed where it is nearer than 30 Hz to one of them.
     """
     if not found.contents:
         is_used_up = found.reason == LIMITS_LEAVE_NOTHING
-        return silent(intended, found.targets, _USED_UP) if is_used_up else found
+        return question.silent(found.targets, _USED_UP) if is_used_up else found
     (content,) = found.contents
     gap = min([abs((content.frequency or 0.0) - each) for each in frequencies])
     if gap >= APART_HZ - SAME_FREQUENCY:
@@ -293,24 +306,6 @@ def _among(intended: Intention, found: Selection, frequencies: Sequence[float]) 
 
 def _contents(parts: Iterable[Selection]) -> list[Content]:
     return [content for part in parts for content in part.contents]
-
-
-def unanswered(requested: ChoiceRequest, reason: str) -> Choice:
-    """Return a choice in place of one not made: nothing is felt, unless what plays would do."""
-    intended = requested.intended
-    none = silent(intended, intended.lasting, reason)
-    return Choice(
-        requested,
-        None if requested.is_rested else none,
-        {each[0].key: silent(intended, (each,), reason) for each in intended.short},
-    )
-
-
-def silent(intended: Intention, targets: Targets, reason: str) -> Selection:
-    """Return the selection of targets that feel nothing, for a reason."""
-    quiet = intended.quiet_beside(targets)
-    skipped = tuple(not_served(contact, reason) for contact, _ in targets)
-    return Selection(targets, quiet, (), reason, skipped, protected=intended.protected)
 
 
 TIME_LIMIT = 1.0
@@ -345,7 +340,7 @@ _SOON = 5.0  # s; longer courses take longer to answer than the control loop may
 _FADES_FOR = FALL_AFTER + CROSSFADE + FADED_AFTER  # s; what a step leads away from
 
 
-def _is_met_by(intended: Intention, chosen: Selection) -> bool:
+def _is_met_by(intended: Question, chosen: Selection) -> bool:
     """Whether what was chosen also serves what lasts of what is intended now."""
     is_whole, then = chosen.is_whole, chosen.contacts
     requested, had = _targets_of(intended.lasting), _targets_of(chosen.targets)
@@ -354,7 +349,7 @@ def _is_met_by(intended: Intention, chosen: Selection) -> bool:
         return False
     now = {each.key: each for each in intended.contacts}
     same = now.keys() <= then.keys() if is_whole else now.keys() == then.keys()
-    follows = not is_alone(intended.lasting, intended.protected)
+    follows = not intended.is_alone
     return same and all(
         math.dist((contact.x, contact.y), (then[key].x, then[key].y)) <= MOVE_TOLERANCE
         and contact.load == then[key].load
@@ -370,7 +365,7 @@ def _has_set_out(now: Contact, then: Contact) -> bool:
     return has_moved and now.motion.is_under_way and not then.motion.is_under_way
 
 
-def _is_among(intended: Intention, chosen: Selection) -> bool:
+def _is_among(intended: Question, chosen: Selection) -> bool:
     """Whether all contacts were there when it was chosen, and have not lifted since."""
     then = {(each.key, each.since) for each in chosen.contacts.values()}
     return all((each.key, each.since) in then for each in intended.contacts)
@@ -517,7 +512,7 @@ class Selector:
             self._fingers[contact.key] = contact.since
             if before.get(contact.key) != contact.since:
                 came.add(contact.key)
-        intended = Intention(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
+        intended = Question(tuple(contacts), tuple(lasting), tuple(short), intent.protected)
         back = came.intersection([contact.key for contact, _ in self._lasting.targets])
         if back and not _is_met_by(intended, self._lasting):  # who has come back may be elsewhere
             self._lasting = _felt(self._lasting, self._lasting.target_keys - back)
@@ -540,20 +535,18 @@ class Selector:
             self.due = now + _RESTS_AFTER if self.due <= now else self.due
         else:
             chooser = self.chooser
-            for requested in self._to_request(
-                intended, pulses, now, has_waited=arrived is not None
-            ):
-                if requested.intended.lasting:
+            for question in self._questions(intended, pulses, now, has_waited=arrived is not None):
+                if question.lasting:
                     self._requested = situation
-                if not requested.takes_long:
-                    self._take(chooser.choose(requested, capabilities), now)
+                if not question.takes_long:
+                    self._take(chooser.choose(question, capabilities), now)
                 elif self._thread.is_blocked:
-                    self._take(unanswered(requested, BLOCKED), now)
+                    self._take(question.unanswered(BLOCKED), now)
                 else:
                     self.requests += 1
                     self._thread.compute(
-                        partial(chooser.choose, requested, capabilities),
-                        instead=unanswered(requested, GIVEN_UP),
+                        partial(chooser.choose, question, capabilities),
+                        instead=question.unanswered(GIVEN_UP),
                     )
         parts = [_felt(self._lasting, self._fingers.keys()), *self._short.values()]
         found = _together(contacts, targets, parts, skipped, intent.reason, self.chooser.table)
@@ -588,15 +581,15 @@ class Selector:
         if self._lasting.reason in _UNANSWERED:
             self._lasting = _NOTHING
 
-    def _to_request(
+    def _questions(
         self,
-        intended: Intention,
+        intended: Question,
         pulses: Mapping[ContactKey, Selection],
         now: float,
         *,
         has_waited: bool,
-    ) -> Iterator[ChoiceRequest]:
-        """Yield the requests that are due, one after the other.
+    ) -> Iterator[Question]:
+        """Yield the questions that are due, one after the other.
 
         pulses: selections of pulses until now. A pulse that has waited for the thread goes before
         what lasts, after which it would be late.
@@ -604,7 +597,7 @@ class Selector:
         lasting = intended.lasting
         is_kept = not lasting or _is_met_by(intended, self._lasting)
         new = tuple([each for each in intended.short if each[0].key not in self._short])
-        is_due, takes_long = self.due < math.inf and self.due <= now, False
+        is_due = self.due < math.inf and self.due <= now
         if is_due:
             self.due = math.inf
             is_kept = is_kept and not self._is_limited  # by pulses that have ended
@@ -612,11 +605,7 @@ class Selector:
                 each.contact.key in self._fingers for each in self._lasting.not_served
             ):
                 is_kept = False
-        if lasting:
-            takes_long = not is_alone(lasting, intended.protected) or any(
-                each.course is not None and each.course.duration > _SOON for _, each in lasting
-            )
-        is_rested = is_due and is_kept and takes_long
+        is_rested = is_due and is_kept and intended.takes_long
         if is_rested and any(target.course for _, target in lasting):  # which no cross-fade follows
             is_rested = False
         if is_rested:
@@ -633,30 +622,28 @@ class Selector:
         parts = [felt] if is_rested else [felt, *pulses.values()]
         before = {each.key: each for part in parts for each in part.contents}
         if new and (has_waited or is_kept):
-            pulses_alone = replace(intended, lasting=(), short=new)
-            fading = self._fading if now < self._led_at + _FADES_FOR else _NOTHING
-            kept = felt, *self._playing(now)
-            yield ChoiceRequest(pulses_alone, before, kept, fading=fading)
+            yield replace(
+                intended,
+                lasting=(),
+                short=new,
+                before=before,
+                kept=(felt, *self._playing(now)),
+                fading=self._fading if now < self._led_at + _FADES_FOR else _NOTHING,
+            )
             new = ()
         if is_kept and not is_rested:
             return
         if not is_rested:
             self._rest_again(now)
-        yield ChoiceRequest(
-            replace(intended, short=new),
-            before,
-            self._playing(now),
-            takes_long,
-            is_rested,
-            now,
-        )
+        kept = self._playing(now)
+        yield replace(intended, short=new, before=before, kept=kept, is_rested=is_rested, now=now)
 
     def _playing(self, now: float) -> tuple[Selection, ...]:
         """Return the short pulses that have not ended at a time [s]."""
         parts = self._short.values()
         return tuple([part for part in parts if any(now < each.end for each in part.pulses)])
 
-    def _is_intended(self, chosen: Choice, intended: Intention) -> bool:
+    def _is_intended(self, chosen: Choice, intended: Question) -> bool:
         """Whether a late choice of what lasts still serves the contacts on the plate.
 
         Places, levels and courses may have changed since, or such a finger would get nothing; the
@@ -688,11 +675,11 @@ class Selector:
             if self._lasting.reason in _UNANSWERED:
                 self.due = math.inf
             if chosen.is_limited:
-                ends = [pulse.end for part in chosen.requested.kept for pulse in part.pulses]
+                ends = [pulse.end for part in chosen.question.kept for pulse in part.pulses]
                 self.due = max(ends) + FADED_AFTER
 
 
-def _situation_of(intended: Intention) -> tuple[object, ...]:
+def _situation_of(intended: Question) -> tuple[object, ...]:
     """Return a value that changes with the fingers or their targets that last, not with places."""
     contacts = frozenset([(each.key, each.since, each.load) for each in intended.contacts])
     return contacts, _targets_of(intended.lasting), intended.protected

@@ -20,7 +20,7 @@ from controller.effects.layout import SurfaceLayout
 from controller.play.intent import Target
 from controller.play.joint_answers import fingers_of, selection_of
 from controller.play.layer_contents import Selection
-from controller.play.selection import ChoiceRequest, Intention
+from controller.play.selection import Question
 from controller.sources.touch import Contact, ContactKey
 from era_haptics.lab.checks.layout_check import (
     CheckedEffect,
@@ -247,9 +247,8 @@ def _felt(
     contacts = tuple(contact for contact, _ in fingers)
     for one in short:
         key = one[0].key
-        intended = Intention(contacts, (), (one,), protected or frozenset())
-        requested = ChoiceRequest(intended, {}, tuple(beside))
-        chosen = simulator.chooser.choose(requested, simulator.capabilities).short[key]
+        question = Question(contacts, (), (one,), protected or frozenset(), kept=tuple(beside))
+        chosen = simulator.chooser.choose(question, simulator.capabilities).short[key]
         (predicted,) = chosen.beside(beside, simulator.table).predictions
         found[key] = predicted.promised_contrast_db or 0.0, predicted.verdict
         worst = min(worst, found[key][0])

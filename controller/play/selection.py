@@ -15,7 +15,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from operator import itemgetter
 
 from controller.play.intent import FADED_AFTER, HapticIntent, Target
@@ -78,7 +78,7 @@ class Question:
     fading: Selection = _NOTHING
     """What played before a cross-fade that goes on."""
 
-    @property
+    @cached_property
     def is_alone(self) -> bool:
         """Whether what lasts is one, steady, beside no other finger that is protected."""
         if len(self.lasting) != 1:
@@ -86,7 +86,7 @@ class Question:
         ((contact, target),) = self.lasting
         return self.protected <= {contact.key} and target.modulation_hz is None
 
-    @property
+    @cached_property
     def takes_long(self) -> bool:
         """Whether what lasts takes longer than the control loop may wait."""
         if not self.lasting or self.is_alone:

@@ -1,6 +1,6 @@
 """Reading of content: the base of all formats, strict JSON, mixed vibrations, and WAV files.
 
-JSON files are bounded before they are parsed; the line of a key is found when an error needs it.
+JSON files are bounded before they are parsed; the line of every key is kept for errors.
 Vibrations that last at the same time are mixed into one curve of intensity and one of sharpness.
 
 A WAV signal is felt by the strength of its vibration, not by its waveform: it is split into two
@@ -15,7 +15,6 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
@@ -73,11 +72,10 @@ _MAX_VALUES = 5 * MAX_POINTS  # a keyframe of HJIF is four, an event of AHAP thi
 _MAX_NAMED = 5  # unknown keys in remarks
 _EMPTY: tuple[object, ...] = (None, "", [], {})
 
-_SPACE = re.compile(r"[ \t\n\r]*")
 _STRING = r'"[^"\\]*+(?:\\.?+[^"\\]*+)*+"?'  # one without an end, too: no text is read twice
 _STRINGS = re.compile(_STRING, re.DOTALL)
 _TRAILING_COMMA = re.compile(rf"({_STRING})|,(?=[ \t\n\r]*[\]}}])", re.DOTALL)
-_DECODER = json.JSONDecoder(parse_int=float)  # of any number of digits
+_TOKENS = re.compile(rf"{_STRING}|[{{}}\[\],:]|[^\s{{}}\[\],:\"]+", re.DOTALL)
 
 
 _T = TypeVar("_T")
@@ -103,22 +101,7 @@ class ContentSection(Section):
     model_config = ConfigDict(extra="allow", strict=True, frozen=True, allow_inf_nan=False)
 
 
-@dataclass(frozen=True)
-class JsonDocument(Document):
-    """The content of a JSON file; lines are found when asked for."""
-
-    def line_of(self, path: KeyPath) -> int:
-        """Return the line of a key or list entry, or of the nearest one above if it is missing."""
-        start = value = _skipped(self.text, 0)
-        for key in path:
-            found = (where for name, *where in _entries(self.text, value) if name == key)
-            start, value = next(found, (start, -1))
-            if value < 0:
-                break
-        return _line(self.text, start)
-
-
-def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> JsonDocument:
+def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False) -> Document:
     """Read an object; raises ConfigError if it is invalid, nested too deep, or repeats a key."""
     if len(content) > _MAX_SIZE:
         raise refusal(source, f"is larger than {_MAX_SIZE >> 20} MiB; shorten the content")
@@ -128,11 +111,7 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
     _check_size(source, text)
     try:
         # Whole numbers become floats: those of many digits are refused by their size, as 1e999 is.
-        data = json.loads(text, object_pairs_hook=_unique, parse_int=float)
-    except _RepeatedKey:
-        line, path, first = next(_repeated(text, _skipped(text, 0), ()))
-        message = f"is given twice, first on line {first}; remove one"
-        raise refusal(source, message, line=line, key=key_name(path)) from None
+        data = json.loads(text, parse_int=float)
     except json.JSONDecodeError as error:
         is_cut = not text.rstrip().endswith("}")
         remedy = "its end is missing: export it again" if is_cut else "correct it there"
@@ -140,7 +119,7 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         raise refusal(source, message, line=error.lineno) from error
     if not isinstance(data, dict):
         raise refusal(source, "must be an object in braces, got another value", line=1)
-    return JsonDocument(source, text, data, {})
+    return Document(source, text, data, _lines_of(source, text))
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:
@@ -166,26 +145,32 @@ def _extra(value: Any) -> Iterator[str]:
             yield from _extra(getattr(value, name))
 
 
-class _RepeatedKey(Exception):
-    """A key that is given twice."""
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    made = dict(pairs)
-    if len(made) < len(pairs):
-        raise _RepeatedKey
-    return made
-
-
-def _repeated(text: str, at: int, path: KeyPath) -> Iterator[tuple[int, KeyPath, int]]:
-    """Yield the line, the path and the first line of every repeated key."""
-    seen: dict[str | int, int] = {}
-    for key, start, value in _entries(text, at):
-        inner = (*path, key)
-        if key in seen:
-            yield _line(text, start), inner, _line(text, seen[key])
-        seen[key] = start
-        yield from _repeated(text, value, inner)
+def _lines_of(source: str, text: str) -> dict[KeyPath, int]:
+    """Return the line of every key and list entry of JSON; raises ConfigError for a repeat."""
+    lines: dict[KeyPath, int] = {}
+    path: list[str | int] = []  # of the next value
+    line, at, is_key = 1, 0, False
+    for found in _TOKENS.finditer(text):
+        line, at, sign = line + text.count("\n", at, found.start()), found.start(), found[0]
+        if sign in ("}", "]"):
+            path.pop()
+            is_key = False
+        elif sign == ",":
+            last = path[-1]
+            is_key = isinstance(last, str)
+            path[-1] = last if isinstance(last, str) else last + 1
+        elif sign != ":":
+            if is_key:
+                path[-1] = json.loads(sign)
+            where = tuple(path)
+            if is_key and where in lines:
+                message = f"is given twice, first on line {lines[where]}; remove one"
+                raise refusal(source, message, line=line, key=key_name(where))
+            lines.setdefault(where, line)
+            is_key = sign == "{"
+            if sign in ("{", "["):
+                path.append("" if is_key else 0)
+    return lines
 
 
 def _check_size(source: str, text: str) -> None:
@@ -199,31 +184,6 @@ def _check_size(source: str, text: str) -> None:
         raise refusal(source, f"is nested more than {_MAX_LEVELS} levels deep", line=line)
     if np.count_nonzero(opened | (codes == ord(","))) > _MAX_VALUES:
         raise refusal(source, f"has more than {_MAX_VALUES} values; shorten it")
-
-
-def _entries(text: str, at: int) -> Iterator[tuple[str | int, int, int]]:
-    """Yield each key of an object or list, and where it and its value begin."""
-    closing = {"{": "}", "[": "]"}.get(text[at])
-    if closing is None:
-        return
-    at = _skipped(text, at + 1)
-    index = 0
-    while text[at] != closing:
-        start, key = at, index
-        name: str | int = key
-        if closing == "}":
-            name, at = json.decoder.scanstring(text, at + 1)  # type: ignore[attr-defined]
-            at = _skipped(text, _skipped(text, at) + 1)
-        yield name, start, at
-        at = _skipped(text, _DECODER.raw_decode(text, at)[1])
-        at = _skipped(text, at + 1) if text[at] == "," else at
-        index += 1
-
-
-def _skipped(text: str, at: int) -> int:
-    """Return the position of the next character that is no space."""
-    found = _SPACE.match(text, at)
-    return at if found is None else found.end()
 
 
 def _line(text: str, at: int) -> int:

@@ -9,6 +9,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,13 @@ from model.config.document import parse_document
 from model.errors import InputError
 from model.estimate.fit_report import clock_rows, fit_rows, identification_json
 from model.estimate.forward import ForwardModel, Sensor
-from model.estimate.identify import MAX_CHI2, Identification, clock_estimates, identify
+from model.estimate.identify import (
+    MAX_CHI2,
+    Identification,
+    clock_estimates,
+    identify,
+    standard_errors,
+)
 from model.estimate.measurement import Measurement, Repeat
 from model.estimate.space import space_of
 from model.reduction.free_plate import solve_free_plate
@@ -57,12 +64,15 @@ def found(rig: Rig, measurement: Measurement) -> Identification:
 
 
 def test_identified_rig_states_less_uncertainty_but_for_fingers(found: Identification) -> None:
-    """Thickness and springs are known better; drives repeat to 1 %; fingers are as they were."""
+    """Thickness and springs are known better; drives repeat to 1 %; fingers are as they were.
+
+    So are harmonics, of which responses to single tones say nothing.
+    """
     before, after = found.before.uncertainty, found.rig.uncertainty
     assert after.thickness < before.thickness / 5
     assert after.stiffness < before.stiffness / 5
     assert 0.01 <= after.gain < before.gain
-    assert after.fingertip == before.fingertip
+    assert (after.fingertip, after.harmonic) == (before.fingertip, before.harmonic)
 
 
 def test_level_of_all_drives_is_known_as_far_as_four_sensors_tell(found: Identification) -> None:
@@ -179,11 +189,22 @@ def test_errors_of_an_uneven_plate_are_as_wide_as_paths_disagree(rig: Rig) -> No
 
 
 def test_file_with_identified_values_reads_back(found: Identification, tmp_path: Path) -> None:
-    """The rig that stands beside the file is the one identified."""
+    """The rig that stands beside the file is the one identified, with the errors of the table."""
     shutil.copy(example_rig_path(), tmp_path / "rig.yaml")
     path, before = tmp_path / "identified.yaml", load_rig(tmp_path / "rig.yaml")
-    save_fitted(path, before, found.rig, comment="identified")
-    back = load_rig(path)
+    save_fitted(path, before, found.rig, comment="identified", errors=standard_errors(found))
+    back, rows = load_rig(path), identification_json(found, [])["parameters"]
+    printed = {each["name"]: each["standard_error"] for each in rows}
+    assert back.document is not None
+    assert back.document.over is not None
+    written: Any = back.document.over.data["standard_errors"]
+    values = {"thickness": before.plate.thickness, "loss_factor": before.plate.loss_factor}
+    for key, value in values.items():
+        error = 100 * written["plate"][key] / value
+        assert error == pytest.approx(printed[key.replace("_", " ")], rel=0.01)
+    for era in before.eras:
+        error = 100 * written["eras"][era.name]["stiffness"] / era.stiffness
+        assert error == pytest.approx(printed[f"stiffness {era.name}"], rel=0.01)
     assert back.plate.thickness == pytest.approx(found.rig.plate.thickness, rel=1e-5)
     assert pytest.approx(found.rig.plate.material.E, rel=1e-5) == back.plate.material.E
     assert back.plate.loss_exponent == pytest.approx(found.rig.plate.loss_exponent, rel=1e-5)

@@ -1,17 +1,17 @@
 """A plate that settled patterns follow while it is driven, and a table that follows it.
 
 The parameters of an identification drift. Each settled pattern updates them, together with the
-loads of its fingers, which are dropped afterwards: the one fit, with the state before as its prior.
-The noise of readings follows from what updates leave.
+loads of its fingers, which are dropped afterwards: the one fit, with what was known before as its
+prior. The noise of readings follows from what updates leave.
 
 An alarm means that some of the last innovations are unlikely together, or along one change: a
 spring, a gain, the thickness, or a mass in one of many places. The latter is a generalised
 likelihood ratio test, which finds what fingers and noise hide in the sum (M. Basseville, I. V.
 Nikiforov, Detection of Abrupt Changes, 1993, section 2.4.3). One pattern alone raises no alarm,
-since a finger may be unlike any other, but it does not update the state either.
+since a finger may be unlike any other, but it does not update the plate either.
 
-An update would smear a sudden change over all parameters. So after an alarm the state goes back to
-where the odd patterns began and is held, until the patterns since then are explained by one change:
+An update would smear a sudden change over all parameters. So after an alarm what is known goes back
+to where the odd patterns began and is held, until one change explains the patterns since then:
 a hypothesis is a wide prior of the parameters that would have changed. The most likely one costs
 least in a fit of the held patterns, plus a cost for each changed parameter, and is followed. Where
 it still leaves residuals beyond chance, as for a crack or a hand that rests on the plate, the plate
@@ -24,7 +24,7 @@ import json
 import time as clock
 import zipfile
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Self
@@ -125,22 +125,78 @@ class SettledPattern:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
-    """Parameters of a plate as known at a time."""
+class PlateEstimate:
+    """What is known of a plate in service at a time."""
 
+    model: ForwardModel
+    """Forward model of the rig that parameters count from, with a spare mass."""
     x: FloatArray
     """Parameters (p,)."""
     covariance: FloatArray
     """Covariance (p, p) of x."""
     time: float | None = None
     """When it was updated [s], since which it has drifted; None before the first pattern."""
+    is_explained: bool = True
+    """Whether an identification explains the plate, so that patterns update it, not only alarm."""
+    change: str = ""
+    """How it has changed in a way that its parameters do not follow, "" where it has not."""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as it is known now."""
+        before = self.model.rig
+        return rig_with(before, Values.of(before, self.model.space, self.x), before.uncertainty)
+
+    @property
+    def cautious_rig(self) -> Rig:
+        """The rig as last known, with the errors of a plate that was not measured."""
+        return replace(self.rig, uncertainty=widest(self.model.rig.uncertainty))
+
+    @classmethod
+    def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
+        """Start from a rig's `uncertainty`; gains of the sensors are not known.
+
+        What the rig does not state counts as known as well as its thickness, as by identification.
+        """
+        free = solved_for(rig, rig.limits.frequency_max)
+        # Counted in the deviations of a plate that was not measured, which steps are limited by.
+        count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
+        space, stated = (
+            space_of(rig, [each.name for each in sensors], known, masses=1, mode_count=count)
+            for known in (widest(rig.uncertainty), rig.uncertainty)
+        )
+        model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
+        std = np.divide(stated.std, space.std, out=np.zeros(space.size), where=space.uncertain)
+        std[space.of(*_NOT_STATED)] = std[space.index("thickness")]
+        std[space.groups["masses"]] = 0.0
+        return cls(model, np.zeros(space.size), np.diag(std**2))
+
+    def at(self, time: float) -> Self:
+        """Return it for a later time [s], less certain by the drift since its last update."""
+        space = self.model.space
+        hours = 0.0 if self.time is None else max(time - self.time, 0.0) / 3600
+        drift, limits = (
+            (space.of_kinds(of) / space.scale) ** 2
+            for of in (lambda kind: kind.drift, lambda kind: kind.widest)
+        )
+        room = np.maximum(limits - np.diag(self.covariance), 0.0)
+        further = np.diag(np.minimum(drift * hours, room))
+        return replace(self, covariance=self.covariance + further)
+
+
+def widest(uncertainty: Uncertainty) -> Uncertainty:
+    """The larger of each standard deviation and that of a plate that was not measured."""
+    names, built = [each.name for each in fields(Uncertainty)], Uncertainty()
+    return Uncertainty(
+        **{name: max(getattr(uncertainty, name), getattr(built, name)) for name in names}
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class StateUpdate:
-    """A state after some patterns, with the innovation in standard deviations."""
+class PlateUpdate:
+    """A plate after some patterns, with the innovation in standard deviations."""
 
-    state: State
+    known: PlateEstimate
     fit: Fit
     """Fit of plate and fingers."""
     innovation: FloatArray
@@ -163,20 +219,20 @@ class StateUpdate:
 
 
 def update(
-    model: ForwardModel,
-    before: State,
+    before: PlateEstimate,
     patterns: Sequence[SettledPattern],
     *,
     evaluations: int = _EVALUATIONS,
     start: FloatArray | None = None,
     theory: FloatArray | None = None,
-) -> StateUpdate:
-    """Find the most likely state after patterns, within its bounds.
+) -> PlateUpdate:
+    """Find the most likely plate after patterns, within its bounds.
 
-    model: of the plate without fingers. evaluations: of the model, at most; start: of the plate
-    (p,), or of plate and fingers, by default the state before; theory (p,): variances of the
-    theory's errors, which count only in the likelihood of the innovation.
+    evaluations: of the model, at most; start: of the plate (p,), or of plate and fingers, by
+    default what was known before; theory (p,): variances of the theory's errors, which count only
+    in the likelihood of the innovation.
     """
+    model = before.model
     fingers = [replace(f, tone=n) for n, each in enumerate(patterns) for f in each.fingers]
     parts, p = len(FINGER_PARTS), len(before.x)
     names = [f"finger part {number}" for number in range(parts * len(fingers))]
@@ -223,8 +279,9 @@ def update(
     wrong[:p] = 0.0 if theory is None else theory
     # In the slopes where it ended: those before are wrong for a finger of another load.
     expected = H @ (P @ H.T + wrong[:, None] * H.T) + np.eye(len(left))
-    return StateUpdate(
-        State(found.x[:p], (covariance + covariance.T) / 2, patterns[-1].time),
+    covariance = (covariance + covariance.T) / 2
+    return PlateUpdate(
+        replace(before, x=found.x[:p], covariance=covariance, time=patterns[-1].time),
         found,
         H @ (found.x - mean) - left,
         linalg.inv(expected),
@@ -256,10 +313,10 @@ class NoiseLevel:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A pattern with the state before it and its innovation, along d directions of change."""
+    """A pattern with the plate before it and its innovation, along d directions of change."""
 
     pattern: SettledPattern
-    before: State
+    before: PlateEstimate
     nis: float
     count: int
     """Number of real numbers in the innovation."""
@@ -271,7 +328,7 @@ class Observation:
     """Number of the last directions, masses, which can only grow."""
 
     @classmethod
-    def of(cls, pattern: SettledPattern, before: State, found: StateUpdate) -> Self:
+    def of(cls, pattern: SettledPattern, before: PlateEstimate, found: PlateUpdate) -> Self:
         """Make it of a pattern and its update."""
         best = found.fit
         driven = best.measurement.driven
@@ -344,18 +401,25 @@ def _squares(slopes: FloatArray, curvatures: FloatArray, masses: int) -> FloatAr
 
 @dataclass(frozen=True, eq=False)
 class PlateChange:
-    """Explanation of some patterns by one change of the plate."""
+    """One change of the plate that may have happened, with a fit of patterns that supposes it."""
 
     name: str
-    """Name of the change, "" if none explains them."""
+    """Name of the change, "" where none explains the patterns."""
+    widened: Mapping[int, float]
+    """Deviation by which each changed parameter may have changed, in its unit."""
+    after: PlateUpdate
+    """The plate after the change."""
     change: float
     """Size of the change: of a mass in kg, of others the logarithm of a factor."""
-    lead: float
+    lead: float = 0.0
     """Further cost of the next best explanation."""
-    state: State
-    """State of the plate after the change."""
     resembles: str = ""
     """Name of the change that explains most, though not enough."""
+
+    @property
+    def likelihood(self) -> float:
+        """Less the cost of residuals and changes, and of supposing a change."""
+        return -(2 * self.after.fit.cost + _COST_OF_CHANGE * len(self.widened))
 
     def __str__(self) -> str:
         if self.name == BY_MASS:
@@ -365,61 +429,44 @@ class PlateChange:
         return f"the plate has changed, most as if {self.resembles} had"
 
 
-@dataclass(frozen=True, eq=False)
-class Supposition:
-    """A change that may have happened, with a fit of the patterns that supposes it."""
-
-    name: str
-    changed: dict[int, float]
-    """Deviation by which each changed parameter may have changed, in its unit."""
-    after: StateUpdate
-
-    @property
-    def likelihood(self) -> float:
-        """Less the cost of residuals and changes, and of supposing a change."""
-        return -(2 * self.after.fit.cost + _COST_OF_CHANGE * len(self.changed))
-
-
-def explain(model: ForwardModel, before: State, patterns: Sequence[SettledPattern]) -> PlateChange:
-    """Find the one change that explains patterns, from the state before it."""
-    space = model.space
+def explain(known: PlateEstimate, patterns: Sequence[SettledPattern]) -> PlateChange:
+    """Find the one change that explains patterns, from the plate as known before it."""
 
     def supposed(
-        name: str, changed: dict[int, float], start: FloatArray | None, evaluations: int
-    ) -> Supposition:
-        covariance = before.covariance.copy()
-        for number, std in changed.items():
-            covariance[number, number] += (std / space.std[number]) ** 2
-        prior = replace(before, covariance=covariance)
-        after = update(model, prior, patterns, evaluations=evaluations, start=start)
-        return Supposition(name, changed, after)
+        name: str, widened: Mapping[int, float], start: FloatArray | None, evaluations: int
+    ) -> PlateChange:
+        std, covariance = known.model.space.std, known.covariance.copy()
+        for number, deviation in widened.items():
+            covariance[number, number] += (deviation / std[number]) ** 2
+        prior = replace(known, covariance=covariance)
+        after = update(prior, patterns, evaluations=evaluations, start=start)
+        first = next(iter(widened))
+        change = float(std[first] * (after.known.x[first] - known.x[first]))
+        return PlateChange(name, widened, after, change)
 
-    tried = [supposed(*each, _FIRST_EVALUATIONS) for each in _hypotheses(model, before, patterns)]
+    tried = [supposed(*each, _FIRST_EVALUATIONS) for each in _hypotheses(known, patterns)]
     tried = ranked_by(tried, lambda each: each.likelihood)
-    followed = {*list(dict.fromkeys(each.name for each in tried))[:_FOLLOWED]}
     least = tried[0].likelihood - _WITHIN_REACH
-    for number, each in enumerate(tried):
-        if each.name in followed and each.likelihood >= least:
-            followed.remove(each.name)
-            x = each.after.fit.x
-            tried[number] = supposed(each.name, each.changed, x, _LAST_EVALUATIONS)
+    best_of_name = {each.name: number for number, each in reversed([*enumerate(tried)])}
+    for number in sorted(best_of_name.values())[:_FOLLOWED]:
+        if (each := tried[number]).likelihood >= least:
+            start = each.after.fit.x
+            tried[number] = supposed(each.name, each.widened, start, _LAST_EVALUATIONS)
     best, *others = ranked_by(tried, lambda each: each.likelihood)
     if chdtrc(len(best.after.innovation), -best.likelihood) < _UNLIKELY:
-        return PlateChange("", 0.0, 0.0, before, resembles=best.name)
-    index, state = next(iter(best.changed)), best.after.state
-    change = float(space.std[index] * (state.x[index] - before.x[index]))
+        return replace(best, name="", resembles=best.name)
     rival = max(each.likelihood for each in others if each.name != best.name)
-    return PlateChange(best.name, change, best.likelihood - rival, state)
+    return replace(best, lead=best.likelihood - rival)
 
 
 def _hypotheses(
-    model: ForwardModel, before: State, patterns: Sequence[SettledPattern]
-) -> Iterator[tuple[str, dict[int, float], FloatArray | None]]:
+    known: PlateEstimate, patterns: Sequence[SettledPattern]
+) -> Iterator[tuple[str, Mapping[int, float], FloatArray | None]]:
     """All that may have changed, by name: with what, how far, and where a fit starts.
 
     A mass starts where it would explain most. A new kind of change is one more of them.
     """
-    space, plate = model.space, model.rig.plate
+    space, plate = known.model.space, known.model.rig.plate
     kinds = [(space.names[n], {n: _SPRING}) for n in space.indices("stiffness")]
     for gain, phase in zip(space.indices("gain"), space.indices("phase"), strict=True):
         kinds.append((space.names[gain], {gain: _GAIN, phase: _PHASE}))
@@ -429,9 +476,9 @@ def _hypotheses(
             yield name, changed, None
     points, mass = PLACES.centres(plate), space.groups["masses"].stop - 3
     own, sides = slice(mass, mass + 3), np.array([plate.length, plate.width])
-    unchanged = update(model, before, patterns, evaluations=1).fit
+    unchanged = update(known, patterns, evaluations=1).fit
     for number, size in unchanged.loads(points, std=_MASS)[:_STARTS]:
-        start = before.x.copy()
+        start = known.x.copy()
         start[own] = [size, *(points[number] - sides / 2)] / space.std[own]
         yield BY_MASS, dict(zip(range(mass, mass + 3), [_MASS, *sides / 3], strict=True)), start
 
@@ -447,62 +494,9 @@ class PatternReport:
     alarm: bool = False
     """Whether it began an alarm; not while the plate counts as changed."""
     is_held: bool = False
-    """Whether the state waits for an explanation."""
+    """Whether patterns wait for an explanation."""
     explanation: PlateChange | None = None
     """The change that explains the held patterns, if it was found now."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlateEstimate:
-    """What is known of a plate in service."""
-
-    before: Rig
-    """The rig that parameters count from."""
-    model: ForwardModel
-    """Forward model with a spare mass."""
-    state: State
-    is_explained: bool = True
-    """Whether an identification explains the plate, so that patterns update it, not only alarm."""
-    change: str = ""
-    """How it has changed in a way that its parameters do not follow, "" where it has not."""
-
-    @property
-    def rig(self) -> Rig:
-        """The rig as it is known now."""
-        values = Values.of(self.before, self.model.space, self.state.x)
-        return rig_with(self.before, values, self.before.uncertainty)
-
-    @property
-    def cautious_rig(self) -> Rig:
-        """The rig as last known, with the errors of a plate that was not measured."""
-        return replace(self.rig, uncertainty=widest(self.before.uncertainty))
-
-    @classmethod
-    def of_rig(cls, rig: Rig, sensors: Sequence[Sensor]) -> Self:
-        """Start from a rig's `uncertainty`; gains of the sensors are not known.
-
-        What the rig does not state counts as known as well as its thickness, as by identification.
-        """
-        free = solved_for(rig, rig.limits.frequency_max)
-        # Counted in the deviations of a plate that was not measured, which steps are limited by.
-        count = len(lowest_elastic(free.modes.eigenvalues, MODE_SHIFTS))
-        space, stated = (
-            space_of(rig, [each.name for each in sensors], known, masses=1, mode_count=count)
-            for known in (widest(rig.uncertainty), rig.uncertainty)
-        )
-        model = ForwardModel(rig, sensors, np.array([rig.limits.frequency_max]), space, free)
-        std = np.divide(stated.std, space.std, out=np.zeros(space.size), where=space.uncertain)
-        std[space.of(*_NOT_STATED)] = std[space.index("thickness")]
-        std[space.groups["masses"]] = 0.0
-        return cls(rig, model, State(np.zeros(space.size), np.diag(std**2)))
-
-
-def widest(uncertainty: Uncertainty) -> Uncertainty:
-    """The larger of each standard deviation and that of a plate that was not measured."""
-    names, built = [each.name for each in fields(Uncertainty)], Uncertainty()
-    return Uncertainty(
-        **{name: max(getattr(uncertainty, name), getattr(built, name)) for name in names}
-    )
 
 
 class LivePlate:
@@ -517,61 +511,46 @@ class LivePlate:
         self._suspects = 0
 
     def take(self, pattern: SettledPattern) -> PatternReport:
-        """Take a settled pattern: update the state, or hold it and explain what happened."""
+        """Take a settled pattern: update what is known, or hold it and explain what happened."""
         pattern, known = replace(pattern, noise=self._noise.relative), self.known
-        if known.state.time is None:
-            known = self.known = replace(known, state=replace(known.state, time=pattern.time))
+        if known.time is None:
+            known = self.known = replace(known, time=pattern.time)
         if self._held:
             self._held.append(pattern)
             return self._explained(pattern.time)
         space = known.model.space
         theory = (space.of_kinds(lambda kind: kind.theory) / space.scale) ** 2
-        after = update(known.model, self._drifted(pattern.time), [pattern], theory=theory)
-        suspect = self._alarm.take(Observation.of(pattern, known.state, after))
+        after = update(known.at(pattern.time), [pattern], theory=theory)
+        suspect = self._alarm.take(Observation.of(pattern, known, after))
         report = PatternReport(after.nis, len(after.innovation))
         if suspect is not None:
             self._alarm = Alarm()
             if known.is_explained and not known.change:
-                self.known = replace(known, state=suspect[0].before)
+                self.known = replace(suspect[0].before, change="")
                 self._held, self._suspects = [each.pattern for each in suspect], len(suspect)
                 report = self._explained(pattern.time)
             return replace(report, alarm=not known.change)
         if known.change and self._alarm.is_full:
             known = self.known = replace(known, change="")
         if known.is_explained and not known.change and not self._alarm.is_odd:
-            self.known = replace(known, state=after.state)
+            self.known = replace(after.known, change="")
             self._noise.take(after.misfit, after.freedom)
         return report
 
     def _explained(self, time: float) -> PatternReport:
         """Explain the held patterns, early if the explanation is certain."""
-        count, model, before = len(self._held), self.known.model, self._drifted(time)
+        count, before = len(self._held), self.known.at(time)
         is_full = count >= max(_MAX_EXPLAINED, self._suspects + _AFTER_ALARM)
-        found = explain(model, before, self._held) if count >= _MIN_EXPLAINED else None
+        found = explain(before, self._held) if count >= _MIN_EXPLAINED else None
         if is_full and found and not found.name:
             # The first of them may be from before the change.
-            later = explain(model, before, self._held[-_MIN_EXPLAINED:])
+            later = explain(before, self._held[-_MIN_EXPLAINED:])
             found = later if later.name else found
         if found is None or not (is_full or (found.name and found.lead > _CERTAIN)):
             return PatternReport(is_held=True)
         self._held = []
-        if found.name:
-            self.known = replace(self.known, state=found.state)
-        else:
-            self.known = replace(self.known, change=str(found))
+        self.known = found.after.known if found.name else replace(self.known, change=str(found))
         return PatternReport(explanation=found)
-
-    def _drifted(self, time: float) -> State:
-        """The state at a time [s], less certain by the drift since its last update."""
-        state, space = self.known.state, self.known.model.space
-        hours = 0.0 if state.time is None else max(time - state.time, 0.0) / 3600
-        drift, limits = (
-            (space.of_kinds(of) / space.scale) ** 2
-            for of in (lambda kind: kind.drift, lambda kind: kind.widest)
-        )
-        room = np.maximum(limits - np.diag(state.covariance), 0.0)
-        further = np.diag(np.minimum(drift * hours, room))
-        return replace(state, covariance=state.covariance + further)
 
 
 class LearnedTable:
@@ -598,34 +577,31 @@ class LearnedTable:
             return
         header, x, covariance = load_learned(self._file, table=self._table.fingerprint)
         known = self.live.known
-        expected = known.model.space.names, known.before.fingerprint
+        expected = known.model.space.names, known.model.rig.fingerprint
         if (tuple(header["names"]), header["base"]) != expected:
             raise InputError(
                 f"{self._file}: parameters must be those of this rig and its sensors; remove the "
                 "file to learn anew"
             )
-        age = max(clock.time() - self._file.stat().st_mtime, 0.0)
-        state = State(x, covariance, now - age)
-        self.live = LivePlate(replace(known, state=state, change=header["change"]))
+        then = now - max(clock.time() - self._file.stat().st_mtime, 0.0)
+        known = replace(known, x=x, covariance=covariance, time=then, change=header["change"])
+        self.live = LivePlate(known)
         self.current = self._followed()
 
     def take(self, pattern: SettledPattern) -> tuple[PatternReport, LocalizationTable | None]:
         """Take a settled pattern, and correct the table by it; None where that stays the same.
 
         Raises InputError or another ValueError for a pattern that leads to a plate that no table
-        can follow; the state before it is restored, suspect patterns are discarded.
+        can follow; what was known before is restored, suspect patterns are discarded.
         """
         if not np.isfinite(pattern.values).all() or not np.any(pattern.values):
             raise InputError("readings must be finite and not all 0, got others")
         before = self.live.known
         try:
             report, known = self.live.take(pattern), self.live.known
-            if (
-                not np.isfinite(known.state.x).all()
-                or not np.isfinite(known.state.covariance).all()
-            ):
+            if not np.isfinite(known.x).all() or not np.isfinite(known.covariance).all():
                 raise InputError("parameters must be finite after a pattern, got others")
-            if known.state.x is before.state.x and bool(known.change) == bool(before.change):
+            if known.x is before.x and bool(known.change) == bool(before.change):
                 return report, None
             self.current = self._followed()
         except Exception:
@@ -640,16 +616,16 @@ class LearnedTable:
 
     def save(self) -> None:
         """Write what was learned, atomically; raises OSError."""
-        known, state = self.live.known, self.live.known.state
+        known = self.live.known
         header = {
             "version": _VERSION,
             "table": self._table.fingerprint,
-            "base": known.before.fingerprint,
+            "base": known.model.rig.fingerprint,
             "names": known.model.space.names,
             "change": known.change,
         }
         text = json.dumps(header).encode()
-        arrays = {"x": state.x, "covariance": state.covariance}
+        arrays = {"x": known.x, "covariance": known.covariance}
         written = {"header": text, "digest": _digest(text, *arrays.values())}
         texts = {name: np.frombuffer(each, dtype=np.uint8) for name, each in written.items()}
         write_arrays(self._file, arrays | texts)

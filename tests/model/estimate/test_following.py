@@ -55,7 +55,7 @@ POINTS = np.array([[0.06, 0.05], [0.15, 0.11], [0.26, 0.17], [0.22, 0.04]])
 @pytest.fixture(scope="module")
 def table(known: PlateEstimate) -> LocalizationTable:
     """The table of the identified rig at a few tones."""
-    return build_table(known.before, frequencies=TONES, drive_mode="phased")
+    return build_table(known.model.rig, frequencies=TONES, drive_mode="phased")
 
 
 def resumed(table: LocalizationTable, known: PlateEstimate, file: Path) -> LearnedTable:
@@ -145,16 +145,14 @@ def test_what_was_learned_is_resumed_for_its_table_only(
     learned.save()
     again = resumed(table, known, file)
     assert not again.live.known.change
-    np.testing.assert_array_equal(
-        again.live.known.state.covariance, learned.live.known.state.covariance
-    )
+    np.testing.assert_array_equal(again.live.known.covariance, learned.live.known.covariance)
     np.testing.assert_array_equal(
         again.current.unit_fields(POINTS), learned.current.unit_fields(POINTS)
     )
     with pytest.raises(InputError, match="this table"):
         resumed(replace(table, masses=()), known, file)
     with pytest.raises(InputError, match="this rig"):
-        resumed(table, PlateEstimate.of_rig(known.before, known.model.sensors[:2]), file)
+        resumed(table, PlateEstimate.of_rig(known.model.rig, known.model.sensors[:2]), file)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(bytes(content))
@@ -187,11 +185,11 @@ def test_an_idle_plate_is_known_at_least_as_one_that_nobody_measured(
     known: PlateEstimate,
 ) -> None:
     """Thickness by 1 % more after an hour; after two weeks by 2 %, stiffness by 10 %."""
-    live = LivePlate(replace(known, state=replace(known.state, time=0.0)))
+    live = LivePlate(replace(known, time=0.0))
     space = live.known.model.space
 
     def known(kind: str, hours: float) -> float:
-        after = np.sqrt(np.diag(live._drifted(3600.0 * hours).covariance))
+        after = np.sqrt(np.diag(live.known.at(3600.0 * hours).covariance))
         return float(np.max((space.std * after)[space.groups[kind]]))
 
     begun = known("thickness", 0.0)
@@ -226,9 +224,9 @@ def test_heavy_finger_is_no_change(hidden: Hidden, known: PlateEstimate) -> None
 def test_plate_that_was_not_explained_is_not_updated(hidden: Hidden, known: PlateEstimate) -> None:
     """After an identification with chi² above 2 patterns leave the state as it was."""
     live = LivePlate(replace(known, is_explained=False))
-    before = live.known.state
+    before = live.known.x
     played(live.take, hidden, hidden.mounted, count=2)
-    assert live.known.state.x is before.x
+    assert live.known.x is before
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,10 +280,10 @@ def test_change_that_nothing_explains_is_said_until_it_is_gone(
     (explanation,) = (each.explanation for each in reports if each.explanation)
     assert explanation.name == ""
     assert live.known.change
-    before = live.known.state
+    before = live.known.x
     played(live.take, hidden, hidden.mounted, count=9, start=16)
     assert not live.known.change
-    assert live.known.state is not before
+    assert live.known.x is not before
 
 
 @pytest.mark.long
@@ -383,7 +381,7 @@ def state_after(drawn: PlateEstimate, pattern: SettledPattern) -> FloatArray:
     """Parameters after the pattern."""
     live = LivePlate(drawn)
     live.take(pattern)
-    return live.known.state.x
+    return live.known.x
 
 
 def test_update_does_not_depend_on_a_phase_that_is_unknown(
@@ -405,7 +403,7 @@ def test_update_within_bounds_explains_a_pattern(
     A hundred parameters are free for eight numbers: at the most likely state these are explained to
     their errors, by no more changes than eight directions of the prior are likely to make.
     """
-    found = update(drawn.model, drawn.state, [pattern])
+    found = update(drawn, [pattern])
     count = len(found.innovation)
     assert count == 2 * len(pattern.values)
     assert found.misfit < count
@@ -415,7 +413,7 @@ def test_update_within_bounds_explains_a_pattern(
     assert (found.fit.x <= space.upper).all()
     # What the fit predicts is what the plate does under the fingers that it found.
     rows, own = found.fit.plate.responses[0], found.fit.x[: drawn.model.space.size]
-    np.testing.assert_array_equal(found.state.x, own)
+    np.testing.assert_array_equal(found.known.x, own)
     np.testing.assert_allclose(found.fit.predicted[0, :, 0], rows @ pattern.bases)
 
 
@@ -426,13 +424,13 @@ def test_patterns_together_are_those_alone(drawn: PlateEstimate) -> None:
     """
     hidden = draw("form", 1)
     several = [*settled_patterns(hidden, hidden.mounted, count=3, start=0)]
-    whole = update(drawn.model, drawn.state, several, evaluations=1)
+    whole = update(drawn, several, evaluations=1)
     for number, each in enumerate(several):
-        (alone,) = update(drawn.model, drawn.state, [each], evaluations=1).fit.predicted
+        (alone,) = update(drawn, [each], evaluations=1).fit.predicted
         np.testing.assert_allclose(whole.fit.predicted[number], alone, rtol=1e-9)
-    certain = np.diag(whole.state.covariance)
+    certain = np.diag(whole.known.covariance)
     for each in several:
-        after = update(drawn.model, drawn.state, [each], evaluations=1).state
+        after = update(drawn, [each], evaluations=1).known
         assert (certain <= np.diag(after.covariance) + 1e-9).all()
 
 
@@ -444,8 +442,8 @@ def test_numbers_change_as_their_derivatives_say(
     size, step = drawn.model.space.size, 1e-5
 
     def fitted(x: FloatArray) -> Fit:
-        exact = replace(drawn.state, covariance=np.eye(size))
-        return update(drawn.model, exact, [without], evaluations=1, start=x).fit
+        exact = replace(drawn, covariance=np.eye(size))
+        return update(exact, [without], evaluations=1, start=x).fit
 
     centre = np.full(size, 0.2)
     _, J = fitted(centre).of_values

@@ -330,11 +330,11 @@ class Learning:
 
     async def close(self) -> None:
         """End the estimator, which keeps what it has learned."""
-        self._end_outage()
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
             self._task = None
+        self._end_outage()
 
     async def _run(self) -> None:
         """Follow the plate until cancelled, or until that fails for good."""
@@ -347,7 +347,7 @@ class Learning:
                 reading.cancel()
         except Exception as error:
             _logger.exception("plate: learning failed")
-            self._say_failed(failure_text(error))
+            self._fail(failure_text(error))
         finally:
             self._waiting = asyncio.Queue(MAX_WAITING)
 
@@ -386,12 +386,11 @@ class Learning:
             finally:
                 self.worker, self._in_hand = None, 0
             failures = 1 if self._counts["estimates"] > estimates else failures + 1
-            self._start_outage()
             if failures >= MAX_FAILURES:
-                self._say_failed(f"estimator: {reason}")
+                self._fail(f"estimator: {reason}")
                 return
             self._counts["restarts"] += 1
-            self._say_failed(f"estimator: {reason}; retrying")
+            self._fail(f"estimator: {reason}; retrying")
             await asyncio.sleep(backoff.pause(ran_for=threads.now() - started_at))
 
     async def _estimate(self) -> None:
@@ -421,27 +420,23 @@ class Learning:
                 if threads.now() >= shape_at and not self._is_shaped:
                     await self._shape()
                     shape_at = threads.now() + _SHAPE_INTERVAL
-                if (pattern := await self._pattern_until(keep_at)) is not None:
-                    self._in_hand = 1
-                    report = await worker.call(ESTIMATE_LIMIT, Estimator.take, pattern)
-                    self._in_hand = 0
-                    self._follow(report, pattern)
-                else:
+                try:
+                    async with asyncio.timeout_at(keep_at):
+                        pattern = await self._waiting.get()
+                except TimeoutError:
                     keep_at = threads.now() + _KEEP_INTERVAL
                     note, cautious = await worker.call(ESTIMATE_LIMIT, Estimator.keep)
                     self._note(note)
                     self._cautious = cautious or self._cautious
+                    continue
+                self._in_hand = 1
+                report = await worker.call(ESTIMATE_LIMIT, Estimator.take, pattern)
+                self._in_hand = 0
+                self._follow(report, pattern)
         finally:
             with contextlib.suppress(Exception):
                 await worker.call(_CLOSE_LIMIT, Estimator.keep)
             worker.end()
-
-    async def _pattern_until(self, moment: float) -> SettledPattern | None:
-        """The next pattern, None at a moment [s]."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout_at(moment):
-                return await self._waiting.get()
-        return None
 
     def _hand(self, pattern: SettledPattern) -> None:
         self._counts["readings"] += 1
@@ -488,12 +483,6 @@ class Learning:
         self._controller.replace_answers(table, timing)
         self.event = self.event.model_copy(update={"cautious": is_cautious})
 
-    def _start_outage(self) -> None:
-        """Answer cautiously after a while, unless the plate is watched again by then."""
-        if self._outage is None:
-            loop = asyncio.get_running_loop()
-            self._outage = loop.call_later(CAUTIOUS_AFTER, self._answer_cautiously)
-
     def _end_outage(self) -> None:
         if self._outage is not None:
             self._outage.cancel()
@@ -522,8 +511,12 @@ class Learning:
         _logger.log(level, "plate: %s: %s", words, cause, extra={"topic": "plate"})
         self._changed(self.event)
 
-    def _say_failed(self, cause: str) -> None:
+    def _fail(self, cause: str) -> None:
+        """Say why the plate is not watched; after a while answers are cautious, unless it is."""
         self._say("off", cause, _FAILED_REMEDY, is_bad=True)
+        if self._outage is None:
+            loop = asyncio.get_running_loop()
+            self._outage = loop.call_later(CAUTIOUS_AFTER, self._answer_cautiously)
 
     async def _read(self) -> None:
         """Read settled patterns; report failures and start again after them."""
@@ -532,7 +525,5 @@ class Learning:
                 await self.readings.run()
             except Exception as error:
                 _logger.exception("plate: readings failed")
-                cause = f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s"
-                self._say_failed(cause)
-                self._start_outage()
+                self._fail(f"readings: {failure_text(error)}; retrying every {_PAUSE:g} s")
             await asyncio.sleep(_PAUSE)

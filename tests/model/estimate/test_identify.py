@@ -206,6 +206,10 @@ def test_file_with_identified_values_reads_back(found: Identification, tmp_path:
     for era in before.eras:
         error = 100 * written["eras"][era.name]["stiffness"] / era.stiffness
         assert error == pytest.approx(printed[f"stiffness {era.name}"], rel=0.01)
+    differences = {each["name"]: each["difference"] for each in rows}
+    for era, other in zip(before.eras, back.eras, strict=True):
+        expected = 100 * (other.stiffness / era.stiffness - 1)
+        assert differences[f"stiffness {era.name}"] == pytest.approx(expected, rel=1e-3)
     assert back.plate.thickness == pytest.approx(found.rig.plate.thickness, rel=1e-5)
     assert pytest.approx(found.rig.plate.material.E, rel=1e-5) == back.plate.material.E
     assert back.plate.loss_exponent == pytest.approx(found.rig.plate.loss_exponent, rel=1e-5)

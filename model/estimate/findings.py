@@ -121,7 +121,7 @@ _FORM = {
 
 
 @dataclass(frozen=True)
-class Kind:
+class FindingKind:
     """A kind of finding."""
 
     text: str
@@ -135,117 +135,119 @@ class Kind:
 
 
 KINDS = {
-    "mirrored": Kind(
+    "mirrored": FindingKind(
         "PLACES: places of sensors must be from the corner from which those of ERAs are, "
         "got ones mirrored in {of}: {coarse}; correct the positions of all{or_plugs}",
         "file",
     ),
-    "reversed": Kind(
+    "reversed": FindingKind(
         "PLACES: frequencies must be those of their responses, got reversed ones: {coarse}", "file"
     ),
-    "exchanged": Kind(
+    "exchanged": FindingKind(
         "PLACES: sensors must be at their places, got responses that fit exchanged ones: "
         "{of}; correct their positions or names",
         "file",
     ),
-    "grain": Kind(
+    "grain": FindingKind(
         "GRAIN: plate.grain must be {along}, got {as_written}: with the grain along its {along} a "
         "coarse fit leaves {percent} of the responses unexplained, along its {as_written} "
         "{percent_as_written}; look at the veneer of its faces, and correct the rig",
         "file",
     ),
-    "resonance": Kind(
+    "resonance": FindingKind(
         "RESONANCE: resonance_is of {of} must be {which}, got {as_written}: with it "
         "{which} a glued magnet resonates at {value:.0f} Hz, and gains vary by a factor of "
         "{factor:.2g} over frequency, as written by {factor_as_written:.2g}; correct the rig",
         "file",
     ),
-    "swapped": Kind(
+    "swapped": FindingKind(
         "SWAPPED: {one} drives ERA {second}, and {other} drives ERA {first} (confidence "
         "{confidence:.3f}): exchange the two plugs, or the channels in the rig"
     ),
-    "cycle": Kind(
+    "cycle": FindingKind(
         "SWAPPED in a cycle: the channels of {of} each drive the next one's ERA (confidence "
         "{confidence:.3f}): correct the plugs"
     ),
-    "all strong or weak": Kind(
+    "all strong or weak": FindingKind(
         "{state}: the channels of {of} play {least:.2f} to {value:.2f} of the "
         "commanded amplitude: check the sensors' sensitivity first, which makes all of them so "
         "together; then the amplifier's volume"
     ),
-    "all inverted": Kind(
+    "all inverted": FindingKind(
         "INVERTED: all channels have the sign that is opposite to the sensors': turn "
         "the sensors over, swap the two wires of every ERA, or check the sign convention of phases"
     ),
-    "dead": Kind(
+    "dead": FindingKind(
         "DEAD: {wiring} does not move the plate: check its supply, its cable and the "
         "amplifier's channel"
     ),
-    "loose": Kind(
+    "loose": FindingKind(
         "LOOSE: {wiring} acts on the plate with a part of its contact only, as an exciter "
         "whose glue is off: press it on or glue it anew, and measure again"
     ),
-    "weak": Kind(
+    "weak": FindingKind(
         "WEAK: {wiring} plays {value:.2f} of the commanded amplitude: check its voltage, "
         "volume and mounting, or measure its gain with `era calibrate`"
     ),
-    "strong": Kind(
+    "strong": FindingKind(
         "STRONG: {wiring} plays {value:.2f} of the commanded amplitude: lower its voltage or "
         "volume, or correct its stroke or gains in the rig"
     ),
-    "other ERA": Kind(
+    "other ERA": FindingKind(
         "WRONG ERA: {wiring} drives ERA {drives} instead of {of} (MAC {mac_found:.3f}, with its "
         "own ERA {mac_own:.3f}; confidence {confidence:.3f}): correct the plug, or the rig's "
         "channels"
     ),
-    "inverted": Kind("INVERTED: {wiring} has the opposite sign of the others: swap its two wires"),
-    "out of phase": Kind(
+    "inverted": FindingKind(
+        "INVERTED: {wiring} has the opposite sign of the others: swap its two wires"
+    ),
+    "out of phase": FindingKind(
         "OUT OF PHASE: {wiring} is off by {phase:+.0f}°: measure its gains with `era calibrate`"
     ),
-    "silent": Kind("SENSOR {of} reads nothing: left out", "sensor", is_fault=False),
-    "mute": Kind(
+    "silent": FindingKind("SENSOR {of} reads nothing: left out", "sensor", is_fault=False),
+    "mute": FindingKind(
         "SENSOR {of} reads {value:.2f} of what the others say: check that it is where its line "
         "says, and its cable: left out",
         "sensor",
         is_fault=False,
     ),
-    "upside down": Kind(
+    "upside down": FindingKind(
         "SENSOR {of} is upside down (reads {value:.2f} of what the others say): turn it "
         "over: left out",
         "sensor",
         is_fault=False,
     ),
-    "off scale": Kind(
+    "off scale": FindingKind(
         "SENSOR {of} reads {value:.2f} of what the others say: left out", "sensor", is_fault=False
     ),
-    "plate": Kind("PLATE: the rig does not match the plate: {why}\n{hypotheses}", "plate"),
-    "outliers": Kind(
+    "plate": FindingKind("PLATE: the rig does not match the plate: {why}\n{hypotheses}", "plate"),
+    "outliers": FindingKind(
         "OUTLIERS: {count} left out, {value} of them of sensor {of}: check for loose "
         "contacts if they are many",
         "plate",
         is_fault=False,
     ),
-    "mass": Kind(
+    "mass": FindingKind(
         "MASS: {grams} at ({x_m:.2f}, {y_m:.2f}) m: remove it, or write it to the rig's masses",
         "load",
     ),
-    "finger": Kind(
+    "finger": FindingKind(
         "FINGER: the plate is touched at ({x_m:.2f}, {y_m:.2f}) m: take away what rests "
         "there, and measure again",
         "load",
     ),
-    "thickness": Kind(
+    "thickness": FindingKind(
         "THICKNESS: the plate is {along_x} thicker at the end of x and {along_y} at that "
         "of y than in its middle, by what its sensors read: check it, or the sensors' scales",
         "form",
     ),
-    "unnamed": Kind(
+    "unnamed": FindingKind(
         "UNNAMED: the plate is as written, but for something that has no name here: {said}; "
         "check its thickness, what is bonded to it and the sensors' scales, and measure for `era "
         "calibrate`",
         "form",
     ),
-    "promise": Kind(
+    "promise": FindingKind(
         "PROMISE: half of the answers of the rig's table miss the contrast that it promises "
         "by {value:.1f} dB or more",
         "plate",
@@ -279,7 +281,7 @@ class Finding:
 
     @property
     def about(self) -> str:
-        """What it is about, as `Kind.about`."""
+        """What it is about, as `FindingKind.about`."""
         return KINDS[self.kind].about
 
     @property

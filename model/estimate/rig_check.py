@@ -163,7 +163,7 @@ class Verdict:
         return [each for each in self.findings if each.kind in kinds]
 
     def about(self, *what: str) -> list[Finding]:
-        """The findings about some of what `Kind.about` names."""
+        """The findings about some of what `FindingKind.about` names."""
         return [each for each in self.findings if each.about in what]
 
     @property

@@ -38,9 +38,10 @@ MAX_DUMPS = 5
 _GROUPS = "era_haptics."  # prefix of our entry point groups
 _COMMENT = re.compile(r"(?m)(?:^|(?<=\s))#.*$")
 _HOST = re.compile(r"(?<=://)[^/?#\s\"']+")
-_PARAMETER = re.compile(r"""([\w-]+)(=)([^\s,&#}"']+)""")  # of a URL
+_PARAMETER = re.compile(r"""(?<![\w-])([\w-]++)(=)([^\s,&#}"']+)""")  # of a URL
 _ENTRY = re.compile(
-    r"""([\w-]+)(["']?[ \t]*:[ \t]*)(?!//)("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
+    r"""(?<![\w-])([\w-]++)(["']?[ \t]*:[ \t]*)(?!//)"""
+    r"""("[^"\n]*"|'[^'\n]*'|[^\s,{}\[\]"'][^\n,{}\[\]"']*)"""
 )  # of YAML or JSON
 _SECRET = re.compile(r"(?i)key|\blease\b|pass|\bpin\b|secret|serial_number|token|user")
 

@@ -181,7 +181,7 @@ def test_init_writes_a_rig_and_its_schema(tmp_path: Path) -> None:
     first = path.read_text(encoding="utf-8").splitlines()[0]
     assert first == "# yaml-language-server: $schema=mine.schema.json"
     schema = json.loads((tmp_path / "mine.schema.json").read_text(encoding="utf-8"))
-    assert "eras" in schema["properties"]
+    assert "eras" in schema["else"]["required"]
     assert result.stdout.splitlines()[-1] == f"Next: era config check {path}"
 
 

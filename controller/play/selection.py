@@ -89,11 +89,10 @@ class Question:
     @cached_property
     def takes_long(self) -> bool:
         """Whether what lasts takes longer than the control loop may wait."""
-        if not self.lasting or self.is_alone:
-            return any(
-                each.course is not None and each.course.duration > _SOON for _, each in self.lasting
-            )
-        return True
+        if self.lasting and not self.is_alone:
+            return True
+        courses = [each.course for _, each in self.lasting if each.course is not None]
+        return any(each.duration > _SOON for each in courses)
 
     def quiet_beside(self, targets: Targets) -> tuple[Contact, ...]:
         """Return the contacts that are not among some targets."""

@@ -105,7 +105,7 @@ class Planner:
         self.clocks = CountedClocks(rig, clock_errors)
         """The clock errors of the amplifiers, as answers count them."""
         self._selector = Selector(
-            Chooser(table, partial(capabilities.envelope_support.shape, timing)),
+            self._chooser_of(table),
             arrived=self._note_answer,
             may_lead=self.slots.may_lead,
         )
@@ -125,8 +125,7 @@ class Planner:
     def replace_answers(self, table: LocalizationTable, timing: Timing) -> None:
         """Answer by another table of this plate from now on; what plays is kept until all rest."""
         self.slots.timing = timing
-        shape = partial(self.capabilities.envelope_support.shape, timing)
-        self._answer_by(Chooser(self.clocks.counted_by(table), shape))
+        self._answer_by(self._chooser_of(self.clocks.counted_by(table)))
 
     def replace_limits(self, limits: Limits) -> None:
         """Answer within other limits from now on: an amplifier was identified again."""
@@ -144,6 +143,11 @@ class Planner:
         counted = self.clocks.counted_by(chooser.table, known)
         if counted is not chooser.table:
             self._answer_by(replace(chooser, table=counted), at_once=is_one_lost)
+
+    def _chooser_of(self, table: LocalizationTable) -> Chooser:
+        """Make a chooser by a table, whose envelopes are of the timing in use."""
+        shape = partial(self.capabilities.envelope_support.shape, self.slots.timing)
+        return Chooser(table, shape)
 
     def _answer_by(self, chooser: Chooser, *, at_once: bool = False) -> None:
         """Answer by another chooser once all rest, or at once; at once where nothing plays, too."""

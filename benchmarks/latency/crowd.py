@@ -75,18 +75,19 @@ async def stops(session: Session, count: int) -> np.ndarray:
     to the last byte of the stop at the last amplifier; infinite for one that was not seen."""
     era, far, times = session.era, session.far, []
     assert era is not None
-    for _ in range(count):
-        far.begin()
-        session.touch(RESTING)
-        await far.until(lambda: far.playing_since(1), UNANSWERED)
-        begun = time.monotonic()
-        stopping = asyncio.create_task(era.stop())
-        stopped_at = await far.until(far.stopped_at, UNANSWERED)
-        times.append(np.inf if stopped_at is None else stopped_at - begun)
-        session.touch()
-        await stopping
-        await _clear(era)
-        await era.begin_armed("latency")
+    async with AsyncExitStack() as armed:
+        for _ in range(count):
+            far.begin()
+            session.touch(RESTING)
+            await far.until(lambda: far.playing_since(1), UNANSWERED)
+            begun = time.monotonic()
+            stopping = asyncio.create_task(era.stop())
+            stopped_at = await far.until(far.stopped_at, UNANSWERED)
+            times.append(np.inf if stopped_at is None else stopped_at - begun)
+            session.touch()
+            await stopping
+            await _clear(era)
+            await armed.enter_async_context(era.armed("latency"))
     return np.array(times)
 
 

@@ -7,7 +7,7 @@ import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.latency.far_side import FarSide
 from benchmarks.latency.machine import DAEMON_NICE, TIMEOUT, EndedEarly, running
 from controller.api.client import AsyncClient
-from controller.api.link import Unreachable
+from controller.api.link import LeaseLost, Unreachable
 from controller.sources.touch import Touch, TouchFrame
 from examples.make_touches import tuio_datagram
 from model.rig.rig import Rig
@@ -87,10 +87,13 @@ async def daemon_session(
                 running(*program, config, nice=DAEMON_NICE, has_line=False) as (process, _),
                 await _client(path, process) as era,
             ):
-                await era.begin_armed("latency")  # a stop of another client may end the lease
+                armed = AsyncExitStack()
+                await armed.enter_async_context(era.armed("latency"))
                 await asyncio.sleep(_ARMING)
                 with _panel(port) as panel:
                     yield Session(process.pid, rig, far, panel, era, path)
+                with suppress(LeaseLost):  # by a stop of another client
+                    await armed.aclose()
         finally:
             far.close()
 

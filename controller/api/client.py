@@ -19,7 +19,7 @@ import functools
 import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -79,20 +79,18 @@ class AsyncClient:
         self.path = path
         self._name = name
         self._timeout = timeout
+        self._is_closed = False
+        self._connecting = asyncio.Lock()
+        self._connections = 0
         self._link: DaemonLink | None = None
         self._reading: asyncio.Task[None] | None = None
         self._pending: dict[int, asyncio.Future[Any]] = {}  # of the present connection, by id
         self._ids = itertools.count(1)
-        self._connecting = asyncio.Lock()
-        self._is_closed = False
         self._rates: dict[Topic, float | None] = {}  # of the subscriptions
-        self._events: deque[tuple[int, Notification]] = deque()
+        self._events: deque[tuple[int, Notification]] = deque()  # with the number of its connection
         self._lost = 0  # events that were dropped here before the next one
-        self._connections = 0
-        self._changed = asyncio.Event()  # an event arrived, or the connection was lost
-        self._lease: ArmResult | None = None  # of `armed`
-        self._lease_lost: LeaseLost | None = None
-        self._renewing: asyncio.Task[None] | None = None
+        self._changed = asyncio.Event()  # an event arrived, or connection or lease was lost
+        self._renewing: asyncio.Task[LeaseLost] | None = None  # while armed by `armed`
         self._seen: tuple[int, int] | None = None  # connection and epoch of what was seen last
 
     @classmethod
@@ -109,7 +107,7 @@ class AsyncClient:
         not to be believed.
         """
         client = cls(find_socket(path), name=name, timeout=timeout)
-        await client._within_timeout(client._repeated(client._connected))
+        await client._repeated(client._connected)
         return client
 
     async def __aenter__(self) -> Self:
@@ -122,8 +120,7 @@ class AsyncClient:
         """Close the connection; the daemon lifts this client's fingers."""
         self._is_closed = True
         self._changed.set()
-        if self._renewing is not None:
-            self._renewing.cancel()
+        self._end_renewal()
         if self._link is not None:
             self._link.abort()
         await asyncio.sleep(0)
@@ -246,17 +243,6 @@ class AsyncClient:
 
         Raises LeaseLost at the next call and at the end of the block once the lease is lost.
         """
-        lease = await self.begin_armed(owner, lease_s=lease_s)
-        try:
-            yield lease
-        except BaseException:
-            with suppress(RpcError, Unreachable):
-                await self.end_armed()
-            raise
-        await self.end_armed()
-
-    async def begin_armed(self, owner: str, *, lease_s: float = DEFAULT_LEASE) -> ArmResult:
-        """Arm, and renew the lease until `end_armed`: the beginning of `armed`."""
         arming = asyncio.ensure_future(self.arm(owner, lease_s=lease_s))
         try:
             lease = await asyncio.shield(arming)
@@ -264,25 +250,15 @@ class AsyncClient:
             with suppress(RpcError, Unreachable):  # if refused, another client's lease
                 await self.disarm(lease=(await arming).lease)
             raise
-        self._lease, self._lease_lost = lease, None
-        self._renewing = asyncio.create_task(self._keep_renewing(lease), name="lease")
-        return lease
-
-    async def end_armed(self) -> None:
-        """Disarm: the end of `armed`; raises LeaseLost if the lease was lost before."""
-        lease, lost = self._lease, self._lease_lost
-        self._release()
-        self._lease_lost = None
-        if lost is not None:
-            raise lost
-        if lease is None:  # ended by a call of this client
-            return
+        self._renewing = asyncio.create_task(self._renewed(lease), name="lease")
+        self._renewing.add_done_callback(lambda _: self._changed.set())
         try:
-            await self.disarm(lease=lease.lease)
-        except RpcError as error:
-            if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
-                raise
-            raise await self._why_lost(error) from error
+            yield lease
+        except BaseException:
+            with suppress(RpcError, Unreachable):
+                await self._disarmed(lease)
+            raise
+        await self._disarmed(lease)
 
     async def events(self) -> AsyncIterator[Notification]:
         """Yield notifications as they arrive, until `close`; raises Unreachable."""
@@ -301,16 +277,10 @@ class AsyncClient:
                 while not self._events and not self._is_closed:
                     self._check_lease()
                     self._changed.clear()
-                    if self._link is None or not self._link.is_open:
-                        await self._within_timeout(
-                            self._repeated(
-                                self._connected,
-                                after=(RpcError, Unreachable),
-                                duration=0.9 * self._timeout,
-                            )
-                        )
-                    else:
-                        await self._changed.wait()
+                    await self._repeated(
+                        self._connected, (RpcError, Unreachable), duration=0.9 * self._timeout
+                    )
+                    await self._changed.wait()
         if not self._events:
             return None
         connection, event = self._events.popleft()
@@ -322,7 +292,7 @@ class AsyncClient:
         """Call a method with these parameters and return its result.
 
         What `clear` acknowledges is what this client has seen, in its last `status`, `stop` or
-        state event.
+        state event. From a stop on no lease is renewed, even if no daemon responds.
         """
         if method not in SILENCING:
             self._check_lease()
@@ -330,13 +300,12 @@ class AsyncClient:
             values["epoch"] = self._seen[1]
         params = make_params(method, **values)
         if method == "stop":
-            self._release()
-        found = await self.request(method, params)
-        if method in SILENCING:
-            self._release()
+            self._end_renewal()
+        read = read_result(await self.request(method, params), result)
+        if method == "disarm":
+            self._end_renewal()
         elif method == "hello":
             self._name = values["client"]
-        read = read_result(found, result)
         self._see(self._connections, getattr(read, "epoch", None))
         return read
 
@@ -346,14 +315,11 @@ class AsyncClient:
         Returns its result as parsed JSON, with the keys of a later daemon.
         """
 
-        is_once = method in METHODS and not METHODS[method].is_repeated
-
         async def attempt() -> Any:
-            link = await (self._repeated(self._connected) if is_once else self._connected())
-            return await self._exchange(link, method, params)
+            return await self._exchange(await self._repeated(self._connected), method, params)
 
-        after = () if is_once else Unreachable if method == "stop" else ConnectionLost
-        return await self._within_timeout(self._repeated(attempt, after=after))
+        again = Unreachable if method == "stop" else ConnectionLost
+        return await self._repeated(attempt, again if METHODS[method].is_repeated else ())
 
     async def _exchange(self, link: DaemonLink, method: str, params: ApiMessage) -> Any:
         """Send a request over the present connection; raises RpcError and Unreachable."""
@@ -369,27 +335,27 @@ class AsyncClient:
     async def _repeated(
         self,
         attempt: Callable[[], Awaitable[_T]],
-        *,
         after: type[Exception] | tuple[type[Exception], ...] = ConnectionLost,
+        *,
         duration: float = _REPEATED_FOR,
     ) -> _T:
-        """The result of an attempt, which is repeated after some errors for a while [s]."""
+        """The result of an attempt, which is repeated after some errors for a while [s].
+
+        Raises Unreachable if it does not end within the client's timeout.
+        """
         loop = asyncio.get_running_loop()
         end = loop.time() + duration
         following = pauses(first=duration / 100, maximum=duration / 10)
-        while True:
-            try:
-                return await attempt()
-            except after:
-                pause = next(following)
-                if self._is_closed or loop.time() + pause >= end:
-                    raise
-                await asyncio.sleep(pause)
-
-    async def _within_timeout(self, work: Any) -> Any:
         try:
             async with asyncio.timeout(self._timeout):
-                return await work
+                while True:
+                    try:
+                        return await attempt()
+                    except after:
+                        pause = next(following)
+                        if self._is_closed or loop.time() + pause >= end:
+                            raise
+                        await asyncio.sleep(pause)
         except TimeoutError as error:
             if self._link is not None:  # else what waits in it would grow without bounds
                 self._link.abort()
@@ -401,10 +367,10 @@ class AsyncClient:
             if self._is_closed:
                 raise Unreachable(f"this client of the daemon at {self.path} is closed")
             if self._link is None or not self._link.is_open:
-                link = await DaemonLink.open(self.path, self._name)
+                link = self._link = await DaemonLink.open(self.path, self._name)
                 self._pending, self._ids = {}, itertools.count(1)
-                connection = self._connections + 1
-                reading = self._read(link, self._pending, connection)
+                self._connections += 1
+                reading = self._read(link, self._pending, self._connections)
                 self._reading = asyncio.create_task(reading, name="API")
                 try:
                     for topic, rate in list(self._rates.items()):
@@ -413,7 +379,6 @@ class AsyncClient:
                 except BaseException:
                     link.abort()
                     raise
-                self._link, self._connections = link, connection
             return self._link
 
     async def _read(
@@ -446,18 +411,32 @@ class AsyncClient:
 
     def _check_lease(self) -> None:
         """Raise LeaseLost once the lease of `armed` is lost."""
-        if self._lease_lost is not None:
-            raise self._lease_lost.with_traceback(None)
+        if self._renewing is not None and self._renewing.done():
+            raise self._renewing.result().with_traceback(None)
 
-    def _release(self) -> None:
-        """Stop renewing the lease."""
-        self._lease = None
-        if self._renewing is not None:
+    def _end_renewal(self) -> None:
+        """Renew the lease no longer, unless it is lost."""
+        if self._renewing is not None and not self._renewing.done():
             self._renewing.cancel()
             self._renewing = None
 
-    async def _keep_renewing(self, lease: ArmResult) -> None:
-        """Renew a lease until it is lost, over a new connection if need be.
+    async def _disarmed(self, lease: ArmResult) -> None:
+        """End `armed`: disarm, unless this client has; raises LeaseLost if it was lost before."""
+        renewing, self._renewing = self._renewing, None
+        if renewing is None:
+            return
+        if renewing.done():
+            raise renewing.result().with_traceback(None)
+        renewing.cancel()
+        try:
+            await self.disarm(lease=lease.lease)
+        except RpcError as error:
+            if error.code not in (ErrorCode.LEASE, ErrorCode.WRONG_STATE):
+                raise
+            raise await self._loss(error) from error
+
+    async def _renewed(self, lease: ArmResult) -> LeaseLost:
+        """Renew a lease, over a new connection if need be, until it is lost; return how it was.
 
         While no daemon responds it is tried again for as long as the lease lasts. Nothing arms
         again: a lease that the daemon has ended is lost.
@@ -472,19 +451,16 @@ class AsyncClient:
             try:
                 async with asyncio.timeout_at(expires_at):
                     await self.request("renew", params)
-            except TimeoutError as error:
-                reason = reason or Unreachable.at(self.path, error)
+                expires_at, reason = sent_at + lease.lease_s, None
+            except TimeoutError:
+                break
             except (RpcError, Unreachable) as error:
                 reason = error
                 if isinstance(error, RpcError) and error.code is not ErrorCode.BUSY:
                     break
-            else:
-                expires_at, reason = sent_at + lease.lease_s, None
-        if self._lease is lease:
-            self._lease_lost = await self._why_lost(reason)
-            self._changed.set()
+        return await self._loss(reason or Unreachable.at(self.path, TimeoutError()))
 
-    async def _why_lost(self, reason: RpcError | Unreachable | None) -> LeaseLost:
+    async def _loss(self, reason: RpcError | Unreachable) -> LeaseLost:
         """The loss of the lease with the daemon's cause, where the daemon has refused it."""
         if isinstance(reason, RpcError):
             with suppress(RpcError, Unreachable):
@@ -576,14 +552,11 @@ class Client:
 
         Raises LeaseLost at the next call and at the end of the block once the lease is lost.
         """
-        lease = self._run(self._client.begin_armed(owner, lease_s=lease_s))
-        try:
+        armed = self._client.armed(owner, lease_s=lease_s)
+        with ExitStack() as end:
+            lease = self._run(armed.__aenter__())
+            end.push(lambda *error: self._run(armed.__aexit__(*error)))
             yield lease
-        except BaseException:
-            with suppress(RpcError, Unreachable):
-                self._run(self._client.end_armed())
-            raise
-        self._run(self._client.end_armed())
 
     def events(self, *, timeout: float | None = None) -> Iterator[Notification]:
         """Yield notifications as they arrive; end when none arrives within a timeout [s]."""

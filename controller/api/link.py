@@ -175,12 +175,10 @@ def default_socket(environment: Mapping[str, str] = os.environ) -> Path:
     named = environment.get(SOCKET_VARIABLE)
     if named:
         return Path(named)
-    runtime = environment.get("XDG_RUNTIME_DIR")
-    if runtime:
-        return Path(runtime) / "era-haptics" / "daemon.sock"
-    folder = Path(f"/run/user/{os.getuid()}")
-    if folder.is_dir():
-        return folder / "era-haptics" / "daemon.sock"
+    given = environment.get("XDG_RUNTIME_DIR")
+    runtime = Path(given or f"/run/user/{os.getuid()}")
+    if given or runtime.is_dir():
+        return runtime / "era-haptics" / "daemon.sock"
     return Path(tempfile.gettempdir()) / f"era-haptics-{os.getuid()}" / "daemon.sock"
 
 
@@ -273,7 +271,6 @@ class DaemonLink:
         self._reader = reader
         self._writer = writer
         self._received = b""
-        self._is_closed = False
 
     @classmethod
     async def open(cls, path: Path, name: str) -> Self:
@@ -308,7 +305,7 @@ class DaemonLink:
     @property
     def is_open(self) -> bool:
         """Whether neither side has closed it."""
-        return not (self._is_closed or self._reader.at_eof() or self._reader.exception())
+        return not (self._writer.is_closing() or self._reader.at_eof() or self._reader.exception())
 
     async def send(self, line: bytes) -> None:
         """Send a line with its line feed, as soon as the daemon reads; raises Unreachable."""
@@ -340,11 +337,9 @@ class DaemonLink:
 
         For the daemon its client has left: its fingers are lifted, and it is not armed for.
         """
-        self._is_closed = True
         self._writer.write_eof()
         asyncio.get_running_loop().call_later(RESPONSE_TIMEOUT, self.abort)
 
     def abort(self) -> None:
         """Close at once; the daemon lifts this client's fingers."""
-        self._is_closed = True
         self._writer.transport.abort()

@@ -98,7 +98,6 @@ ALLOWED = {
     "answers": "JSON of `era table verify` and `era amp discover`: not modal ones",
     "hold": "a parameter of the effect `ramp`: the last level is held",
     "places": "JSON of `era amp discover`",
-    "begin_armed": "a method of the public client",
     "CLOSE": "an event and an action of the daemon: it closes its amplifiers",
 }
 """Identifiers in which the word has its ordinary meaning, and which."""

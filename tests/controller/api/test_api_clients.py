@@ -70,7 +70,7 @@ async def test_client_plays_and_receives_events(tmp_path: Path) -> None:
 async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path) -> None:
     """A lease of 5 s outlives a loss of 3 s; one of 6 s ends it for good, for calls and waiting."""
     async with ready_daemon(tmp_path) as (bench, era):
-        away, events = bench.socket.with_name("away"), []
+        away, events, armed = bench.socket.with_name("away"), [], contextlib.AsyncExitStack()
 
         async def lose(duration: float) -> None:
             bench.socket.rename(away)
@@ -80,7 +80,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
             away.rename(bench.socket)
 
         await era.subscribe("state")
-        await era.begin_armed("me", lease_s=5)
+        await armed.enter_async_context(era.armed("me", lease_s=5))
         for duration in (0.0, 3.0):
             await lose(duration)
             await asyncio.sleep(duration)
@@ -89,7 +89,7 @@ async def test_client_connects_again_with_subscriptions_and_lease(tmp_path: Path
         await lose(6.0)
         with pytest.raises(LeaseLost, match="no daemon runs"):
             events += [event async for event in era.events()]
-        for use in (era.touch([PLACE]), era.end_armed()):
+        for use in (era.touch([PLACE]), armed.aclose()):
             with pytest.raises(LeaseLost):
                 await use
         while not events or events[-1].data["new"] != READY:

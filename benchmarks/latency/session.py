@@ -31,8 +31,10 @@ _APART = 0.05  # m; between fingers
 _EDGE = 0.06  # of the sensor
 _ARMING = 1.0  # s; until what follows arming is over
 _TWO_HALVES = """regions:
-  west: {{rectangle: {{start: [0 m, 0 m], end: [{middle} m, {width} m]}}, on_press: buzz}}
-  east: {{rectangle: {{start: [{middle} m, 0 m], end: [{length} m, {width} m]}}, on_press: buzz}}
+  west: {{rectangle: {{start: [0 m, 0 m], end: [{middle} m, {plate.width} m]}}, on_press: buzz}}
+  east:
+    rectangle: {{start: [{middle} m, 0 m], end: [{plate.length} m, {plate.width} m]}}
+    on_press: buzz
 elsewhere: null
 """
 
@@ -72,9 +74,9 @@ async def daemon_session(
         try:
             more = ""
             if is_two:
-                length, width = rig.plate.length, rig.plate.width
-                text = _TWO_HALVES.format(middle=length / 2, length=length, width=width)
-                (folder / "layout.yaml").write_text(text, "utf-8")
+                (folder / "layout.yaml").write_text(
+                    _TWO_HALVES.format(plate=rig.plate, middle=rig.plate.length / 2), "utf-8"
+                )
                 more = "layouts: {panel: layout.yaml}\n"
             path, config = folder / "socket", folder / "daemon.yaml"
             config.write_text(

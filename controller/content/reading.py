@@ -1,6 +1,6 @@
 """Reading of content: the base of all formats, strict JSON, mixed vibrations, and WAV files.
 
-JSON files are bounded before they are parsed; the line of every key is kept for errors.
+JSON files are bounded before they are parsed; lines of keys are found where there is an error.
 Vibrations that last at the same time are mixed into one curve of intensity and one of sharpness.
 
 A WAV signal is felt by the strength of its vibration, not by its waveform: it is split into two
@@ -15,6 +15,7 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
@@ -109,9 +110,18 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
     if has_trailing_commas:
         text = _TRAILING_COMMA.sub(lambda found: found[1] or " ", text)
     _check_size(source, text)
+    find_lines = partial(_lines_of, source, text)
+    with_repeats = list[dict[str, Any]]()
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        given = dict(pairs)
+        if len(given) < len(pairs):
+            with_repeats.append(given)
+        return given
+
     try:
         # Whole numbers become floats: those of many digits are refused by their size, as 1e999 is.
-        data = json.loads(text, parse_int=float)
+        data = json.loads(text, parse_int=float, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
         is_cut = not text.rstrip().endswith("}")
         remedy = "its end is missing: export it again" if is_cut else "correct it there"
@@ -119,7 +129,9 @@ def read_json(content: bytes, source: str, *, has_trailing_commas: bool = False)
         raise refusal(source, message, line=error.lineno) from error
     if not isinstance(data, dict):
         raise refusal(source, "must be an object in braces, got another value", line=1)
-    return Document(source, text, data, _lines_of(source, text))
+    if with_repeats:
+        find_lines()  # raises
+    return Document(source, text, data, find_lines)
 
 
 def unknown_keys(section: ContentSection, but: Collection[str] = ()) -> tuple[str, ...]:

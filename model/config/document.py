@@ -9,8 +9,9 @@ true, false or null (core schema of YAML 1.2).
 import errno
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -68,17 +69,20 @@ class ConfigError(InputError):
 
 @dataclass(frozen=True)
 class Document:
-    """The content of a file, its text, and the line of every key and list entry by its path.
-
-    Keys that were given in a program have no text and no lines.
-    """
+    """The content of a file and its text; keys that were given in a program have no text."""
 
     source: str
     text: str
     data: dict[str, Value]
-    lines: dict[KeyPath, int]
+    find_lines: Callable[[], Mapping[KeyPath, int]] = field(default=dict, compare=False)
+    """Finds the line of every key and list entry by its path, for errors; of no text none."""
     over: "Document | None" = None
     """The file alone, where `data` are its keys over those of the file that it names as `base`."""
+
+    @cached_property
+    def lines(self) -> Mapping[KeyPath, int]:
+        """What `find_lines` finds."""
+        return self.find_lines()
 
     @property
     def whole_text(self) -> str:
@@ -188,7 +192,7 @@ def parse_document(source: str, text: str, *, if_empty: str = IF_EMPTY) -> Docum
         raise ConfigError(source, reader.repeated)
     if data is None:
         raise _whole(source, f"is empty; {if_empty}")
-    return Document(source, text, data, reader.lines)
+    return Document(source, text, data, reader.lines.copy)
 
 
 def _whole(source: str, message: str) -> ConfigError:

@@ -367,7 +367,7 @@ def with_base(document: Document) -> Document:
             if not isinstance(known, dict) or each not in known:
                 refuse(f"must be in {name}, which has none of this name; remove it", kind, each)
     data = merged_keys(base.data, over)
-    return Document(document.source, "", data, document.lines, over=document)
+    return Document(document.source, "", data, document.find_lines, over=document)
 
 
 def base_path(document: Document) -> Path:
@@ -440,7 +440,7 @@ def rig_of(document: Document, *, mesh: str | None = None) -> Rig:
     check_across(validation, mesh_given=mesh is not None)
     section = validation.finish()
     if mesh is not None:
-        document = replace(document, text="", data=document.data | {"mesh": mesh}, lines={})
+        document = replace(document, text="", data=document.data | {"mesh": mesh}, find_lines=dict)
     plate = section.plate.made(frequency_max=section.limits.frequency[1])
     wanted = section.mesh if mesh is None else mesh
     fingertip: FingertipSection | str = section.fingertip

@@ -397,7 +397,7 @@ def stated(rig: Rig) -> Document:
     if before == rig:
         return document
     data = merged_keys(document.data, fitted_keys(before, rig))
-    found = Document(document.source, "", data, {})
+    found = Document(document.source, "", data)
     back = rig_of(found)
     is_same = _is_same(back, rig, Validation(document, RigSection).finish())
     if not is_same or replace(back, **{name: getattr(rig, name) for name in _REWRITTEN}) != rig:
@@ -417,7 +417,6 @@ def _document(source: str, keys: Mapping[str, Any]) -> Document:
             _given(keys),
             fallback=lambda each: each.tolist() if hasattr(each, "tolist") else repr(each),
         ),
-        {},
     )
 
 

@@ -177,7 +177,7 @@ class RankedLayout:
     def rig(self) -> Rig:
         """The rig with these ERAs on free channels, if need be of another, simulated amplifier."""
         keys = layout_keys(self.problem, self.found.positions, stated(self.problem.rig).data)
-        return rig_of(Document("RankedLayout.rig", "", keys, {}))
+        return rig_of(Document("RankedLayout.rig", "", keys))
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,10 +42,10 @@ def parameters_held(found: Identification, own: Mounted) -> dict[str, Reals]:
     places = space.groups["place"]
     written = np.array([(era.x, era.y) for era in found.before.eras])
     errors["place"] = (space.std[places] * x[places] - (own.at - written).ravel()) / stds["place"]
-    if len(own.masses) and len(found.values.masses):
+    if len(own.masses) and len(found.values["masses"]):
         x, y, weight = own.masses[0]
         at = space.groups["masses"].start
-        off = found.values.masses[0] - [weight, x, y]
+        off = found.values["masses"][0] - [weight, x, y]
         std = np.hypot(found.std[at : at + 3], [0.0, *[KINDS["place"].theory] * 2])
         errors["mass"] = off / std
     return errors

@@ -39,14 +39,14 @@ from model.estimate.fit import (
     row_rms,
     without_outliers,
 )
-from model.estimate.forward import jacobian, viscous_difference
+from model.estimate.forward import MASS_CELLS, jacobian, viscous_difference
 from model.estimate.measurement import (
     LEAST_SENSORS,
     Measurement,
     check_enough_sensors,
 )
 from model.estimate.rig_check import Verdict, cycles, diagnose
-from model.estimate.space import FORM, KINDS, MASS_CELLS
+from model.estimate.space import FORM, KINDS
 from model.files.csv_file import as_frame
 from model.processes import Progress, unseen
 from model.quantities import in_display_unit
@@ -650,7 +650,7 @@ def _fitted_with_scales(rig: Rig, measured: Measurement, screened: Screening) ->
         space = plate.model.space
         start = np.zeros(space.size)
         start[plate.numbers] = screened.start
-        measurement = replace(live, free_gains=True)
+        measurement = replace(live, gain_std=math.inf)
         std, scales = without_outliers(measurement.values, plate.responses(start))
         count = np.isfinite(measurement.values).sum(axis=(0, 2))
         heard = np.isfinite(std).sum(axis=(0, 2)) > count / 2

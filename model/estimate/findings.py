@@ -398,7 +398,6 @@ def match_plate(
             model.frequencies,
             scaled,
             errors,
-            free_gains=True,
             gain_std=_GAIN_STD,
             drives=tuple(driven),
         )

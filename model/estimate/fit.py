@@ -25,18 +25,18 @@ from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray, best_by, best_first
 from model.config.document import KeyPath
-from model.estimate.forward import ForwardModel, PlateAt, Sensor, by_mass_at, jacobian
-from model.estimate.measurement import Measurement
-from model.estimate.space import (
-    KINDS,
-    MAX_GUESSED,
-    VALUE_UNITS,
+from model.estimate.forward import (
+    ForwardModel,
+    PlateAt,
+    Sensor,
     Space,
     Values,
+    by_mass_at,
+    jacobian,
     reduced_modes,
-    rig_with,
-    space_by_sheets,
 )
+from model.estimate.measurement import Measurement
+from model.estimate.space import KINDS, MAX_GUESSED, VALUE_UNITS, rig_with, space_by_sheets
 from model.reduction.free_plate import solve_free_plate
 from model.rig.actuator_keys import KINDS as ACTUATOR_KEYS
 from model.rig.rig import Rig
@@ -107,7 +107,7 @@ class Fit:
         """Squared residuals of the values per degree of freedom."""
         r, J = self.of_values
         taken = np.trace(linalg.solve(self.information, J.T @ J, assume_a="pos"))
-        if self.measurement.free_gains:
+        if self.measurement.gain_std:
             taken += 2 * self.measurement.known.any(axis=1).sum()
         return float(r @ r / max(len(r) - taken, 1.0))
 
@@ -285,7 +285,7 @@ def best_gains(
     known, w, d = measurement.known, measurement.weight, measurement.filled
     gains = np.ones((len(responses), responses.shape[2]), dtype=complex)
     by_gain = np.zeros((*gains.shape, slopes.shape[-1]), dtype=complex)
-    if measurement.free_gains:
+    if measurement.gain_std:
         heard = known.any(axis=1)
         power = ((w * np.abs(responses)) ** 2).sum(axis=1) + measurement.gain_std**-2
         power = np.where(power > 0, power, 1.0)
@@ -309,7 +309,7 @@ def _gain_residuals(
     gains: ComplexArray, by_gain: ComplexArray, std: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Deviations of gains (f, n) from a magnitude of 1 (k,), and their derivatives (k, q)."""
-    kept = np.isfinite(gains) & np.isfinite(std)
+    kept = np.isfinite(gains) & (0 < std < math.inf)
     size = np.abs(gains[kept])
     by_size = (gains[kept].conj()[:, None] * by_gain[kept]).real / size[:, None]
     return (size - 1) / std + 0j, by_size / std + 0j
@@ -341,7 +341,7 @@ def fit_to_noise(
     for _ in range(_ROUNDS):
         before = found.measurement
         raw = np.abs(measurement.values - found.predicted)
-        of_gain = np.abs(before.weight * found.predicted) ** 2 * before.free_gains
+        of_gain = np.abs(before.weight * found.predicted) ** 2 * bool(before.gain_std)
         total = of_gain.sum(axis=1, keepdims=True)
         left = 1 - of_gain / np.where(total > 0, total, 1)
         left[before.known] -= found.leverage
@@ -615,7 +615,7 @@ class SensedPlate:
         own[self.numbers] = z[self.numbers]
         beside = self.model.space.groups["force_factor"]
         own[beside] = z[beside]  # with the damping that was found beside it
-        values = Values.of(self.rig, self.model.space, own)
+        values = Values(self.rig, self.model.space, own)
         return rig_with(self.rig, values, self.rig.uncertainty)
 
     def values(self, z: FloatArray) -> FloatArray:

@@ -23,16 +23,6 @@ from model.study.verification import ExpectedContrast
 _ALIKE = 0.9  # of a correlation of errors: beyond it two values are hardly told apart
 _MISTAKEN = 0.01  # unexplained, beyond which a plate differs from the rig by more than parameters
 _LISTED_STDS = 2.0  # from the rig's value, beyond which a parameter is listed
-_ALWAYS_LISTED = (
-    "thickness",
-    "modulus",
-    "stiffness",
-    "damping",
-    "loss",
-    "gain",
-    "phase",
-    "supports",
-)
 
 
 def confusions(names: Sequence[str], covariance: FloatArray) -> list[str]:
@@ -298,7 +288,7 @@ def parameter_rows(found: Identification) -> list[str]:
     rows = []
     for each in identified_parameters(found):
         assert each.standard_error is not None  # noqa: S101  all were searched
-        if each.kind in _ALWAYS_LISTED or abs(each.value) > _LISTED_STDS * each.standard_error:
+        if KINDS[each.kind].is_listed or abs(each.value) > _LISTED_STDS * each.standard_error:
             unit = each.unit if each.unit in ("", "°") else f" {each.unit}"
             value, _, error = with_error(each.value, each.standard_error, sign="+").partition(" ± ")
             other = confused[each.name]

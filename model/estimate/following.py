@@ -35,10 +35,18 @@ from scipy.special import chdtrc
 from model.arrays import ComplexArray, FloatArray, best_of, ranked_by
 from model.errors import InputError
 from model.estimate.fit import Fit, best_gains, fit
-from model.estimate.forward import ForwardModel, RestingFinger, Sensor, by_mass_at
+from model.estimate.forward import (
+    FINGER_PARTS,
+    MODE_SHIFTS,
+    ForwardModel,
+    RestingFinger,
+    Sensor,
+    Values,
+    by_mass_at,
+)
 from model.estimate.identify import solved_for
 from model.estimate.measurement import Measurement
-from model.estimate.space import FINGER_PARTS, MODE_SHIFTS, Values, rig_with, space_of
+from model.estimate.space import rig_with, space_of
 from model.files.array_file import UNREADABLE, read_arrays, write_arrays
 from model.files.output_paths import begins_with
 from model.finger import Grid
@@ -144,7 +152,7 @@ class PlateEstimate:
     def rig(self) -> Rig:
         """The rig as it is known now."""
         before = self.model.rig
-        return rig_with(before, Values.of(before, self.model.space, self.x), before.uncertainty)
+        return rig_with(before, Values(before, self.model.space, self.x), before.uncertainty)
 
     @property
     def cautious_rig(self) -> Rig:
@@ -247,8 +255,7 @@ def update(
         np.arange(len(patterns), dtype=float),
         np.array([each.values for each in patterns])[..., None],
         np.array([each.std for each in patterns])[..., None],
-        free_gains=not patterns[0].has_phase,
-        gain_std=_ONLY_PHASE,
+        gain_std=0.0 if patterns[0].has_phase else _ONLY_PHASE,
         bases=np.array([each.bases for each in patterns]),
     )
     # A finger loads a plate more or less as a whole, and each of its parts differs half as much

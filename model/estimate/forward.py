@@ -16,16 +16,25 @@ proportion to frequency, eta omega / omega_j. Both agree at the resonances alone
 are beside them, so that a fit of the wrong law finds a loss factor that is off by more than noise
 and form errors explain. A plate with form errors has a parameter between both laws, 0 to 1.
 
-Derivatives of a plate's responses by all of its parameters, and by a mass at any point.
-
 With L = 1 - T Z, a change dA of the free receptance and dZ of what is attached change the
 receptance T of the plate on its attachments by L dA L^T - T dZ T. For a mode, a place or an
-attachment that is a change of rank one or two (symbols as in `model.estimate.forward`). A
-sensor of mass m that is on the plate while it measures adds l² w² m T_sj dT_ss to l dT_sj.
+attachment that is a change of rank one or two. A sensor of mass m that is on the plate while it
+measures adds l² w² m T_sj dT_ss to l dT_sj.
+
+A vector x has one number for each parameter, in standard deviations of what is known beforehand.
+`Kind` says of all parameters of a kind how they change the plate and its responses; which there are
+is in `model.estimate.space`. `Space` names the parameters of a rig, `Values` has what they stand
+for.
+
+A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
+that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
+residual shows by how much. They change stiffness and mass between the modes of the free plate, and
+so its mode shapes (`ReducedModes`).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -34,17 +43,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.estimate.space import (
-    EXCITER_KINDS,
-    AttachmentPoints,
-    Modes,
-    ReducedModes,
-    Space,
-    Values,
-    places_of,
-)
-from model.reduction.free_plate import TERMS, FreePlate, FreeReceptance, combined
-from model.rig.rig import Rig
+from model.fem import Mesh, element_slopes
+from model.finger import Grid
+from model.reduction.free_plate import TERMS, FreeModes, FreePlate, FreeReceptance, combined
+from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
+from model.rig.rig import Rig, Uncertainty
+from model.spectral.direct_solution import stiffness_slopes
 from model.structure.attachments import (
     Fingertip,
     attached_stiffness,
@@ -52,8 +56,10 @@ from model.structure.attachments import (
     drive_forces,
     footprints_of,
 )
+from model.structure.exciter import Actuator, Exciter
 from model.structure.modal_elasticity import (
     WITHOUT_PART,
+    Dispersion,
     ModalElasticity,
     check_scales,
     lowest_elastic,
@@ -62,6 +68,9 @@ from model.structure.plate import LOSS_FREQUENCY
 
 SENSOR_FOOT = 5e-3
 """Radius of the disc on which a sensor's mass acts [m]: under a point a plate is soft."""
+
+MASS_CELLS = Grid(8, 6)
+"""Where foreign mass may lie."""
 
 MIN_LOSS_FACTOR = 1e-9
 """Least loss factor, so that there are derivatives by its logarithm."""
@@ -93,6 +102,326 @@ class RestingFinger:
     fingertip: Fingertip
     tone: int | None = None
     """Number of the only tone during which it rests, None for all."""
+
+
+FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
+"""Parts of a finger's load that vary independently."""
+
+AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
+
+MODE_SHIFTS = 12
+"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
+
+Number: TypeAlias = float | NDArray[np.floating[Any]]
+"""One number for all parameters of a kind, or one for each."""
+
+Range: TypeAlias = tuple[Number, Number, Number]
+"""Standard deviation, lowest and highest deviation of parameters, in the unit of `Values`."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchScope:
+    """What may differ of a rig with sensors, of which `Kind` derives its parameters."""
+
+    rig: Rig
+    sensors: Sequence[str]
+    """Names of the sensors."""
+    uncertainty: Uncertainty
+    """How well the rig is known; none for one that data sheets alone describe."""
+    drives_lag: bool = False
+    """Whether bases follow what is played with a lag that nothing states."""
+    amplifiers: Sequence[str] = ()
+    """Names of the amplifiers whose clocks may be off."""
+    masses: int = 0
+    """Number of additional masses."""
+    mode_count: int = MODE_SHIFTS
+    """Number of elastic modes that may shift."""
+    form_of: int | None = None
+    """Number of sensors beside ERAs of a plate with form errors, None without these."""
+
+    @cached_property
+    def eras(self) -> list[str]:
+        """Names of the ERAs."""
+        return [era.name for era in self.rig.eras]
+
+    @cached_property
+    def excites(self) -> NDArray[np.bool_]:
+        """Mask of the ERAs that are exciters."""
+        return np.array(["force_factor" in era.fields for era in self.rig.eras])
+
+    @cached_property
+    def sides(self) -> FloatArray:
+        """Length and width of the plate [m]."""
+        return np.array([self.rig.plate.length, self.rig.plate.width])
+
+
+def values_of_eras(rig: Rig, kind: str) -> FloatArray:
+    """Values of a kind as a rig's ERAs have them in its file (n,), 0 where one has none."""
+    return np.array([getattr(era, era.fields.get(kind, ""), 0.0) for era in rig.eras])
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """Parameters of a kind: names, prior, what they change of a rig and of its responses."""
+
+    std: float
+    """Standard deviation for a plate that was not measured, in the unit of `Values`."""
+    names: Callable[[SearchScope], Sequence[str]]
+    """Names of all parameters."""
+    slope: Callable[["PlateAt"], ComplexArray]
+    """Derivatives of the responses by all parameters, in the unit of `Values` (f, s, n, m)."""
+    value: Callable[["Values"], Any] | None = None
+    """What the parameters stand for, by default their deviations alone."""
+    stated: Callable[[SearchScope, float], Number] | None = None
+    """Standard deviations where a rig states them, from `std`; by default that of all."""
+    limits: Callable[[SearchScope], tuple[Number, Number]] | None = None
+    """Lowest and highest deviations where a rig is measured in place, by default any."""
+    by_sheet: Callable[[SearchScope, float], Range] | None = None
+    """Range of a rig that data sheets alone describe, from `std`; by default exactly known."""
+    unit: str = "%"
+    """Unit in reports for people; logarithms of factors are written as per cent."""
+    per_unit: float = 100.0
+    """Number of report units in one unit of `Values`."""
+    drift: float = 0.0
+    """Standard deviation by which it walks in an hour of service."""
+    drifts_to: float = 0.0
+    """Largest standard deviation by drift, 0 for `std`."""
+    theory: float = 0.0
+    """Change of the fitted value by another theory of the plate."""
+    stage: int = 2
+    """When an identification searches it: 0 at first, 1 with the places of masses, 2 with all."""
+    is_listed: bool = False
+    """Whether the report of an identification always has it."""
+
+    @property
+    def widest(self) -> float:
+        """Largest standard deviation that drift leads to."""
+        return self.drifts_to or self.std
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Names of all p parameters with their standard deviations, bounds and kinds."""
+
+    names: tuple[str, ...]
+    std: FloatArray
+    """Standard deviations (p,) in the units of `Values`, 0 where a parameter is known."""
+    lower: FloatArray
+    """Lower bounds of x (p,)."""
+    upper: FloatArray
+    """Upper bounds of x (p,)."""
+    groups: dict[str, slice]
+    """Slice of the parameters of each kind."""
+    kinds: Mapping[str, Kind]
+    """All kinds by their names."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters p."""
+        return len(self.names)
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """Standard deviations (p,), 1 of what is known."""
+        return np.where(self.std > 0, self.std, 1.0)
+
+    @cached_property
+    def uncertain(self) -> NDArray[np.bool_]:
+        """Mask (p,) of the parameters that are not known beforehand."""
+        return np.asarray(self.std > 0)
+
+    def of(self, *kinds: str) -> NDArray[np.bool_]:
+        """Mask (p,) of the uncertain parameters of some kinds."""
+        chosen = np.zeros(self.size, dtype=bool)
+        for kind in kinds:
+            chosen[self.groups[kind]] = True
+        return chosen & self.uncertain
+
+    def and_further(self, kind: str, names: Sequence[str], known: Range | None = None) -> "Space":
+        """Append parameters of a kind; known: by default with the kind's deviation, unbounded."""
+        own = (self.kinds[kind].std, -np.inf, np.inf) if known is None else known
+        std, lower, upper = (np.broadcast_to(each, len(names)) for each in own)
+        unit = np.where(std > 0, std, 1.0)
+        return replace(
+            self,
+            names=(*self.names, *names),
+            std=np.append(self.std, std),
+            lower=np.append(self.lower, lower / unit),
+            upper=np.append(self.upper, upper / unit),
+            groups=self.groups | {kind: slice(self.size, self.size + len(names))},
+        )
+
+    def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
+        """A property of the kind of each parameter, in its unit (p,), 0 for known ones."""
+        found = np.zeros(self.size)
+        for kind, part in self.groups.items():
+            found[part] = known(self.kinds[kind])
+        return np.where(self.uncertain, found, 0.0)
+
+    @cached_property
+    def as_built(self) -> "Space":
+        """The space of a plate that was not measured: that of kinds where the rig states less."""
+        return replace(self, std=np.maximum(self.std, self.of_kinds(lambda kind: kind.std)))
+
+    def indices(self, kind: str) -> range:
+        """Numbers of the parameters of a kind."""
+        return range(*self.groups[kind].indices(self.size))
+
+    def values(self, x: FloatArray, kind: str) -> FloatArray:
+        """Deviations of the parameters of a kind from the rig, in their units, for x (p,)."""
+        part = self.groups[kind]
+        return np.asarray(self.std[part] * x[part])
+
+    def index(self, name: str) -> int:
+        """Number of the parameter of a name; raises ValueError for an unknown one."""
+        return self.names.index(name)
+
+
+class Values:
+    """Values of a rig's plate by the kinds of parameters x (p,) that change them.
+
+    As each `Kind.value` says; of n ERAs, m additional masses, k fingers and s sensors.
+    """
+
+    def __init__(self, rig: Rig, space: Space, x: FloatArray) -> None:
+        self.rig, self.space, self.x = rig, space, x
+
+    def own(self, kind: str) -> FloatArray:
+        """Deviations of all parameters of a kind."""
+        return self.space.values(self.x, kind)
+
+    def __getitem__(self, kind: str) -> Any:
+        """The values of a kind, without the deviations of others that add to it elsewhere."""
+        value = self.space.kinds[kind].value
+        return self.own(kind) if value is None else value(self)
+
+    def sources(self) -> tuple[Actuator, ...]:
+        """The rig's ERAs with their values, without gains."""
+        found: list[Actuator] = []
+        for number, era in enumerate(self.rig.eras):
+            fields: dict[str, Any] = {
+                name: float(self[kind][number]) for kind, name in era.fields.items()
+            }
+            if isinstance(era, Exciter):
+                largest = era.largest_force_factor(fields["magnet_mass"])
+                fields["force_factor"] = min(fields["force_factor"], largest)
+            found.append(replace(era, gains=(), **fields))
+        return tuple(found)
+
+    def lag(self, frequencies: FloatArray) -> ComplexArray:
+        """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
+
+        1 / (1 - inertia f² + i drag f), f in kilohertz: of an actuator with a resonance at
+        1 / sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
+        """
+        f = 1e-3 * np.asarray(frequencies)[:, None]
+        return np.asarray(1 / (1 - self["inertia"] * f**2 + 1j * self["drag"] * f))
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModes:
+    """A plate's modes and residual vectors at all that is attached, for one with form errors.
+
+    No further modes count as truncated.
+    """
+
+    plate: ReducedPlate
+    cells: FloatArray
+    """Shapes where foreign mass may lie (c, r)."""
+    stiffening: FloatArray
+    """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
+    (relative) and Poisson's ratio."""
+
+    @property
+    def eigenvalues(self) -> FloatArray:
+        """omega² (r,) [rad²/s²]."""
+        return np.asarray(self.plate.omega**2)
+
+    @property
+    def losses(self) -> FloatArray:
+        """Their imaginary part beside the plate's own loss factor (r,)."""
+        return self.plate.losses
+
+    @property
+    def dispersion(self) -> Dispersion | None:
+        """How they change with frequency, None where they do not."""
+        return self.plate.dispersion
+
+    def shapes_at(self, points: FloatArray) -> FloatArray:
+        """Shapes at points or footprints [m], (n, r)."""
+        return self.plate.at(points)
+
+    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
+        """Sums over truncated modes: zero, (TERMS, n, m)."""
+        return np.zeros((TERMS, len(points), len(others)))
+
+
+def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
+    """Reduce a rig's free plate to coordinates in which it may have form errors."""
+    plate = rig.plate
+    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
+    cells = MASS_CELLS.centres(plate)
+    unknowns = reduced.unknowns()
+    if isinstance(free.mesh, Mesh):
+        stiffening = element_slopes(plate, free.mesh, unknowns[0])
+    else:
+        degrees = free.mesh.nx, free.mesh.ny
+        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
+        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
+    return ReducedModes(reduced, reduced.at(cells), stiffening)
+
+
+Modes: TypeAlias = FreeModes | ReducedModes
+
+
+@dataclass(frozen=True, eq=False)
+class AttachmentPoints:
+    """Shapes at a points of attachment and observation, v of which may move along x and y."""
+
+    footprints: FloatArray
+    """Place and radius of each (a, 3) [m]."""
+    shapes: FloatArray
+    """Mode shapes (a, r)."""
+    truncated: FloatArray
+    """Sums over truncated modes (TERMS, a, a)."""
+    shape_slopes: FloatArray
+    """Derivatives of the shapes by x and y of each movable point in turn (2 v, r) [1/m]."""
+    truncated_slopes: FloatArray
+    """Derivatives of the sums by the place of the first point (TERMS, 2 v, a) [1/m]."""
+
+    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
+        """The same for other footprints (a, 3), by the slopes of the shapes alone."""
+        off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
+        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
+        shapes = self.shapes.copy()
+        shapes[movable] += (off * slopes).sum(axis=1)
+        return replace(self, footprints=footprints, shapes=shapes)
+
+
+def places_of(
+    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
+) -> AttachmentPoints:
+    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
+
+    movable (v,): numbers of those that may move.
+    """
+    moving, shapes = footprints[movable], modes.shapes_at(footprints)
+    truncated = modes.truncated_terms(footprints, footprints)
+    if not len(movable):
+        none = np.zeros((len(truncated), 0, len(footprints)))
+        return AttachmentPoints(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
+
+    def field(points: FloatArray) -> FloatArray:
+        return modes.truncated_terms(points, footprints).swapaxes(0, 1)
+
+    by_place = place_slopes(field, moving, sides)
+    return AttachmentPoints(
+        footprints,
+        shapes,
+        truncated,
+        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
+        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,32 +562,33 @@ class ForwardModel:
         """
         footprints = self._footprints(values)
         if self.form is not None:
-            nominal = self._footprints(Values.of(self.rig, self.space, np.zeros(self.space.size)))
+            nominal = self._footprints(Values(self.rig, self.space, np.zeros(self.space.size)))
             return self._solved(nominal).moved(footprints, self.movable)
-        footprints[:, :2] = np.clip(footprints[:, :2], 0, self._sides)
+        footprints[:, :2] = np.clip(footprints[:, :2], 0, self.sides)
         return self._solved(footprints)
 
     def _solved(self, footprints: FloatArray) -> AttachmentPoints:
         key = footprints.tobytes()
         if key not in self.last_places:
             self.last_places.clear()
-            self.last_places[key] = places_of(self.modes, footprints, self.movable, self._sides)
+            self.last_places[key] = places_of(self.modes, footprints, self.movable, self.sides)
         return self.last_places[key]
 
     @property
-    def _sides(self) -> FloatArray:
+    def sides(self) -> FloatArray:
+        """Length and width of the plate [m]."""
         return np.array([self.rig.plate.length, self.rig.plate.width])
 
     def _footprints(self, values: Values) -> FloatArray:
         """Footprints of ERAs, masses, additional masses, fingers and sensors, (a, 3) [m]."""
         feet = [era.foot for era in self.rig.eras]
         fingers = np.array([(each.x, each.y) for each in self.fingers]).reshape(-1, 2)
-        points = np.vstack([values.masses[:, 1:], fingers])
+        points = np.vstack([values["masses"][:, 1:], fingers])
         pads = self.pads.copy()
-        pads[: len(values.sensor_places), :2] += values.sensor_places
+        pads[: len(values["sensor_place"]), :2] += values["sensor_place"]
         return np.vstack(
             [
-                np.column_stack([values.places, feet]),
+                np.column_stack([values["place"], feet]),
                 footprints_of(self.rig.masses),
                 np.column_stack([points, np.zeros(len(points))]),
                 pads,
@@ -275,30 +605,32 @@ class PlateAt:
     def __init__(
         self, model: ForwardModel, x: FloatArray, further: ComplexArray | None = None
     ) -> None:
-        self.model, self.values = model, Values.of(model.rig, model.space, x)
+        self.model, self.values = model, Values(model.rig, model.space, x)
         self.further = further
         self.functions = self._functions()
         """The free plate's modal receptance and truncated sums as functions of frequency."""
         self.located = model.places(self.values)
         """Shapes at all attachments."""
         w, values = model.omega[:, None], self.values
-        self.sources = values.sources(model.rig)
+        self.sources = values.sources()
         """The ERAs with their values."""
+        self.source_slopes = [each.slopes(model.omega) for each in self.sources]
+        """Changes of each ERA's dynamic stiffness and force with its values."""
         self.full_levels = np.array([each.full_level for each in self.sources])
         self.force = drive_forces(model.omega, self.sources) / self.full_levels
         """Force of each ERA on a plate that is held, per unit of its drive, (f, n)."""
         loads = [
             _finger(each, logs, model.omega)
-            for each, logs in zip(model.fingers, values.fingers, strict=True)
+            for each, logs in zip(model.fingers, values["fingers"], strict=True)
         ]
         self.finger_slopes = [slopes for _, slopes in loads]
         """Derivatives of each finger's dynamic stiffness by its parts, (f, 4)."""
         fixed = model.fixed_stiffness.copy()
-        fixed[:, list(model.rig.feet)] += (values.supports - 1) * model.springs
+        fixed[:, list(model.rig.feet)] += (values["supports"] - 1) * model.springs
         held = [
             attached_stiffness(model.omega, self.sources),
             fixed,
-            -(w**2) * values.masses[:, 0],
+            -(w**2) * values["masses"][:, 0],
             *(load[:, None] for load, _ in loads),
             np.zeros((len(w), len(model.pads))),
         ]
@@ -346,23 +678,19 @@ class PlateAt:
     def drive(self) -> ComplexArray:
         """Force of each drive on the plate per unit of what it plays, times -omega² (f, n)."""
         values, model = self.values, self.model
-        force = self.force * values.drive_gains * model.drive_gains * self.lag
+        force = self.force * values["gain"] * model.drive_gains * self.lag
         return np.asarray(-(model.omega**2)[:, None] * force)
 
     @cached_property
     def scale(self) -> ComplexArray:
         """Factors from T at sensors and ERAs to responses, (f, s, n)."""
-        gains = self.values.sensor_gains
-        if len(self.values.sensor_scales):
-            gains = gains * self.values.sensor_scales
+        gains = self.values["sensor_gain"] * self.values["sensor_scale"]
         return np.asarray(gains[:, None] * self.drive[:, None] * self.late)
 
     @cached_property
-    def late(self) -> ComplexArray | float:
-        """Factor of responses by clocks that are off (f, s, n), 1 where they agree."""
-        if not len(self.values.delays):
-            return 1.0
-        delays = self.model.lateness @ self.values.delays
+    def late(self) -> ComplexArray:
+        """Factor of responses by clocks that are off (f, s, n)."""
+        delays = self.model.lateness @ self.values["delay"]
         return np.asarray(np.exp(-1j * self.model.omega[:, None, None] * delays))
 
     @cached_property
@@ -376,7 +704,7 @@ class PlateAt:
         """`loaded` with losses between hysteretic and viscous, as x has them (f, s, n) [m/N]."""
         if self.model.law is None:
             return self.loaded
-        return np.asarray(self.loaded + self.values.loss_law * self.model.law)
+        return np.asarray(self.loaded + self.values["loss_law"] * self.model.law)
 
     @cached_property
     def lightness(self) -> ComplexArray | None:
@@ -398,19 +726,19 @@ class PlateAt:
         model, values = self.model, self.values
         modes, theory = model.shifted_modes, model.elasticity
         eta = (
-            max(values.loss_factor, MIN_LOSS_FACTOR)
-            * (model.frequencies / LOSS_FREQUENCY) ** values.loss_exponent
+            max(values["loss"], MIN_LOSS_FACTOR)
+            * (model.frequencies / LOSS_FREQUENCY) ** values["loss_exponent"]
         )
         eigenvalues, relative = theory.eigenvalues.copy(), theory.relative_loss.copy()
-        eigenvalues[modes] *= np.exp(values.mode_shifts)
-        relative[modes] *= np.exp(values.mode_losses)
+        eigenvalues[modes] *= np.exp(values["mode_shifts"])
+        relative[modes] *= np.exp(values["mode_losses"])
         loss: FloatArray = np.multiply.outer(eta, relative)
         rig, solved = model.rig.plate, model.free.plate
-        thickness = values.thickness * rig.thickness / solved.thickness
-        modulus = values.modulus * rig.material.E / solved.material.E
+        thickness = values["thickness"] * rig.thickness / solved.thickness
+        modulus = values["modulus"] * rig.material.E / solved.material.E
         # Soft layers and air lose beside the plate's loss factor, and deviate with their mode.
         further = theory.losses.copy()
-        further[modes] *= np.exp(values.mode_shifts + values.mode_losses)
+        further[modes] *= np.exp(values["mode_shifts"] + values["mode_losses"])
         own = loss * eigenvalues
         lossy = eigenvalues + 1j * (own + further)
         if theory.dispersion is not None:
@@ -430,12 +758,142 @@ class PlateAt:
         self.bending: ComplexArray | None = None
         """Stiffness between modes with form errors (f, r, r) [rad²/s²]; `added` is their mass."""
         if model.form is not None:
-            stretched = np.einsum("g,grq->rq", values.stretch, model.form.stiffening)
+            stretch = np.append(values["side"], values["poisson"])
+            stretched = np.einsum("g,grq->rq", stretch, model.form.stiffening)
             self.bending = ((1 + 1j * eta) * modulus)[:, None, None] * stretched
-            shares = rig.mass * values.foreign_mass[:, None]
+            shares = rig.mass * values["foreign_mass"][:, None]
             self.added = model.form.cells.T @ (shares * model.form.cells)
         stiffness = np.asarray(modulus * lossy, dtype=complex)
         return model.free.receptance(model.omega, stiffness, eta, thickness, modulus)
+
+    def by_log_stiffness(
+        self, of_modes: ComplexArray | float, of_rest: ComplexArray | float
+    ) -> ComplexArray:
+        """Derivatives by a change of the log stiffness of modes (f, r) and of all else (f,)."""
+        functions, reach = self.functions, self.reach
+        seen, driven = reach[:, self.model.observed], reach[:, self.pushed].swapaxes(1, 2)
+        change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
+        if self.bending is not None:
+            change += seen @ (self.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
+        rest = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
+        further = self.by_free(combined(rest, self.located.truncated))
+        return self.responding(further - functions.thickness**3 * change)[..., None]
+
+    @cached_property
+    def by_log_rigidity(self) -> ComplexArray:
+        """Derivatives by the logarithm of the stiffness of all of the plate."""
+        return self.by_log_stiffness(1.0, 1.0)
+
+    @cached_property
+    def by_log_loss(self) -> ComplexArray:
+        """Derivatives by the logarithm of the plate's loss factor."""
+        return self.by_log_stiffness(self.by_loss, self.by_loss_of_rest)
+
+    def by_free(self, change: ComplexArray) -> ComplexArray:
+        """Change of T as `responding` takes it, by one of the free receptance (f, a, a)."""
+        left = self.left
+        return np.asarray(
+            left[:, self.model.observed] @ change @ left[:, self.pushed].swapaxes(1, 2)
+        )
+
+    def by_modes(self, share: ComplexArray | float) -> ComplexArray:
+        """Derivatives by the log eigenvalue of each mode that shifts, times a share (f, r)."""
+        modes, functions = self.model.shifted_modes, self.functions
+        reach = self.reach[:, :, modes]
+        by_stiffness = -(functions.thickness**3) * functions.elastic
+        return self.outer(reach, reach, (share * by_stiffness)[:, modes])
+
+    def by_foreign_mass(self) -> ComplexArray:
+        """Derivatives by the share of the plate's mass in each cell, taken from all of it."""
+        assert self.model.form is not None  # noqa: S101  there is foreign mass
+        reach = self.reach @ self.model.form.cells.T
+        share = self.model.rig.plate.mass * self.functions.thickness
+        by_mass = self.outer(reach, reach, share * self.model.omega[:, None] ** 2)
+        return np.asarray(by_mass - by_mass.mean(axis=-1, keepdims=True))
+
+    def by_stretch(self, *numbers: int) -> ComplexArray:
+        """Derivatives by relative length, width and Poisson's ratio, by number, as modes couple."""
+        assert self.model.form is not None  # noqa: S101  sides differ
+        seen = self.reach[:, self.model.observed]
+        driven = self.reach[:, self.pushed].swapaxes(1, 2)
+        factor = -(self.functions.q * self.functions.thickness)[:, None, None]
+        slopes = [self.model.form.stiffening[number] for number in numbers]
+        return np.stack(
+            [self.responding(factor * (seen @ slope @ driven)) for slope in slopes], axis=-1
+        )
+
+    @cached_property
+    def by_places(self) -> ComplexArray:
+        """Derivatives by x and y of each attachment that may move, (f, s, n, 2 v).
+
+        A place changes the receptance in its row and its column.
+        """
+        located, moved = self.located, np.repeat(self.model.movable, 2)
+        rows = located.shape_slopes @ self.moved
+        rows = rows + combined(self.functions.truncated(TERMS), located.truncated_slopes)
+        reach, own = self.left @ rows.swapaxes(1, 2), self.left[:, :, moved]
+        ones = np.ones((len(self.model.omega), 1))
+        return self.outer(own, reach, ones) + self.outer(reach, own, ones)
+
+    def by_sources(self, kind: str) -> ComplexArray:
+        """Derivatives by a value of each ERA, which also drives through it, (f, s, n, n)."""
+        none = np.zeros((2, len(self.model.omega)), dtype=complex)
+        slopes = np.array([each.get(kind, none) for each in self.source_slopes])
+        (change, of_force), eras = slopes.transpose(1, 2, 0), np.arange(len(slopes))
+        found = self.by_stiffness(eras, change)
+        found[:, :, eras, eras] += (
+            self.responses * (of_force / self.full_levels / self.force)[:, None]
+        )
+        return found
+
+    def by_masses(self) -> ComplexArray:
+        """Derivatives by each additional mass, its x and y in turn, (f, s, n, 3 m)."""
+        n, count = len(self.sources), self.model.mass_count
+        at = self.model.movable[n : n + count]
+        by_mass = self.by_stiffness(at, -(self.model.omega[:, None] ** 2))[..., None]
+        by_place = self.by_places[..., 2 * n : 2 * (n + count)]
+        by_place = by_place.reshape(*by_mass.shape[:-1], 2)
+        return np.concatenate([by_mass, by_place], axis=-1).reshape(*by_mass.shape[:3], -1)
+
+    def by_drives(self, factor: ComplexArray | complex = 1.0) -> ComplexArray:
+        """Derivatives by the logarithm of the gain of each drive, times a factor, (f, s, n, n)."""
+        return np.asarray(self.responses[..., None] * np.eye(len(self.sources)) * factor)
+
+    @property
+    def by_sensors(self) -> ComplexArray:
+        """Derivatives by the logarithm of the gain of each sensor, (f, s, n, s)."""
+        return np.asarray(self.responses[..., None] * np.eye(len(self.model.sensors))[:, None])
+
+    def by_stiffness(self, at: IntArray, change: AnyArray) -> ComplexArray:
+        """Derivatives by changes (f, m) of the dynamic stiffness of attachments (m,)."""
+        columns = self.receptance[:, :, at]
+        return self.outer(columns, columns, -change)
+
+    def outer(self, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
+        """Responses of T = factor u v^T, (f, s, n, m), of columns (f, a, m) and factors (f, m)."""
+        left = u[:, self.model.observed] * factor[:, None]
+        return self.responding(np.asarray(left[:, :, None] * v[:, None, self.pushed]))
+
+    @property
+    def pushed(self) -> slice | IntArray:
+        """Columns of T whose changes count: those of ERAs, then of sensors that load the plate."""
+        n = len(self.sources)
+        if self.lightness is None:
+            return slice(n)
+        return np.concatenate([np.arange(n), self.model.observed])
+
+    def responding(self, change: AnyArray) -> ComplexArray:
+        """Change of the responses (f, s, n, ...) by one of T (f, s, columns of `pushed`, ...)."""
+        further = (1,) * (change.ndim - 3)
+        n, at = len(self.sources), np.arange(change.shape[1])
+        found = change[:, :, :n]
+        if self.lightness is not None:
+            assert self.model.sensor_inertia is not None  # noqa: S101  there is a mass
+            loaded = self.model.sensor_inertia[:, :, None] * self.loaded
+            own = change[:, at, n + at][:, :, None]
+            found = found + loaded.reshape(*loaded.shape, *further) * own
+            found = found * self.lightness.reshape(*self.lightness.shape, 1, *further)
+        return np.asarray(found * self.scale.reshape(*self.scale.shape, *further))
 
 
 def _finger(
@@ -487,9 +945,9 @@ def _viscous(plate: PlateAt) -> FloatArray:
     springs = [each.in_time.stiffness for each in plate.sources]
     masses = [each.in_time.mass for each in plate.sources]
     factors = np.ones(len(rig.masses))
-    factors[list(rig.feet)] = values.supports
-    springs += [*factors * [load.stiffness for load in rig.masses]] + [0.0] * len(values.masses)
-    masses += [load.mass for load in rig.masses] + [*values.masses[:, 0]]
+    factors[list(rig.feet)] = values["supports"]
+    springs += [*factors * [load.stiffness for load in rig.masses]] + [0.0] * len(values["masses"])
+    masses += [load.mass for load in rig.masses] + [*values["masses"][:, 0]]
     on_plate = shapes[: len(springs)]
     lossy = _lossy(plate)
     stiffness = lossy + (on_plate.T * springs) @ on_plate / h
@@ -500,243 +958,24 @@ def _viscous(plate: PlateAt) -> FloatArray:
     return np.asarray(weighted @ (modes.T @ lossy @ modes) @ weighted.T)
 
 
-AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
-
-
 def jacobian(plate: PlateAt, searched: NDArray[np.bool_] | None = None) -> ComplexArray:
     """Derivatives of the responses of a plate by x, (f, s, n, p).
 
-    searched (p,): those of interest; of kinds without any they may be zero. By default all.
+    searched (p,): those of interest; of kinds without any they are zero. By default all.
     """
     space = plate.model.space
+    wanted = space.uncertain if searched is None else space.uncertain & searched
     found = np.zeros((*plate.responses.shape, space.size), dtype=complex)
-    for group, kinds in _GROUPS.items():
-        wanted = space.of(*kinds)
-        if not (wanted if searched is None else wanted & searched).any():
-            continue
-        for kind, columns in group(plate).items():
-            found[..., space.groups[kind]] = columns * space.std[space.groups[kind]]
+    for kind, part in space.groups.items():
+        if wanted[part].any():
+            found[..., part] = space.kinds[kind].slope(plate) * space.std[part]
     return found
 
 
 def by_mass_at(plate: PlateAt, points: FloatArray) -> ComplexArray:
     """Derivatives of the responses by a mass [kg] at points (p, 2) [m], (f, s, n, p)."""
-    reach = reach_to(plate, points)
-    return _outer(plate, reach, reach, plate.model.omega[:, None] ** 2)
-
-
-def reach_to(plate: PlateAt, points: FloatArray) -> ComplexArray:
-    """Motion of what is attached by forces at points (p, 2) [m], (f, a, p)."""
-    modes, functions = plate.model.modes, plate.functions
+    modes = plate.model.modes
     truncated = modes.truncated_terms(plate.located.footprints, points)
-    by_modes = plate.reach @ modes.shapes_at(points).T
-    return np.asarray(by_modes + plate.left @ combined(functions.truncated(TERMS), truncated))
-
-
-Columns: TypeAlias = dict[str, ComplexArray]
-"""Derivatives (f, s, n, m) by the m parameters of a kind, in the units of `Values`."""
-
-
-def _by_plate(plate: PlateAt) -> Columns:
-    """Derivatives by thickness, modulus and loss factor of the whole plate."""
-    functions, reach = plate.functions, plate.reach
-    seen, driven = reach[:, plate.model.observed], reach[:, _pushed(plate)].swapaxes(1, 2)
-
-    def responses(of_modes: ComplexArray | float, of_rest: ComplexArray | float) -> ComplexArray:
-        """Derivatives by a change of the log stiffness of modes (f, r) and of all else (f,)."""
-        change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
-        if plate.bending is not None:
-            change += seen @ (plate.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
-        rest = np.asarray(of_rest)[..., None] * functions.truncated_by_log_q
-        further = _attached(plate, combined(rest, plate.located.truncated))
-        return _responses(plate, further - functions.thickness**3 * change)[..., None]
-
-    by_stiffness = responses(1.0, 1.0)
-    by_loss = responses(plate.by_loss, plate.by_loss_of_rest)
-    by_mass = _responses(plate, _attached(plate, plate.free_receptance))
-    powers = np.log(plate.model.frequencies / LOSS_FREQUENCY)[:, None, None, None]
-    return {
-        "thickness": 2 * by_stiffness - by_mass[..., None],
-        "modulus": by_stiffness,
-        "loss": by_loss,
-        "loss_added": by_loss / max(plate.values.loss_factor, MIN_LOSS_FACTOR),
-        "loss_exponent": powers * by_loss,
-    }
-
-
-def _attached(plate: PlateAt, change: ComplexArray) -> ComplexArray:
-    """Change of T as `_responses` takes it, by one of the free receptance (f, a, a)."""
-    left = plate.left
-    return np.asarray(
-        left[:, plate.model.observed] @ change @ left[:, _pushed(plate)].swapaxes(1, 2)
-    )
-
-
-def _by_modes(plate: PlateAt) -> Columns:
-    modes, functions = plate.model.shifted_modes, plate.functions
-    reach = plate.reach[:, :, modes]
-    by_stiffness = -(functions.thickness**3) * functions.elastic[:, modes]
-    return {
-        "mode_shifts": _outer(plate, reach, reach, by_stiffness),
-        "mode_losses": _outer(plate, reach, reach, plate.by_mode_loss[:, modes] * by_stiffness),
-    }
-
-
-def _by_form(plate: PlateAt) -> Columns:
-    """Derivatives by form errors: foreign mass and sides, which couple modes, and the loss law."""
-    model, functions = plate.model, plate.functions
-    if model.form is None:
-        return {}
-    reach = plate.reach @ model.form.cells.T
-    share = model.rig.plate.mass * functions.thickness
-    by_mass = _outer(plate, reach, reach, share * plate.model.omega[:, None] ** 2)
-    seen, driven = plate.reach[:, model.observed], plate.reach[:, _pushed(plate)].swapaxes(1, 2)
-    factor = -(functions.q * functions.thickness)[:, None, None]
-    stretched = [
-        _responses(plate, factor * (seen @ slope @ driven)) for slope in model.form.stiffening
-    ]
-    sides = np.array([model.rig.plate.length, model.rig.plate.width])
-    law = np.zeros(plate.scale.shape) if model.law is None else plate.scale * model.law
-    return {
-        "foreign_mass": by_mass - by_mass.mean(axis=-1, keepdims=True),
-        "loss_law": law[..., None],
-        "side": np.stack(stretched[:2], axis=-1) / sides,
-        "poisson": stretched[2][..., None],
-    }
-
-
-def _by_places(plate: PlateAt) -> Columns:
-    """Derivatives by the places of ERAs and sensors, and by additional masses and their places.
-
-    A place changes the receptance in its row and its column.
-    """
-    model = plate.model
-    n, moved = plate.force.shape[1], np.repeat(model.movable, 2)
-    located, functions = plate.located, plate.functions
-    rows = located.shape_slopes @ plate.moved
-    rows = rows + combined(functions.truncated(TERMS), located.truncated_slopes)
-    reach, own = plate.left @ rows.swapaxes(1, 2), plate.left[:, :, moved]
-    ones = np.ones((len(model.omega), 1))
-    by_place = _outer(plate, own, reach, ones) + _outer(plate, reach, own, ones)
-    places, of_masses, of_sensors = np.split(by_place, [2 * n, 2 * (n + model.mass_count)], axis=-1)
-    masses = np.empty((*by_place.shape[:-1], model.mass_count, 3), dtype=complex)
-    masses[..., 1:] = of_masses.reshape(masses[..., 1:].shape)
-    at = model.movable[n : n + model.mass_count]
-    masses[..., 0] = _by_stiffness(plate, at, -(model.omega[:, None] ** 2))
-    return {
-        "place": places,
-        "sensor_place": of_sensors,
-        "masses": masses.reshape(*by_place.shape[:-1], -1),
-    }
-
-
-def _by_attachments(plate: PlateAt) -> Columns:
-    """Derivatives by the values of ERAs, which also drive through them, by feet and by fingers."""
-    model, values, Y = plate.model, plate.values, plate.responses
-    n = plate.force.shape[1]
-    eras, slopes = np.arange(n), [each.slopes(model.omega) for each in plate.sources]
-    none = np.zeros((2, len(model.omega)), dtype=complex)
-    found: Columns = {}
-    for kind in ("stiffness", "damping", "bolt_mass", *EXCITER_KINDS):
-        change, of_force = np.array([each.get(kind, none) for each in slopes]).transpose(1, 2, 0)
-        found[kind] = _by_stiffness(plate, eras, change)
-        found[kind][:, :, eras, eras] += Y * (of_force / plate.full_levels / plate.force)[:, None]
-    for kind in EXCITER_KINDS:
-        found[kind] = found[kind][..., : len(model.space.indices(kind))]
-    found["damping_added"] = found["damping"]
-    found["damping_each"] = found["damping"] * values.damping
-    found["damping"] = found["damping_each"].sum(axis=-1, keepdims=True)
-    feet = np.array([n + number for number in model.rig.feet], dtype=int)
-    found["supports"] = _by_stiffness(plate, feet, values.supports * model.springs)
-    first = n + len(model.rig.masses) + model.mass_count
-    by_finger = [
-        _by_stiffness(plate, np.full(4, first + number), slopes)
-        for number, slopes in enumerate(plate.finger_slopes)
-    ]
-    found["fingers"] = np.concatenate([np.zeros((*Y.shape, 0)), *by_finger], axis=-1)
-    return found
-
-
-def _by_gains(plate: PlateAt) -> Columns:
-    Y = plate.responses
-    by_drive = Y[..., None] * np.eye(Y.shape[2])
-    by_sensor = Y[..., None] * np.eye(Y.shape[1])[:, None]
-    f = 1e-3 * plate.model.frequencies[:, None]
-    by_inertia, by_drag = f**2 * plate.lag, -1j * f * plate.lag
-    count = len(plate.values.delays)
-    lateness = plate.model.lateness if count else np.zeros((*Y.shape[1:], 0))
-    # A scale may be zero.
-    unscaled = plate.values.sensor_gains[:, None] * plate.drive[:, None] * plate.late * plate.seen
-    by_scale = np.eye(Y.shape[1], len(plate.values.sensor_scales))[:, None]
-    return {
-        "gain": by_drive,
-        "phase": 1j * by_drive,
-        "inertia": by_drive * by_inertia[:, None, None],
-        "drag": by_drive * by_drag[:, None, None],
-        "delay": -1j * plate.model.omega[:, None, None, None] * Y[..., None] * lateness,
-        "sensor_gain": by_sensor,
-        "sensor_phase": 1j * by_sensor,
-        "sensor_scale": unscaled[..., None] * by_scale,
-    }
-
-
-_GROUPS: dict[Callable[[PlateAt], Columns], tuple[str, ...]] = {
-    _by_plate: ("thickness", "modulus", "loss", "loss_added", "loss_exponent"),
-    _by_modes: ("mode_shifts", "mode_losses"),
-    _by_places: ("place", "masses", "sensor_place"),
-    _by_form: ("foreign_mass", "loss_law", "side", "poisson"),
-    _by_attachments: (
-        "stiffness",
-        "damping",
-        "damping_each",
-        "damping_added",
-        "bolt_mass",
-        *EXCITER_KINDS,
-        "supports",
-        "fingers",
-    ),
-    _by_gains: (
-        "gain",
-        "phase",
-        "inertia",
-        "drag",
-        "delay",
-        "sensor_gain",
-        "sensor_phase",
-        "sensor_scale",
-    ),
-}
-
-
-def _by_stiffness(plate: PlateAt, at: IntArray, change: AnyArray) -> ComplexArray:
-    """Responses by changes (f, m) of the dynamic stiffness of attachments (m,)."""
-    columns = plate.receptance[:, :, at]
-    return _outer(plate, columns, columns, -change)
-
-
-def _outer(plate: PlateAt, u: AnyArray, v: AnyArray, factor: AnyArray) -> ComplexArray:
-    """Responses of T = factor u v^T, (f, s, n, m), of columns (f, a, m) and factors (f, m)."""
-    left = u[:, plate.model.observed] * factor[:, None]
-    return _responses(plate, np.asarray(left[:, :, None] * v[:, None, _pushed(plate)]))
-
-
-def _pushed(plate: PlateAt) -> slice | IntArray:
-    """Columns of T whose changes count: those of ERAs, then of sensors that load the plate."""
-    n = plate.force.shape[1]
-    if plate.lightness is None:
-        return slice(n)
-    return np.concatenate([np.arange(n), plate.model.observed])
-
-
-def _responses(plate: PlateAt, change: AnyArray) -> ComplexArray:
-    """Change of the responses (f, s, n, ...) by one of T (f, s, columns of `_pushed`, ...)."""
-    further = (1,) * (change.ndim - 3)
-    n, at = plate.force.shape[1], np.arange(change.shape[1])
-    found = change[:, :, :n]
-    if plate.lightness is not None:
-        assert plate.model.sensor_inertia is not None  # noqa: S101  there is a mass
-        loaded = plate.model.sensor_inertia[:, :, None] * plate.loaded
-        own = change[:, at, n + at][:, :, None]
-        found = found + loaded.reshape(*loaded.shape, *further) * own
-        found = found * plate.lightness.reshape(*plate.lightness.shape, 1, *further)
-    return np.asarray(found * plate.scale.reshape(*plate.scale.shape, *further))
+    rest = combined(plate.functions.truncated(TERMS), truncated)
+    reach = plate.reach @ modes.shapes_at(points).T + plate.left @ rest
+    return plate.outer(reach, reach, plate.model.omega[:, None] ** 2)

@@ -46,18 +46,9 @@ from model.estimate.fit import (
     likeliest,
     parameters_of,
 )
-from model.estimate.forward import ForwardModel, Sensor, jacobian
+from model.estimate.forward import MODE_SHIFTS, ForwardModel, Sensor, Space, Values, jacobian
 from model.estimate.measurement import Measurement
-from model.estimate.space import (
-    KINDS,
-    MODE_SHIFTS,
-    Space,
-    Values,
-    inwards,
-    plate_with,
-    rig_with,
-    space_of,
-)
+from model.estimate.space import KINDS, inwards, plate_with, rig_with, space_of
 from model.finger import Grid
 from model.processes import Progress, unseen
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -95,21 +86,9 @@ _MASS_STARTS = 4
 _MORE_MASS_BEYOND = 1.5  # chi²
 _MASS_GAINS = 25.0  # of the cost: five standard deviations
 
-_SIMPLE = (
-    "thickness",
-    "stiffness",
-    "damping",
-    "damping_each",
-    "loss",
-    "gain",
-    "phase",
-    "inertia",
-    "drag",
-    "delay",
-    "sensor_gain",
-    "sensor_phase",
+_SIMPLE, _LOCATED = (
+    [name for name, kind in KINDS.items() if kind.stage <= stage] for stage in (0, 1)
 )
-_LOCATED = (*_SIMPLE, "place", "masses")
 
 _THEORY = {
     "frequency": KINDS["mode_shifts"].theory / 2,
@@ -457,8 +436,8 @@ def _check_gains(rig: Rig, measurement: Measurement, values: Values, space: Spac
     drives = [f"drive {era.name}" for era in rig.eras]
     sensors = [f"sensor {sensor.name}" for sensor in measurement.sensors]
     wrong = [
-        *_wrong_gains(drives, values.drive_gains, space, ""),
-        *_wrong_gains(sensors, values.sensor_gains, space, "sensor_"),
+        *_wrong_gains(drives, values["gain"], space, ""),
+        *_wrong_gains(sensors, values["sensor_gain"], space, "sensor_"),
     ]
     if wrong:
         raise InputError(
@@ -650,7 +629,7 @@ def clock_estimates(found: Identification) -> list[ClockEstimate]:
     stated = found.fitted.measurement.clock_errors
     first, *others = sorted(stated) or [""]
     part = found.fitted.space.groups["delay"]
-    rows = zip([first, *others], found.values.delays, found.std[part], strict=False)
+    rows = zip([first, *others], found.values["delay"], found.std[part], strict=False)
     estimated = [
         ClockEstimate(name, 1e6 * delay, 1e6 * error, 1e6 * math.hypot(stated[first], stated[name]))
         for name, delay, error in rows

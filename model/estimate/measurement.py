@@ -141,10 +141,9 @@ class Measurement:
     their lines state; empty where all have one clock."""
     skipped: int = 0
     """Number of values that were read beyond the rig's limits of frequency."""
-    free_gains: bool = False
-    """Whether each drive has a gain of its own at every frequency, which nothing states."""
-    gain_std: float = math.inf
-    """Relative standard deviation of the magnitudes of free gains from 1."""
+    gain_std: float = 0.0
+    """Relative standard deviation from 1 of the gain that each drive has at every frequency: 0
+    where gains are 1, infinite where nothing states them. A phase is free with its magnitude."""
     drives: tuple[int, ...] = ()
     """Number of the ERA that each of the n channels drives, empty where each drives its own."""
     bases: ComplexArray | None = None

@@ -1,59 +1,40 @@
-"""Parameters of a rig that a fit may change: their kinds, their space, and the values they stand
-for.
+"""Which parameters of a rig a fit may change: each kind in one table, and the spaces of them.
 
-A vector x has one number for each parameter, in standard deviations of what is known beforehand.
-`Space` names them, `Values` converts x to springs, places, masses, losses and gains of the rig, and
-`rig_with` writes these to a rig.
-
-A plate may also have form errors, which a rig file does not describe: a cable glued to it, sides
-that are not cut to size. Left out, they bias fitted values by far more than noise does, and no
-residual shows by how much. They change stiffness and mass between the modes of the free plate, and
-so its mode shapes (`ReducedModes`).
+`KINDS` says of each kind what it is called, how well it is known beforehand, how it changes the rig
+and how responses follow it. A space has those of a rig that is measured in place (`space_of`), or
+of one that data sheets describe (`space_by_sheets`); `rig_with` writes what a fit found to a rig.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Self, TypeAlias
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from model.arrays import ComplexArray, FloatArray, IntArray
-from model.fem import Mesh, element_slopes
-from model.finger import Grid
-from model.reduction.free_plate import TERMS, FreeModes, FreePlate
-from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
-from model.rig.rig import Rig, Uncertainty
-from model.spectral.direct_solution import stiffness_slopes
-from model.structure.attachments import (
-    FEET_DEVIATE,
-    Gain,
-    PointLoad,
-    damping_from_ratio,
-    footprints_of,
+from model.estimate.forward import (
+    FINGER_PARTS,
+    MASS_CELLS,
+    MIN_LOSS_FACTOR,
+    MODE_SHIFTS,
+    Kind,
+    Number,
+    PlateAt,
+    Range,
+    SearchScope,
+    Space,
+    Values,
+    values_of_eras,
 )
-from model.structure.exciter import Actuator, Exciter
-from model.structure.modal_elasticity import Dispersion
+from model.rig.rig import Rig, Uncertainty
+from model.structure.attachments import FEET_DEVIATE, Gain, PointLoad, damping_from_ratio
 from model.structure.plate import LOSS_FREQUENCY, MAX_LOSS_EXPONENT, MAX_LOSS_FACTOR, Plate
 
-MASS_CELLS = Grid(8, 6)
-
-MODE_SHIFTS = 12
-"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
-
-FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
-"""Parts of a finger's load that vary independently."""
-
 _BUILT = Uncertainty()
-_PHASE, _LENGTH, _WEIGHT = ("°", math.degrees(1)), ("mm", 1e3), ("g", 1e3)
+_DAMPED = math.log(_BUILT.damping)
 
 UNIT_KEYS = {"%": "percent", "°": "deg", "/kHz²": "1/kHz^2", "/kHz": "1/kHz"}
 """Units in reports for programs, of those that people read in another way."""
-
-EXCITER_KINDS = ("magnet_mass", "force_factor")
-"""Kinds whose parameters only exciters have."""
 
 FORM = ("sensor_scale", "sensor_place", "foreign_mass", "side", "poisson", "loss_law")
 """Kinds whose parameters only a plate with form errors has."""
@@ -80,174 +61,489 @@ VALUE_UNITS = {
 """Units of the values of a rig that parameters change."""
 
 _AT_EDGE = 1e-6  # m
-
-Number: TypeAlias = float | FloatArray
-"""One number for all parameters of a kind, or one for each."""
-
 _MIN_MASS = 1e-5  # kg; a lighter one is not written to a rig
 _GAIN_STEP = 10.0  # Hz, of a drive that lags; linear between them is right to a thousandth
+_OWN_SHARE = 0.7  # least deviation by sheets of a loss, relative to the rig's
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Prior knowledge of all parameters of a kind, and how reports write them."""
-
-    std: float
-    """Standard deviation for a plate that was not measured, in the unit of `Values`."""
-    unit: str = "%"
-    """Unit in reports for people; logarithms of factors are written as per cent."""
-    per_unit: float = 100.0
-    """Number of report units in one unit of `Values`."""
-    drift: float = 0.0
-    """Standard deviation by which it walks in an hour of service."""
-    drifts_to: float = 0.0
-    """Largest standard deviation by drift, 0 for `std`."""
-    theory: float = 0.0
-    """Change of the fitted value by another theory of the plate."""
-    sheet: float = 0.0
-    """Standard deviation where data sheets alone describe a plate, 0 for `std`."""
-    bound: float = math.inf
-    """Largest deviation."""
-    own_share: float = 0.0
-    """Least `sheet` of what is added to a rig's value, as a share of that value."""
-
-    @property
-    def widest(self) -> float:
-        """Largest standard deviation that drift leads to."""
-        return self.drifts_to or self.std
+def _damps(scope: SearchScope) -> FloatArray:
+    """Which ERAs have a damping that is not known (n,), 0 or 1."""
+    damped = [float(era.damping > 0) for era in scope.rig.eras]
+    return (scope.uncertainty.damping > 1) * np.array(damped)
 
 
-KINDS = {
-    "thickness": Kind(_BUILT.thickness, drift=0.01),
-    "modulus": Kind(_BUILT.modulus, sheet=0.07, bound=math.log(3.0)),
-    "stiffness": Kind(_BUILT.stiffness, drift=0.03, theory=3e-3, sheet=0.10, bound=math.log(10.0)),
-    "damping": Kind(math.log(_BUILT.damping)),
-    # Of one ERA beside that of all.
-    "damping_each": Kind(0.2, drift=0.07, drifts_to=math.log(_BUILT.damping), theory=0.01),
-    "loss": Kind(math.log(_BUILT.damping), drift=0.1),
-    # Beside those of the rig, which may have none; data sheets give little, of ERAs by their ratio.
-    "damping_added": Kind(0.0, "N s/m", 1.0, sheet=0.015, bound=2.0, own_share=0.7),
-    "loss_added": Kind(0.0, "", 1.0, sheet=0.003, bound=0.5, own_share=0.7),
+def _loses(scope: SearchScope, std: float) -> float:
+    """A deviation, 0 of a plate without losses or of known ones."""
+    return std * float(scope.uncertainty.damping > 1 and scope.rig.plate.loss_factor > 0)
+
+
+def _exciters(scope: SearchScope) -> Sequence[str]:
+    """Names of all ERAs where one is an exciter, else none."""
+    return scope.eras if scope.excites.any() else ()
+
+
+def _lags(scope: SearchScope, std: float) -> Number:
+    """A deviation of the drives whose lag nothing states.
+
+    A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
+    """
+    known = [bool(era.gains) for era in scope.rig.eras] | scope.excites
+    return std * (~known & scope.drives_lag)
+
+
+def _of_form(scope: SearchScope, std: float) -> Range:
+    """Deviations of a plate with form errors, 0 of one without."""
+    return std * (scope.form_of is not None), -np.inf, np.inf
+
+
+def _factors(scope: SearchScope, std: Number, largest: float) -> Range:
+    """Range of logarithms of factors on values of parts as sold, of which a rig knows the error."""
+    return np.maximum(std, scope.rig.uncertainty.stiffness), -largest, largest
+
+
+def _exciter_factors(scope: SearchScope, std: float, largest: float) -> Range:
+    """Range of logarithms of factors on values of exciters, which other ERAs have not."""
+    of_all, low, high = _factors(scope, std, largest)
+    return of_all * scope.excites, low, high
+
+
+def _added(value: Number, std: Number, largest: Number) -> Range:
+    """Range of what is added to a value, which cannot become less than zero."""
+    return std, -value, np.maximum(largest - value, value)
+
+
+def _damping_by_sheets(scope: SearchScope, std: float) -> Range:
+    """Range of what is added to the damping of each ERA, by a damping ratio."""
+    rig, c = scope.rig, values_of_eras(scope.rig, "damping")
+    unit = np.array(
+        [
+            damping_from_ratio(
+                1.0,
+                stiffness=era.in_time.stiffness,
+                plate_mass=rig.plate.mass,
+                era_count=len(rig.eras),
+            )
+            for era in rig.eras
+        ]
+    )
+    return _added(c, np.maximum(_OWN_SHARE * c, std * unit), 2.0 * unit)
+
+
+def _bolts_by_sheets(scope: SearchScope, std: float) -> Range:
+    """Range of what is added to the mass of each bolt or coil.
+
+    A coil weighs what its sheet says, but for glue; a response tells it together with a gain.
+    """
+    bolt, unit = values_of_eras(scope.rig, "bolt_mass"), scope.rig.plate.mass / len(scope.rig.eras)
+    is_coil = scope.excites & (bolt > 0)
+    largest = np.where(is_coil, 2 * bolt, 5.0 * unit)
+    return _added(bolt, np.where(is_coil, COIL_DEVIATES * bolt, 0.05 * unit), largest)
+
+
+def _feet_by_sheets(scope: SearchScope, std: float) -> Range:
+    """Range of feet whose deviation a rig states; others are known."""
+    return scope.rig.uncertainty.supports, -math.log(10.0), math.log(10.0)
+
+
+def _by_lag(plate: PlateAt, factor: complex, power: int) -> ComplexArray:
+    """Derivatives by what makes drives lag with a power of frequency."""
+    f = 1e-3 * plate.model.frequencies[:, None]
+    return plate.by_drives((factor * f**power * plate.lag)[:, None, None])
+
+
+def _finger_numbers(plate: PlateAt) -> IntArray:
+    """Number among the attachments of the finger of each parameter (4 k,)."""
+    before = len(plate.sources) + len(plate.model.rig.masses) + plate.model.mass_count
+    return np.repeat(before + np.arange(len(plate.finger_slopes)), len(FINGER_PARTS))
+
+
+def _if_form(scope: SearchScope, names: Sequence[str]) -> Sequence[str]:
+    """Names of parameters that only a plate with form errors has."""
+    return names if scope.form_of is not None else ()
+
+
+def _on_plate(values: Values) -> FloatArray:
+    """Additional masses [kg] with x and y [m] (m, 3), which stay on the plate."""
+    masses = values.own("masses").reshape(-1, 3)
+    sides = np.array([values.rig.plate.length, values.rig.plate.width])
+    masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
+    return masses
+
+
+KINDS: dict[str, Kind] = {
+    "thickness": Kind(
+        _BUILT.thickness,
+        names=lambda scope: ["thickness"],
+        slope=lambda plate: (
+            2 * plate.by_log_rigidity
+            - plate.responding(plate.by_free(plate.free_receptance))[..., None]
+        ),
+        value=lambda values: float(np.exp(values.own("thickness")[0])),
+        stated=lambda scope, std: scope.uncertainty.thickness,
+        drift=0.01,
+        stage=0,
+        is_listed=True,
+    ),
+    # Known where the thickness is.
+    "modulus": Kind(
+        _BUILT.modulus,
+        names=lambda scope: ["modulus"],
+        slope=lambda plate: plate.by_log_rigidity,
+        value=lambda values: float(np.exp(values.own("modulus")[0])),
+        stated=lambda scope, std: (
+            max(std, scope.uncertainty.modulus) * (scope.uncertainty.thickness > 0)
+        ),
+        by_sheet=lambda scope, std: (0.07, -math.log(3.0), math.log(3.0)),
+        is_listed=True,
+    ),
+    "stiffness": Kind(
+        _BUILT.stiffness,
+        names=lambda scope: [f"stiffness {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_sources("stiffness"),
+        value=lambda values: (
+            values_of_eras(values.rig, "stiffness") * np.exp(values.own("stiffness"))
+        ),
+        stated=lambda scope, std: scope.uncertainty.stiffness,
+        by_sheet=lambda scope, std: _factors(scope, 0.10, math.log(10.0)),
+        drift=0.03,
+        theory=3e-3,
+        stage=0,
+        is_listed=True,
+    ),
+    # Of all ERAs; the damping of one is known where this is.
+    "damping": Kind(
+        _DAMPED,
+        names=lambda scope: ["damping"],
+        slope=lambda plate: KINDS["damping_each"].slope(plate).sum(axis=-1, keepdims=True),
+        value=lambda values: np.maximum(
+            values_of_eras(values.rig, "damping")
+            * np.exp(values.own("damping") + values.own("damping_each"))
+            + values.own("damping_added"),
+            0.0,
+        ),
+        stated=lambda scope, std: math.log(scope.uncertainty.damping) * _damps(scope).max(),
+        stage=0,
+        is_listed=True,
+    ),
+    "damping_each": Kind(
+        0.2,
+        names=lambda scope: [f"damping {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_sources("damping") * plate.values["damping"],
+        stated=lambda scope, std: std * _damps(scope),
+        drift=0.07,
+        drifts_to=_DAMPED,
+        theory=0.01,
+        stage=0,
+    ),
+    # Beside that of the rig, which may have none; data sheets give little, of ERAs by their ratio.
+    "damping_added": Kind(
+        0.0,
+        names=lambda scope: [f"further damping {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_sources("damping"),
+        by_sheet=_damping_by_sheets,
+        unit="N s/m",
+        per_unit=1.0,
+    ),
+    "loss": Kind(
+        _DAMPED,
+        names=lambda scope: ["loss factor"],
+        slope=lambda plate: plate.by_log_loss,
+        value=lambda values: float(
+            np.clip(
+                values.rig.plate.loss_factor * np.exp(values.own("loss")[0])
+                + values.own("loss_added")[0],
+                0.0,
+                MAX_LOSS_FACTOR,
+            )
+        ),
+        stated=lambda scope, std: _loses(scope, math.log(scope.uncertainty.damping)),
+        drift=0.1,
+        stage=0,
+        is_listed=True,
+    ),
+    "loss_added": Kind(
+        0.0,
+        names=lambda scope: ["further loss factor"],
+        slope=lambda plate: plate.by_log_loss / max(plate.values["loss"], MIN_LOSS_FACTOR),
+        by_sheet=lambda scope, std: _added(
+            scope.rig.plate.loss_factor, max(_OWN_SHARE * scope.rig.plate.loss_factor, 0.003), 0.5
+        ),
+        unit="",
+        per_unit=1.0,
+    ),
     # The power of frequency that the loss factor follows.
-    "loss_exponent": Kind(0.3, "", 1.0),
-    "gain": Kind(_BUILT.gain, drift=0.01, sheet=1.0, bound=8.0),
-    "phase": Kind(math.radians(_BUILT.phase_deg), *_PHASE, drift=math.radians(1)),
+    "loss_exponent": Kind(
+        0.3,
+        names=lambda scope: ["loss exponent"],
+        slope=lambda plate: (
+            np.log(plate.model.frequencies / LOSS_FREQUENCY)[:, None, None, None]
+            * plate.by_log_loss
+        ),
+        value=lambda values: float(values.rig.plate.loss_exponent + values.own("loss_exponent")[0]),
+        stated=_loses,
+        limits=lambda scope: (
+            -MAX_LOSS_EXPONENT - scope.rig.plate.loss_exponent,
+            MAX_LOSS_EXPONENT - scope.rig.plate.loss_exponent,
+        ),
+        unit="",
+        per_unit=1.0,
+    ),
+    # Of a drive, complex with its phase, beside that of the rig.
+    "gain": Kind(
+        _BUILT.gain,
+        names=lambda scope: [f"gain {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_drives(),
+        value=lambda values: np.exp(values.own("gain") + 1j * values.own("phase")),
+        stated=lambda scope, std: scope.uncertainty.gain,
+        by_sheet=lambda scope, std: (1.0, -8.0, 8.0),
+        drift=0.01,
+        stage=0,
+        is_listed=True,
+    ),
+    "phase": Kind(
+        math.radians(_BUILT.phase_deg),
+        names=lambda scope: [f"phase {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_drives(1j),
+        stated=lambda scope, std: math.radians(scope.uncertainty.phase_deg),
+        unit="°",
+        per_unit=math.degrees(1),
+        drift=math.radians(1),
+        stage=0,
+        is_listed=True,
+    ),
     # A resonance at 700 Hz with a damping ratio of 0.5.
-    "inertia": Kind(1 / 0.7**2, "/kHz²", 1.0),
-    "drag": Kind(1 / 0.7, "/kHz", 1.0),
-    # Of an amplifier's clock: what no exchange over unlike lines shows.
-    "delay": Kind(200e-6, "us", 1e6),
-    "sensor_gain": Kind(0.05),
-    "sensor_phase": Kind(math.radians(5), *_PHASE),
-    # By data sheets: of the plate's mass that an ERA carries.
-    "bolt_mass": Kind(0.5e-3, *_WEIGHT, sheet=0.05, bound=5.0),
-    # Of exciters.
-    "magnet_mass": Kind(_BUILT.stiffness, bound=math.log(10.0)),
-    "force_factor": Kind(_BUILT.stiffness, drift=0.01),
-    # Of an ERA, on each axis.
-    "place": Kind(1.5e-3, *_LENGTH, theory=1e-4),
-    "masses": Kind(2e-3, *_WEIGHT),
-    "mode_shifts": Kind(0.01, theory=3e-3, sheet=0.003),
-    "mode_losses": Kind(0.5),
-    # Of each foot.
-    "supports": Kind(FEET_DEVIATE, bound=math.log(10.0)),
-    # Of each group of a finger's load.
-    "fingers": Kind(0.5),
+    "inertia": Kind(
+        1 / 0.7**2,
+        names=lambda scope: [f"inertia of drive {name}" for name in scope.eras],
+        slope=lambda plate: _by_lag(plate, 1.0, 2),
+        stated=_lags,
+        limits=lambda scope: (0.0, np.inf),
+        unit="/kHz²",
+        per_unit=1.0,
+        stage=0,
+    ),
+    "drag": Kind(
+        1 / 0.7,
+        names=lambda scope: [f"drag of drive {name}" for name in scope.eras],
+        slope=lambda plate: _by_lag(plate, -1j, 1),
+        stated=_lags,
+        limits=lambda scope: (0.0, np.inf),
+        unit="/kHz",
+        per_unit=1.0,
+        stage=0,
+    ),
+    # Of an amplifier's clock: what no exchange over unlike lines shows. Only differences count:
+    # those to the first.
+    "delay": Kind(
+        200e-6,
+        names=lambda scope: [f"delay of amplifier {name}" for name in scope.amplifiers],
+        slope=lambda plate: (
+            -1j
+            * plate.model.omega[:, None, None, None]
+            * plate.responses[..., None]
+            * plate.model.lateness
+        ),
+        stated=lambda scope, std: np.where(np.arange(len(scope.amplifiers)) > 0, std, 0.0),
+        unit="us",
+        per_unit=1e6,
+        stage=0,
+    ),
+    # Complex with its phase.
+    "sensor_gain": Kind(
+        0.05,
+        names=lambda scope: [f"gain of sensor {name}" for name in scope.sensors],
+        slope=lambda plate: plate.by_sensors,
+        value=lambda values: np.exp(values.own("sensor_gain") + 1j * values.own("sensor_phase")),
+        stage=0,
+    ),
+    "sensor_phase": Kind(
+        math.radians(5),
+        names=lambda scope: [f"phase of sensor {name}" for name in scope.sensors],
+        slope=lambda plate: 1j * plate.by_sensors,
+        unit="°",
+        per_unit=math.degrees(1),
+        stage=0,
+    ),
+    # Of an exciter its coil. By data sheets: of the plate's mass that an ERA carries.
+    "bolt_mass": Kind(
+        0.5e-3,
+        names=lambda scope: [f"bolt mass {name}" for name in scope.eras],
+        slope=lambda plate: plate.by_sources("bolt_mass"),
+        value=lambda values: np.maximum(
+            values_of_eras(values.rig, "bolt_mass") + values.own("bolt_mass"), 0.0
+        ),
+        limits=lambda scope: (-values_of_eras(scope.rig, "bolt_mass"), np.inf),
+        by_sheet=_bolts_by_sheets,
+        unit="g",
+        per_unit=1e3,
+    ),
+    "magnet_mass": Kind(
+        _BUILT.stiffness,
+        names=lambda scope: [f"magnet mass {name}" for name in _exciters(scope)],
+        slope=lambda plate: plate.by_sources("magnet_mass"),
+        value=lambda values: (
+            values_of_eras(values.rig, "magnet_mass") * np.exp(values.own("magnet_mass"))
+        ),
+        stated=lambda scope, std: scope.uncertainty.stiffness * scope.excites,
+        by_sheet=lambda scope, std: _exciter_factors(scope, std, math.log(10.0)),
+    ),
+    # It damps as the suspension of its exciter does, and no response tells them apart.
+    "force_factor": Kind(
+        _BUILT.stiffness,
+        names=lambda scope: [f"force factor {name}" for name in _exciters(scope)],
+        slope=lambda plate: plate.by_sources("force_factor"),
+        value=lambda values: (
+            values_of_eras(values.rig, "force_factor") * np.exp(values.own("force_factor"))
+        ),
+        stated=lambda scope, std: scope.uncertainty.stiffness * scope.excites,
+        by_sheet=lambda scope, std: _exciter_factors(scope, std, math.inf),
+        drift=0.01,
+    ),
+    # Of an ERA, on each axis. With form errors it may leave the plate, whose shapes go on by their
+    # slopes.
+    "place": Kind(
+        1.5e-3,
+        names=lambda scope: [f"{axis} of {name}" for name in scope.eras for axis in "xy"],
+        slope=lambda plate: plate.by_places[..., : 2 * len(plate.sources)],
+        value=lambda values: (
+            np.array([(era.x, era.y) for era in values.rig.eras])
+            + values.own("place").reshape(-1, 2)
+        ),
+        limits=lambda scope: (
+            -np.ravel([(era.x, era.y) for era in scope.rig.eras]),
+            np.ravel(scope.sides - [(era.x, era.y) for era in scope.rig.eras]),
+        ),
+        by_sheet=_of_form,
+        unit="mm",
+        per_unit=1e3,
+        theory=1e-4,
+        stage=1,
+    ),
+    # Additional masses with their places, about the middle of the plate.
+    "masses": Kind(
+        2e-3,
+        names=lambda scope: [
+            f"{of}mass {n}" for n in range(1, scope.masses + 1) for of in ("", "x of ", "y of ")
+        ],
+        slope=lambda plate: plate.by_masses(),
+        value=_on_plate,
+        stated=lambda scope, std: np.tile([std, *scope.sides / 3], scope.masses),
+        limits=lambda scope: (
+            np.tile([0.0, *-scope.sides / 2], scope.masses),
+            np.tile([np.inf, *scope.sides / 2], scope.masses),
+        ),
+        unit="g",
+        per_unit=1e3,
+        stage=1,
+    ),
+    # Logarithms of factors on the eigenvalues and loss factors of the lowest modes.
+    "mode_shifts": Kind(
+        0.01,
+        names=lambda scope: [f"stiffness of mode {n}" for n in range(1, scope.mode_count + 1)],
+        slope=lambda plate: plate.by_modes(1.0),
+        by_sheet=lambda scope, std: (0.003, -np.inf, np.inf),
+        theory=3e-3,
+    ),
+    "mode_losses": Kind(
+        0.5,
+        names=lambda scope: [f"loss of mode {n}" for n in range(1, scope.mode_count + 1)],
+        slope=lambda plate: plate.by_modes(plate.by_mode_loss),
+        stated=_loses,
+    ),
+    # Factors on the stiffness of each foot.
+    "supports": Kind(
+        FEET_DEVIATE,
+        names=lambda scope: [f"stiffness of foot {name}" for name in scope.rig.foot_names],
+        slope=lambda plate: plate.by_stiffness(
+            len(plate.sources) + np.array(plate.model.rig.feet, dtype=int),
+            plate.values["supports"] * plate.model.springs,
+        ),
+        value=lambda values: np.exp(values.own("supports")),
+        stated=lambda scope, std: scope.uncertainty.supports,
+        by_sheet=_feet_by_sheets,
+        is_listed=True,
+    ),
+    # Of each of FINGER_PARTS of a finger, which the daemon adds.
+    "fingers": Kind(
+        0.5,
+        names=lambda scope: [],
+        slope=lambda plate: plate.by_stiffness(
+            _finger_numbers(plate),
+            np.concatenate(plate.finger_slopes, axis=1),
+        ),
+        value=lambda values: values.own("fingers").reshape(-1, 4),
+    ),
     # Form errors: a ruler's, a cutter's, and 1 % of the plate's mass over all cells, as its shares.
-    "sensor_scale": Kind(0.01),
-    "sensor_place": Kind(0.5e-3, *_LENGTH),
-    "foreign_mass": Kind(0.01 / math.sqrt(MASS_CELLS.cell_count)),
-    "side": Kind(0.5e-3, *_LENGTH),
-    "poisson": Kind(0.015, "", 1.0),
+    "sensor_scale": Kind(
+        0.01,
+        names=lambda scope: _if_form(scope, [f"scale of sensor {name}" for name in scope.sensors]),
+        slope=lambda plate: (
+            (plate.values["sensor_gain"][:, None] * plate.drive[:, None] * plate.late * plate.seen)[
+                ..., None
+            ]
+            * np.eye(len(plate.model.sensors))[:, None]
+        ),
+        value=lambda values: (
+            1 + values.own("sensor_scale") if values.own("sensor_scale").size else 1.0
+        ),
+        by_sheet=_of_form,
+    ),
+    "sensor_place": Kind(
+        0.5e-3,
+        names=lambda scope: [
+            f"{axis} of sensor {n}" for n in range(scope.form_of or 0) for axis in "xy"
+        ],
+        slope=lambda plate: plate.by_places[
+            ..., 2 * (len(plate.sources) + plate.model.mass_count) :
+        ],
+        value=lambda values: values.own("sensor_place").reshape(-1, 2),
+        by_sheet=_of_form,
+        unit="mm",
+        per_unit=1e3,
+    ),
+    # Its sum over all cells is zero.
+    "foreign_mass": Kind(
+        0.01 / math.sqrt(MASS_CELLS.cell_count),
+        names=lambda scope: _if_form(scope, [f"mass {n}" for n in range(MASS_CELLS.cell_count)]),
+        slope=lambda plate: plate.by_foreign_mass(),
+        value=lambda values: values.own("foreign_mass") - values.own("foreign_mass").mean(),
+        by_sheet=_of_form,
+    ),
+    "side": Kind(
+        0.5e-3,
+        names=lambda scope: _if_form(scope, ["length", "width"]),
+        slope=lambda plate: plate.by_stretch(0, 1) / plate.model.sides,
+        value=lambda values: values.own("side") / [values.rig.plate.length, values.rig.plate.width],
+        by_sheet=_of_form,
+        unit="mm",
+        per_unit=1e3,
+    ),
+    "poisson": Kind(
+        0.015,
+        names=lambda scope: _if_form(scope, ["Poisson's ratio"]),
+        slope=lambda plate: plate.by_stretch(2),
+        by_sheet=_of_form,
+        unit="",
+        per_unit=1.0,
+    ),
     # From hysteretic losses, 0, to viscous ones, 1 (`model.estimate.forward`).
-    "loss_law": Kind(1.0, "", 1.0),
+    "loss_law": Kind(
+        1.0,
+        names=lambda scope: _if_form(scope, ["loss law"]),
+        slope=lambda plate: (plate.scale * (0.0 if plate.model.law is None else plate.model.law))[
+            ..., None
+        ],
+        value=lambda values: float(values.own("loss_law").sum()),
+        by_sheet=_of_form,
+        unit="",
+        per_unit=1.0,
+    ),
 }
-"""Kinds of parameters; for some a rig's `uncertainty` states the standard deviation instead.
+"""All kinds of parameters by their names, in the order of a space.
 
 `theory` is that of plates of 1.5 mm without shear deformation, with viscous losses
 (docs/measured/identification.md). No measurement shows it, and answers do not depend on it.
 """
-
-
-@dataclass(frozen=True, eq=False)
-class Space:
-    """Names of all p parameters with their standard deviations, bounds and kinds."""
-
-    names: tuple[str, ...]
-    std: FloatArray
-    """Standard deviations (p,) in the units of `Values`, 0 where a parameter is known."""
-    lower: FloatArray
-    """Lower bounds of x (p,)."""
-    upper: FloatArray
-    """Upper bounds of x (p,)."""
-    groups: dict[str, slice]
-    """Slice of the parameters of each kind."""
-
-    @property
-    def size(self) -> int:
-        """Number of parameters p."""
-        return len(self.names)
-
-    @cached_property
-    def scale(self) -> FloatArray:
-        """Standard deviations (p,), 1 of what is known."""
-        return np.where(self.std > 0, self.std, 1.0)
-
-    @cached_property
-    def uncertain(self) -> NDArray[np.bool_]:
-        """Mask (p,) of the parameters that are not known beforehand."""
-        return np.asarray(self.std > 0)
-
-    def of(self, *kinds: str) -> NDArray[np.bool_]:
-        """Mask (p,) of the uncertain parameters of some kinds."""
-        chosen = np.zeros(self.size, dtype=bool)
-        for kind in kinds:
-            chosen[self.groups[kind]] = True
-        return chosen & self.uncertain
-
-    def and_further(
-        self,
-        kind: str,
-        names: Sequence[str],
-        std: Number | None = None,
-        lower: ArrayLike = -np.inf,
-        upper: ArrayLike = np.inf,
-    ) -> "Space":
-        """Append parameters of a kind; std: by default the kind's."""
-        own = KINDS[kind].std if std is None else std
-        further = [np.broadcast_to(each, len(names)) for each in (own, lower, upper)]
-        return Space(
-            (*self.names, *names),
-            np.append(self.std, further[0]),
-            np.append(self.lower, further[1]),
-            np.append(self.upper, further[2]),
-            self.groups | {kind: slice(self.size, self.size + len(names))},
-        )
-
-    def of_kinds(self, known: Callable[[Kind], float]) -> FloatArray:
-        """A property of the kind of each parameter, in its unit (p,), 0 for known ones."""
-        found = np.zeros(self.size)
-        for kind, part in self.groups.items():
-            found[part] = known(KINDS[kind])
-        return np.where(self.uncertain, found, 0.0)
-
-    @cached_property
-    def as_built(self) -> "Space":
-        """The space of a plate that was not measured: `KINDS` where the rig states less."""
-        return replace(self, std=np.maximum(self.std, self.of_kinds(lambda kind: kind.std)))
-
-    def indices(self, kind: str) -> range:
-        """Numbers of the parameters of a kind."""
-        return range(*self.groups[kind].indices(self.size))
-
-    def values(self, x: FloatArray, kind: str) -> FloatArray:
-        """Deviations of the parameters of a kind from the rig, in their units, for x (p,)."""
-        part = self.groups[kind]
-        return np.asarray(self.std[part] * x[part])
-
-    def index(self, name: str) -> int:
-        """Number of the parameter of a name; raises ValueError for an unknown one."""
-        return self.names.index(name)
 
 
 def space_of(
@@ -259,185 +555,44 @@ def space_of(
     amplifiers: Sequence[str] = (),
     masses: int = 0,
     mode_count: int = MODE_SHIFTS,
-    form_of: int | None = None,
 ) -> Space:
-    """Parameters of a rig with sensors by name, with additional masses on it.
+    """Parameters of a rig that is measured in place, as `SearchScope` has it.
 
-    uncertainty: of the rig; a modulus is known where the thickness is, the damping of each ERA and
-    mode where that of all is. Its `common_gain` is no parameter: sensors may be those that it was
-    found by, and tell nothing more of it. drives_lag: whether bases follow what is played with a
-    lag that nothing states; amplifiers: those whose clocks may be off, by name; mode_count: elastic
-    modes that may shift; form_of: number of sensors beside ERAs of a plate with form errors.
+    Its `common_gain` is no parameter: sensors may be those that it was found by, and tell nothing
+    more of it.
     """
-    names = _names(rig, sensors, amplifiers, masses, mode_count, form_of)
-    stds = _stds(rig, uncertainty, masses)
-    # Only differences count: those to the first.
-    stds["delay"] = np.where(np.arange(len(amplifiers)) > 0, KINDS["delay"].std, 0.0)
-    # A measured gain has the lag of its drive in it, and an exciter's force that of its coil.
-    lags = [drives_lag and not (era.gains or "force_factor" in era.fields) for era in rig.eras]
-    for kind in ("inertia", "drag"):
-        stds[kind] = np.where(lags, KINDS[kind].std, 0.0)
-    bounds, space = _bounds(rig, masses), Space((), np.zeros(0), np.zeros(0), np.zeros(0), {})
-    for kind, own in names.items():
-        space = space.and_further(kind, own, stds.get(kind), *bounds.get(kind, (-np.inf, np.inf)))
-    return space
 
+    def known(kind: Kind) -> Range:
+        std = kind.std if kind.stated is None else kind.stated(scope, kind.std)
+        return std, *((-np.inf, np.inf) if kind.limits is None else kind.limits(scope))
 
-def _names(
-    rig: Rig,
-    sensors: Sequence[str],
-    amplifiers: Sequence[str],
-    masses: int,
-    mode_count: int,
-    form_of: int | None,
-) -> dict[str, Sequence[str]]:
-    """Names of all parameters by their kind, as `space_of`."""
-    eras, has_form = [era.name for era in rig.eras], form_of is not None
-    drives = eras if any("force_factor" in era.fields for era in rig.eras) else []
-    cells, modes = range(MASS_CELLS.cell_count), range(1, mode_count + 1)
-    return {
-        "thickness": ["thickness"],
-        "modulus": ["modulus"],
-        "stiffness": [f"stiffness {name}" for name in eras],
-        "damping": ["damping"],
-        "damping_each": [f"damping {name}" for name in eras],
-        "damping_added": [f"further damping {name}" for name in eras],
-        "loss": ["loss factor"],
-        "loss_added": ["further loss factor"],
-        "loss_exponent": ["loss exponent"],
-        "gain": [f"gain {name}" for name in eras],
-        "phase": [f"phase {name}" for name in eras],
-        "inertia": [f"inertia of drive {name}" for name in eras],
-        "drag": [f"drag of drive {name}" for name in eras],
-        "delay": [f"delay of amplifier {name}" for name in amplifiers],
-        "sensor_gain": [f"gain of sensor {name}" for name in sensors],
-        "sensor_phase": [f"phase of sensor {name}" for name in sensors],
-        "bolt_mass": [f"bolt mass {name}" for name in eras],
-        "magnet_mass": [f"magnet mass {name}" for name in drives],
-        "force_factor": [f"force factor {name}" for name in drives],
-        "place": [f"{axis} of {name}" for name in eras for axis in "xy"],
-        "masses": [f"{of}mass {n}" for n in range(1, masses + 1) for of in ("", "x of ", "y of ")],
-        "mode_shifts": [f"stiffness of mode {number}" for number in modes],
-        "mode_losses": [f"loss of mode {number}" for number in modes],
-        "supports": [f"stiffness of foot {name}" for name in rig.foot_names],
-        "fingers": [],
-        "sensor_scale": [f"scale of sensor {name}" for name in sensors if has_form],
-        "sensor_place": [f"{axis} of sensor {n}" for n in range(form_of or 0) for axis in "xy"],
-        "foreign_mass": [f"mass {n}" for n in cells if has_form],
-        "side": ["length", "width"] if has_form else [],
-        "poisson": ["Poisson's ratio"] if has_form else [],
-        "loss_law": ["loss law"] if has_form else [],
-    }
-
-
-def _stds(rig: Rig, uncertainty: Uncertainty, masses: int) -> dict[str, Number]:
-    """Standard deviations of parameters, where they are not those of their kind, as `space_of`."""
-    plate, sides = rig.plate, np.array([rig.plate.length, rig.plate.width])
-    excites = np.array(["force_factor" in era.fields for era in rig.eras])
-    of_drives = uncertainty.stiffness * (excites if excites.any() else excites[:0])
-    damping = math.log(uncertainty.damping)
-    damped = (damping > 0) * np.array([float(era.damping > 0) for era in rig.eras])
-    lossy = float(damping > 0 and plate.loss_factor > 0)
-    return {
-        "thickness": uncertainty.thickness,
-        "modulus": max(KINDS["modulus"].std, uncertainty.modulus) * (uncertainty.thickness > 0),
-        "stiffness": uncertainty.stiffness,
-        "damping": damping * damped.max(),
-        "damping_each": KINDS["damping_each"].std * damped,
-        "loss": damping * lossy,
-        "loss_exponent": KINDS["loss_exponent"].std * lossy,
-        "gain": uncertainty.gain,
-        "phase": math.radians(uncertainty.phase_deg),
-        "magnet_mass": of_drives,
-        "force_factor": of_drives,
-        # About the middle of the plate.
-        "masses": np.tile([KINDS["masses"].std, *sides / 3], masses),
-        "mode_losses": KINDS["mode_losses"].std * lossy,
-        "supports": uncertainty.supports,
-    }
-
-
-def _bounds(rig: Rig, masses: int) -> dict[str, tuple[ArrayLike, ArrayLike]]:
-    """Bounds of x of the kinds of parameters that have some, as `space_of`."""
-    sides = np.array([rig.plate.length, rig.plate.width])
-    places = np.array([(era.x, era.y) for era in rig.eras])
-    least = np.array([-getattr(era, era.fields["bolt_mass"]) for era in rig.eras])
-    exponents = np.array([-MAX_LOSS_EXPONENT, MAX_LOSS_EXPONENT]) - rig.plate.loss_exponent
-    return {
-        "loss_exponent": tuple(exponents / KINDS["loss_exponent"].std),
-        "inertia": (0.0, np.inf),
-        "drag": (0.0, np.inf),
-        "bolt_mass": (least / KINDS["bolt_mass"].std, np.inf),
-        "place": (
-            (-places / KINDS["place"].std).ravel(),
-            ((sides - places) / KINDS["place"].std).ravel(),
-        ),
-        "masses": (np.tile([0.0, -1.5, -1.5], masses), np.tile([np.inf, 1.5, 1.5], masses)),
-    }
+    scope = SearchScope(rig, sensors, uncertainty, drives_lag, amplifiers, masses, mode_count)
+    return _space(scope, known)
 
 
 def space_by_sheets(rig: Rig, sensors: Sequence[str], form_modes: int | None) -> Space:
     """Parameters of a rig of data sheets: its plate's modulus and losses, its ERAs and their gains.
 
-    A force factor damps as the suspension of its exciter does, and no response tells them apart.
-
     form_modes: also form errors, with so many modes that shift; None for none. All else is known.
     """
-    plate, count, has_form = rig.plate, len(rig.eras), form_modes is not None
-    space = space_of(
-        rig,
-        sensors,
-        Uncertainty.none(),
-        mode_count=form_modes or 0,
-        form_of=len(sensors) if has_form else None,
+    form_of = None if form_modes is None else len(sensors)
+    scope = SearchScope(
+        rig, sensors, Uncertainty.none(), mode_count=form_modes or 0, form_of=form_of
     )
-    damping, bolt = (
-        np.array([getattr(era, era.fields[kind]) for era in rig.eras])
-        for kind in ("damping", "bolt_mass")
+    return _space(
+        scope,
+        lambda kind: kind.by_sheet(scope, kind.std) if kind.by_sheet else (0.0, -np.inf, np.inf),
     )
-    ratio = np.array(
-        [
-            damping_from_ratio(
-                1.0, stiffness=era.in_time.stiffness, plate_mass=plate.mass, era_count=count
-            )
-            for era in rig.eras
-        ]
-    )
-    # The rig's value, which cannot become less than zero, and what deviations are relative to.
-    added: dict[str, tuple[Number, Number]] = {
-        "loss_added": (plate.loss_factor, 1.0),
-        "damping_added": (damping, ratio),
-        "bolt_mass": (bolt, plate.mass / count),
-    }
-    # Places may leave the plate, whose shapes go on by their slopes.
-    form = (*FORM, "place", "mode_shifts") if has_form else ()
-    excites = np.array(["force_factor" in era.fields for era in rig.eras])
-    of_exciters = EXCITER_KINDS if excites.any() else ()
-    columns = np.repeat([[0.0], [-np.inf], [np.inf]], space.size, axis=1)
-    for name in ("modulus", "stiffness", "gain", *of_exciters, *added, *form):
-        kind, (value, unit) = KINDS[name], added.get(name, (0.0, 1.0))
-        own = np.maximum(kind.own_share * value, (kind.sheet or kind.std) * unit)
-        std = np.maximum(own, rig.uncertainty.stiffness * (name in ("stiffness", *of_exciters)))
-        lower = -value if name in added else -kind.bound
-        upper = np.maximum(kind.bound * unit - value, value)
-        columns[:, space.groups[name]] = np.array(
-            np.broadcast_arrays(std, lower / std, upper / std)
-        ).reshape(3, -1)
-    for name in of_exciters:
-        columns[0, space.groups[name]] *= excites
-    # A coil weighs what its sheet says, but for glue; a response tells it together with a gain.
-    weighs = excites & (bolt > 0)
-    coils = np.flatnonzero(weighs) + space.groups["bolt_mass"].start
-    columns[:, coils] = _known(COIL_DEVIATES * bolt[weighs], -bolt[weighs], bolt[weighs])
-    feet, bound = space.groups["supports"], KINDS["supports"].bound
-    stated = rig.uncertainty.supports
-    columns[:, feet] = _known(np.full(len(rig.feet), stated), -bound, bound) if stated else 0.0
-    return replace(space, std=columns[0], lower=columns[1], upper=columns[2])
 
 
-def _known(std: FloatArray, lower: Number, upper: Number) -> FloatArray:
-    """Standard deviations (m,) and the bounds in them, (3, m)."""
-    return np.array([std, lower / std, upper / std])
+def _space(scope: SearchScope, known: Callable[[Kind], Range]) -> Space:
+    """All parameters of a scope, whose ranges follow from their kind."""
+    none = np.zeros(0)
+    space = Space((), none, none, none, {}, KINDS)
+    for name, kind in KINDS.items():
+        names = kind.names(scope)
+        space = space.and_further(name, names, known(kind) if names else None)
+    return space
 
 
 def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
@@ -454,141 +609,9 @@ def inwards(space: Space, x: FloatArray, *, by: float) -> FloatArray:
     return np.where(space.uncertain, moved, x)
 
 
-@dataclass(frozen=True, eq=False)
-class Values:
-    """Values of a rig's plate with n ERAs, m additional masses, k fingers and s sensors.
-
-    Arrays of form errors are empty for a plate without them.
-    """
-
-    thickness: float
-    """Factor on the rig's."""
-    modulus: float
-    """Factor on the rig's."""
-    loss_factor: float
-    """At LOSS_FREQUENCY."""
-    loss_exponent: float
-    """Power of frequency that the loss factor follows."""
-    stiffness: FloatArray
-    """Of the ERAs (n,) [N/m]."""
-    damping: FloatArray
-    """Of the ERAs (n,) [N s/m]."""
-    bolt_mass: FloatArray
-    """Of the ERAs, of exciters the coil (n,) [kg]."""
-    magnet_mass: FloatArray
-    """Factors of exciters (n,)."""
-    force_factor: FloatArray
-    """Factors of exciters (n,)."""
-    supports: FloatArray
-    """Factors on the stiffness of each foot (q,)."""
-    places: FloatArray
-    """Of the ERAs (n, 2) [m]."""
-    masses: FloatArray
-    """Additional masses [kg] with x and y [m] (m, 3)."""
-    mode_shifts: FloatArray
-    """Logarithms of factors on the eigenvalues of the lowest modes."""
-    mode_losses: FloatArray
-    """Logarithms of factors on the loss factors of the lowest modes."""
-    drive_gains: ComplexArray
-    """Complex gains (n,) beside those of the rig."""
-    sensor_gains: ComplexArray
-    """Complex gains (s,)."""
-    fingers: FloatArray
-    """Logarithms of factors on FINGER_PARTS (k, 4)."""
-    inertia: FloatArray
-    """By which drives lag (n,) [1/kHz²]."""
-    drag: FloatArray
-    """By which drives lag (n,) [1/kHz]."""
-    delays: FloatArray
-    """Of the amplifiers' clocks behind the first one's [s], by name; empty where they agree."""
-    sensor_scales: FloatArray
-    """Real gains of sensors, a form error (s,)."""
-    sensor_places: FloatArray
-    """Distances of sensors from their places (s, 2) [m]."""
-    foreign_mass: FloatArray
-    """Of each cell, as a share of the plate's; the sum is zero (c,)."""
-    stretch: FloatArray
-    """Deviations of length and width, relative, and of Poisson's ratio (3,)."""
-    loss_law: float
-    """0 for hysteretic losses, 1 for viscous ones."""
-
-    @classmethod
-    def of(cls, rig: Rig, space: Space, x: FloatArray) -> Self:
-        """Those of parameters x (p,)."""
-
-        def own(kind: str) -> FloatArray:
-            return space.values(x, kind)
-
-        plate, n = rig.plate, len(rig.eras)
-        k, c, m = (
-            np.array([getattr(era, era.fields[kind]) for era in rig.eras])
-            for kind in ("stiffness", "damping", "bolt_mass")
-        )
-        at = np.array([(era.x, era.y) for era in rig.eras])
-        sides = np.array([plate.length, plate.width])
-        masses = own("masses").reshape(-1, 3)
-        masses[:, 1:] = np.clip(masses[:, 1:] + sides / 2, 0, sides)
-        cells = own("foreign_mass")
-        loss = plate.loss_factor * np.exp(own("loss")[0]) + own("loss_added")[0]
-        return cls(
-            thickness=float(np.exp(own("thickness")[0])),
-            modulus=float(np.exp(own("modulus")[0])),
-            loss_factor=float(np.clip(loss, 0.0, MAX_LOSS_FACTOR)),
-            loss_exponent=float(plate.loss_exponent + own("loss_exponent")[0]),
-            stiffness=k * np.exp(own("stiffness")),
-            damping=c * np.exp(own("damping") + own("damping_each")) + own("damping_added"),
-            bolt_mass=m + own("bolt_mass"),
-            magnet_mass=np.exp(np.append(own("magnet_mass"), np.zeros(n))[:n]),
-            force_factor=np.exp(np.append(own("force_factor"), np.zeros(n))[:n]),
-            supports=np.exp(own("supports")),
-            places=at + own("place").reshape(n, 2),
-            masses=masses,
-            mode_shifts=own("mode_shifts"),
-            mode_losses=own("mode_losses"),
-            drive_gains=np.exp(own("gain") + 1j * own("phase")),
-            sensor_gains=np.exp(own("sensor_gain") + 1j * own("sensor_phase")),
-            fingers=own("fingers").reshape(-1, 4),
-            inertia=own("inertia"),
-            drag=own("drag"),
-            delays=own("delay"),
-            sensor_scales=1 + own("sensor_scale"),
-            sensor_places=own("sensor_place").reshape(-1, 2),
-            foreign_mass=cells - (cells.mean() if len(cells) else 0.0),
-            stretch=np.append(own("side") / sides[: len(own("side"))], own("poisson")),
-            loss_law=float(own("loss_law").sum()),
-        )
-
-    def sources(self, rig: Rig) -> tuple[Actuator, ...]:
-        """The rig's ERAs with their values, where the rig has them and without gains."""
-        found: list[Actuator] = []
-        for number, era in enumerate(rig.eras):
-            new = {
-                "stiffness": self.stiffness[number],
-                "damping": max(self.damping[number], 0.0),
-                "bolt_mass": max(self.bolt_mass[number], 0.0),
-            }
-            for kind in era.fields.keys() - new:
-                new[kind] = getattr(self, kind)[number] * getattr(era, era.fields[kind])
-            fields: dict[str, Any] = {era.fields[kind]: float(value) for kind, value in new.items()}
-            if isinstance(era, Exciter):
-                largest = era.largest_force_factor(fields["magnet_mass"])
-                fields["force_factor"] = min(fields["force_factor"], largest)
-            found.append(replace(era, gains=(), **fields))
-        return tuple(found)
-
-    def lag(self, frequencies: FloatArray) -> ComplexArray:
-        """Motion of each drive at frequencies (f,) [Hz] relative to a slow one, (f, n).
-
-        1 / (1 - inertia f² + i drag f), f in kilohertz: of an actuator with a resonance at
-        1 / sqrt(inertia) and a damping ratio of drag / (2 sqrt(inertia)).
-        """
-        f = 1e-3 * np.asarray(frequencies)[:, None]
-        return np.asarray(1 / (1 - self.inertia * f**2 + 1j * self.drag * f))
-
-
 def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
     """The rig with identified values; additional masses come after its own."""
-    places = np.clip(values.places, 0, [rig.plate.length, rig.plate.width])
+    places = np.clip(values["place"], 0, [rig.plate.length, rig.plate.width])
     eras = tuple(
         replace(
             era,
@@ -596,16 +619,16 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
             y=float(places[number, 1]),
             gains=_gains(rig, values, number),
         )
-        for number, era in enumerate(values.sources(rig))
+        for number, era in enumerate(values.sources())
     )
     masses = list(rig.masses)
-    for foot, factor in zip(rig.feet, values.supports.tolist(), strict=True):
+    for foot, factor in zip(rig.feet, values["supports"].tolist(), strict=True):
         masses[foot] = replace(masses[foot], stiffness=factor * masses[foot].stiffness)
     return replace(
         rig,
         plate=plate_with(rig.plate, values),
         laminate=rig.laminate
-        and rig.laminate.scaled(modulus=values.modulus, thickness=values.thickness),
+        and rig.laminate.scaled(modulus=values["modulus"], thickness=values["thickness"]),
         eras=eras,
         masses=(*masses, *additional_masses(values)),
         uncertainty=uncertainty,
@@ -614,16 +637,15 @@ def rig_with(rig: Rig, values: Values, uncertainty: Uncertainty) -> Rig:
 
 def plate_with(plate: Plate, values: Values) -> Plate:
     """The plate with identified thickness, modulus, losses and modes."""
-    count = max(len(plate.mode_deviations), len(values.mode_shifts))
+    shifted = np.column_stack([values["mode_shifts"], values["mode_losses"]])
+    count = max(len(plate.mode_deviations), len(shifted))
     deviations = np.zeros((count, 2))
     deviations[: len(plate.mode_deviations)] = np.reshape(plate.mode_deviations, (-1, 2))
-    deviations[: len(values.mode_shifts)] += np.column_stack(
-        [values.mode_shifts, values.mode_losses]
-    )
+    deviations[: len(shifted)] += shifted
     return replace(
-        plate.scaled(modulus=values.modulus, thickness=values.thickness),
-        loss_factor=values.loss_factor,
-        loss_exponent=values.loss_exponent,
+        plate.scaled(modulus=values["modulus"], thickness=values["thickness"]),
+        loss_factor=values["loss"],
+        loss_exponent=values["loss_exponent"],
         mode_deviations=tuple((float(a), float(b)) for a, b in deviations if deviations.any()),
     )
 
@@ -632,7 +654,7 @@ def additional_masses(values: Values) -> Sequence[PointLoad]:
     """The additional masses on the plate, without those that weigh nothing."""
     return [
         PointLoad(float(x), float(y), mass=float(mass))
-        for mass, x, y in values.masses
+        for mass, x, y in values["masses"]
         if mass > _MIN_MASS
     ]
 
@@ -643,9 +665,9 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
     An ERA without measured gains gets one at a single frequency, or some over the rig's frequencies
     where its drive or the clock of its amplifier lags.
     """
-    era = rig.eras[number]
-    lags, delay = values.inertia[number] or values.drag[number], _delay(era.name, rig, values)
-    if values.drive_gains[number] == 1 and not (lags or delay):
+    era, gain = rig.eras[number], values["gain"][number]
+    lags, delay = values["inertia"][number] or values["drag"][number], _delay(era.name, rig, values)
+    if gain == 1 and not (lags or delay):
         return era.gains
     before = era.gains or ((LOSS_FREQUENCY, 1.0, 0.0),)
     if lags or (delay and not era.gains):
@@ -654,7 +676,7 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
         before = tuple((float(f), 1.0, 0.0) for f in np.linspace(low, high, count))
     f = np.array([f for f, *_ in before])
     late = np.exp(-2j * np.pi * f * delay)
-    factors = values.drive_gains[number] * values.lag(f)[:, number] * late
+    factors = gain * values.lag(f)[:, number] * late
     return tuple(
         (f, magnitude * float(abs(factor)), turned + float(np.angle(factor)))
         for (f, magnitude, turned), factor in zip(before, factors.tolist(), strict=True)
@@ -663,113 +685,7 @@ def _gains(rig: Rig, values: Values, number: int) -> tuple[Gain, ...]:
 
 def _delay(era: str, rig: Rig, values: Values) -> float:
     """Delay of an ERA by its amplifier's clock [s]."""
-    if not len(values.delays):
+    if not len(values["delay"]):
         return 0.0
     names = sorted({channel.amplifier for channel in rig.wiring.values()})
-    return float(values.delays[names.index(rig.wiring[era].amplifier)])
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedModes:
-    """A plate's modes and residual vectors at all that is attached, for one with form errors.
-
-    No further modes count as truncated.
-    """
-
-    plate: ReducedPlate
-    cells: FloatArray
-    """Shapes where foreign mass may lie (c, r)."""
-    stiffening: FloatArray
-    """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
-    (relative) and Poisson's ratio."""
-
-    @property
-    def eigenvalues(self) -> FloatArray:
-        """omega² (r,) [rad²/s²]."""
-        return np.asarray(self.plate.omega**2)
-
-    @property
-    def losses(self) -> FloatArray:
-        """Their imaginary part beside the plate's own loss factor (r,)."""
-        return self.plate.losses
-
-    @property
-    def dispersion(self) -> Dispersion | None:
-        """How they change with frequency, None where they do not."""
-        return self.plate.dispersion
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points or footprints [m], (n, r)."""
-        return self.plate.at(points)
-
-    def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
-        """Sums over truncated modes: zero, (TERMS, n, m)."""
-        return np.zeros((TERMS, len(points), len(others)))
-
-
-def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
-    """Reduce a rig's free plate to coordinates in which it may have form errors."""
-    plate = rig.plate
-    reduced = reduce_free_plate(free, footprints_of(rig.eras, rig.masses))
-    cells = MASS_CELLS.centres(plate)
-    unknowns = reduced.unknowns()
-    if isinstance(free.mesh, Mesh):
-        stiffening = element_slopes(plate, free.mesh, unknowns[0])
-    else:
-        degrees = free.mesh.nx, free.mesh.ny
-        frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
-        stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
-    return ReducedModes(reduced, reduced.at(cells), stiffening)
-
-
-Modes: TypeAlias = FreeModes | ReducedModes
-
-
-@dataclass(frozen=True, eq=False)
-class AttachmentPoints:
-    """Shapes at a points of attachment and observation, v of which may move along x and y."""
-
-    footprints: FloatArray
-    """Place and radius of each (a, 3) [m]."""
-    shapes: FloatArray
-    """Mode shapes (a, r)."""
-    truncated: FloatArray
-    """Sums over truncated modes (TERMS, a, a)."""
-    shape_slopes: FloatArray
-    """Derivatives of the shapes by x and y of each movable point in turn (2 v, r) [1/m]."""
-    truncated_slopes: FloatArray
-    """Derivatives of the sums by the place of the first point (TERMS, 2 v, a) [1/m]."""
-
-    def moved(self, footprints: FloatArray, movable: IntArray) -> "AttachmentPoints":
-        """The same for other footprints (a, 3), by the slopes of the shapes alone."""
-        off = (footprints - self.footprints)[movable, :2].reshape(-1, 2, 1)
-        slopes = self.shape_slopes.reshape(len(movable), 2, self.shapes.shape[1])
-        shapes = self.shapes.copy()
-        shapes[movable] += (off * slopes).sum(axis=1)
-        return replace(self, footprints=footprints, shapes=shapes)
-
-
-def places_of(
-    modes: Modes, footprints: FloatArray, movable: IntArray, sides: FloatArray
-) -> AttachmentPoints:
-    """Solve for footprints (a, 3) on a plate of some sides (2,) [m].
-
-    movable (v,): numbers of those that may move.
-    """
-    moving, shapes = footprints[movable], modes.shapes_at(footprints)
-    truncated = modes.truncated_terms(footprints, footprints)
-    if not len(movable):
-        none = np.zeros((len(truncated), 0, len(footprints)))
-        return AttachmentPoints(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
-
-    def field(points: FloatArray) -> FloatArray:
-        return modes.truncated_terms(points, footprints).swapaxes(0, 1)
-
-    by_place = place_slopes(field, moving, sides)
-    return AttachmentPoints(
-        footprints,
-        shapes,
-        truncated,
-        place_slopes(modes.shapes_at, moving, sides).reshape(-1, shapes.shape[1]),
-        np.moveaxis(by_place, 2, 0).reshape(len(truncated), -1, len(footprints)),
-    )
+    return float(values["delay"][names.index(rig.wiring[era].amplifier)])

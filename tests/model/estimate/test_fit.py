@@ -26,8 +26,9 @@ from model.arrays import ComplexArray, FloatArray
 from model.estimate import findings
 from model.estimate.calibrate import calibrate, check_consistency
 from model.estimate.fit import SensedPlate, fit, sensed_plate
+from model.estimate.forward import MASS_CELLS, reduced_modes
 from model.estimate.measurement import Measurement, sensors_at
-from model.estimate.space import KINDS, MASS_CELLS, reduced_modes
+from model.estimate.space import KINDS
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
 from model.spectral.modes import SpectralMesh, stretched
@@ -60,7 +61,7 @@ def fit_a_rig() -> None:
     covariance[np.ix_(own, own)] += 1e2 * (np.eye(count) - 1 / count)
     fit(
         plate.model,
-        replace(measurement, free_gains=True),
+        replace(measurement, gain_std=np.inf),
         searched=space.uncertain & ~space.of("gain"),
         prior=(np.zeros(space.size), covariance),
     )

@@ -322,10 +322,10 @@ def test_hidden_mass_and_places_are_found(seed: int) -> None:
     assert found.chi2 < 1.3
     values = found.plate.values
     ((x, y, mass),) = hidden.mounted.masses
-    assert values.masses[0, 0] == pytest.approx(mass, rel=0.05)
-    np.testing.assert_allclose(values.masses[0, 1:], [x, y], atol=2e-3)
-    np.testing.assert_allclose(values.places, hidden.mounted.at, atol=5e-4)
-    np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
+    assert values["masses"][0, 0] == pytest.approx(mass, rel=0.05)
+    np.testing.assert_allclose(values["masses"][0, 1:], [x, y], atol=2e-3)
+    np.testing.assert_allclose(values["place"], hidden.mounted.at, atol=5e-4)
+    np.testing.assert_allclose(values["stiffness"], hidden.mounted.stiffness, rtol=0.02)
 
 
 @pytest.mark.long
@@ -335,8 +335,8 @@ def test_one_round_of_interleaved_tones_finds_the_springs() -> None:
     found = identified(hidden, rounds=1)
     assert found.chi2 < 1.4
     values = found.plate.values
-    np.testing.assert_allclose(values.stiffness, hidden.mounted.stiffness, rtol=0.02)
-    assert values.masses[0, 0] < 0.3e-3
+    np.testing.assert_allclose(values["stiffness"], hidden.mounted.stiffness, rtol=0.02)
+    assert values["masses"][0, 0] < 0.3e-3
 
 
 def test_plate_solved_anew_keeps_the_modes_of_the_fit() -> None:

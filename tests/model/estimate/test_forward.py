@@ -13,24 +13,19 @@ from model.arrays import ComplexArray, FloatArray
 from model.config.document import parse_document
 from model.estimate.fit_report import parameter_rows
 from model.estimate.forward import (
+    FINGER_PARTS,
     SENSOR_FOOT,
     ForwardModel,
     RestingFinger,
     Sensor,
+    Space,
+    Values,
     by_mass_at,
     jacobian,
 )
 from model.estimate.identify import identify
 from model.estimate.measurement import Measurement
-from model.estimate.space import (
-    FINGER_PARTS,
-    Space,
-    Values,
-    inwards,
-    rig_with,
-    space_by_sheets,
-    space_of,
-)
+from model.estimate.space import inwards, rig_with, space_by_sheets, space_of
 from model.fem import ELEMENTS, Mesh, assemble
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig import Rig
@@ -90,17 +85,22 @@ def test_deviating_rig_is_solved_without_solving_it_again(rig: Rig, model: Forwa
     eras = tuple(
         replace(era, stiffness=k, damping=c, bolt_mass=m, x=place[0], y=place[1])
         for era, k, c, m, place in zip(
-            rig.eras, values.stiffness, values.damping, values.bolt_mass, values.places, strict=True
+            rig.eras,
+            values["stiffness"],
+            values["damping"],
+            values["bolt_mass"],
+            values["place"],
+            strict=True,
         )
     )
-    material = replace(rig.plate.material, E=values.modulus * rig.plate.material.E)
+    material = replace(rig.plate.material, E=values["modulus"] * rig.plate.material.E)
     plate = replace(
         rig.plate,
         material=material,
-        loss_factor=values.loss_factor,
-        loss_exponent=values.loss_exponent,
+        loss_factor=values["loss"],
+        loss_exponent=values["loss_exponent"],
     )
-    ((mass, at_x, at_y),) = values.masses
+    ((mass, at_x, at_y),) = values["masses"]
     loads: list[Support] = [
         PointLoad(at_x, at_y, mass=mass),
         FingertipLoad(FINGER.x, FINGER.y, FINGER.fingertip),
@@ -200,7 +200,7 @@ def test_values_that_a_search_tries_are_those_of_a_rig(name: str, of: str) -> No
     rng = np.random.default_rng(0)
     for size in (1, 10):
         for x in rng.normal(0, size, (50, space.size)).clip(space.lower, space.upper):
-            found = rig_with(rig, Values.of(rig, space, x), known)
+            found = rig_with(rig, Values(rig, space, x), known)
             assert 0 <= found.plate.loss_factor <= 1
             for era in found.eras:
                 if isinstance(era, Exciter):

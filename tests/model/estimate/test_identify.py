@@ -98,7 +98,7 @@ def test_the_same_data_again_tell_no_more_of_the_level(rig: Rig) -> None:
     again = identify(once.rig, same)
     first, second = (each.rig.uncertainty.common_gain for each in (once, again))
     assert first <= second <= np.hypot(first, 0.006)
-    level, moved = (np.log(np.abs(each.values.drive_gains)).mean() for each in (once, again))
+    level, moved = (np.log(np.abs(each.values["gain"])).mean() for each in (once, again))
     assert level > 0.03
     assert abs(moved) < 0.1 * level
 

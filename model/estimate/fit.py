@@ -309,7 +309,7 @@ def _gain_residuals(
     gains: ComplexArray, by_gain: ComplexArray, std: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Deviations of gains (f, n) from a magnitude of 1 (k,), and their derivatives (k, q)."""
-    kept = np.isfinite(gains) & (0 < std < math.inf)
+    kept = np.isfinite(gains) & np.isfinite(std) & np.bool_(std > 0)
     size = np.abs(gains[kept])
     by_size = (gains[kept].conj()[:, None] * by_gain[kept]).real / size[:, None]
     return (size - 1) / std + 0j, by_size / std + 0j

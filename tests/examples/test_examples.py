@@ -42,6 +42,8 @@ from drivers.opening import Lines
 from drivers.playing import AmplifierLayer, AmplifierTone
 from drivers.wires.serial_frames import Frame, encode_frame
 from era_haptics.lab.conformance.contract import judge, of_kind
+from model.caching import cache_folder
+from model.compiled.kernels import kernels
 from model.rig.rig_file import load_rig
 from registry.limits import GuardLimits
 from sim.amplifier.simulated_amplifier import SimulatedAmplifier
@@ -276,13 +278,21 @@ SHORT = "add-a-material"
 
 @pytest.fixture
 def reader(tmp_path: Path, installed: Path) -> Iterator[Reader]:
-    """A reader in a checkout with examples and firmware alone; `pip` installs prebuilt packages."""
+    """A reader in a checkout with examples and firmware alone, for whom kernels were compiled.
+
+    `pip` installs prebuilt packages.
+    """
     home = Path(tempfile.mkdtemp(prefix="era"))
     folder, site, programs = tmp_path / "checkout", home / "site", home / "bin"
     folder.mkdir()
     programs.mkdir()
     for part in ("examples", "firmware"):
         shutil.copytree(ROOT / part, folder / part)
+    kernels()  # compiled here, if nowhere before
+    kept = home / "cache" / cache_folder().name
+    kept.mkdir(parents=True)
+    for library in cache_folder().glob("kernels-*"):
+        shutil.copy2(library, kept)
     pip = programs / "pip"
     words = [sys.executable, str(PIP), str(installed), str(site)]
     pip.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', encoding="utf-8")

@@ -19,7 +19,7 @@ from drivers.wires.modbus_frames import framed
 from era_haptics.lab.witness.capture import Direction, Message, WitnessedReply, WitnessedRequest
 from era_haptics.lab.witness.witness import DECODERS
 from group_stops import RandomGroup
-from long_form import in_turn, shortly
+from long_form import shortly
 from plate_witness import RULES
 from sim.far_ends.wire_assignment import SimulatedWire
 from virtual_lines import run_virtual
@@ -51,14 +51,16 @@ def live(kind: str, lines: str, seed: int, *, lossy_steps: int = 0) -> None:
 
 
 @pytest.mark.parametrize("seed", shortly(range(12), [1]))
-@pytest.mark.parametrize(("kind", "lines"), in_turn(KINDS, LINES))
+@pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
+@pytest.mark.parametrize("kind", shortly(KINDS, ["can", "rtu"]))
 def test_witness_finds_nothing_in_random_days(kind: str, lines: str, seed: int) -> None:
     """Layers, stops, disarms, faults, and watchdogs that expire, heard at the amplifiers' end."""
     live(kind, lines, seed)
 
 
 @pytest.mark.parametrize("seed", shortly(range(8), [1]))
-@pytest.mark.parametrize(("kind", "lines"), in_turn(KINDS, LINES))
+@pytest.mark.parametrize("lines", shortly(LINES, ["shared"]))
+@pytest.mark.parametrize("kind", shortly(KINDS, ["serial", "tcp"]))
 def test_witness_excuses_lost_and_doubled_frames(kind: str, lines: str, seed: int) -> None:
     """Both sides bear them as the decision says, and half a second later all rules hold again."""
     live(kind, lines, seed, lossy_steps=25)

@@ -9,7 +9,7 @@ from drivers.by_hand.actions import BlockingAmplifier
 from drivers.playing import AmplifierLayer
 from era_haptics.drive import Played, expect_rig, layers_of
 from model.errors import InputError, expect_path, shown
-from model.estimate.calibrate import Calibration, check_consistency
+from model.estimate.calibrate import Calibration
 from model.estimate.calibrate import calibrate as fit
 from model.estimate.measurement import measurement_of, read_measured
 from model.processes import Progress, check_progress, unseen
@@ -122,5 +122,4 @@ def calibrate(
     expect_rig(rig)
     check_progress(progress)
     responses = measurement_of(read_measured(expect_path(measured, what="measured")), rig)
-    screened = check_consistency(rig, responses)
-    return fit(rig, responses, screened, all_scales=all_scales, progress=progress)
+    return fit(rig, responses, all_scales=all_scales, progress=progress)

@@ -18,7 +18,7 @@ from benchmarks.calibration.hidden_plates import CHOSEN, field_deviations, senso
 from benchmarks.setting import RIG
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate, check_consistency
+from model.estimate.calibrate import calibrate
 from model.estimate.measurement import Measurement, measurement_of, read_measured
 from model.rig.rig import Rig
 from model.rig.rig_file import load_rig
@@ -31,7 +31,7 @@ def deviations(
     rig: Rig, responses: Measurement, truth: dict[str, list[float]]
 ) -> dict[str, tuple[FloatArray, float]]:
     """Errors in standard errors by kind of value, and the standard error, relative."""
-    found = calibrate(rig, responses, check_consistency(rig, responses))
+    found = calibrate(rig, responses)
     real, imaginary = np.array(truth["fields"])
     gains, phases, fields = field_deviations(found.rig, real + 1j * imaginary)
     known = found.rig.uncertainty

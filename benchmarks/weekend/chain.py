@@ -32,7 +32,7 @@ from era_haptics.lab.measuring.sound_card import WiredSensor, read_sensors
 from model.answer.answer import Answer
 from model.arrays import ComplexArray, FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate, check_consistency
+from model.estimate.calibrate import calibrate
 from model.estimate.measurement import Measurement, write_responses
 from model.finger import fingertips_on
 from model.reduction.free_plate import FreePlate, solve_free_plate
@@ -168,7 +168,7 @@ def measured(rig: Rig, seed: int) -> tuple[BuiltBoard, Measurement]:
 def touches(rig: Rig, seed: int, count: int) -> Iterator[Touch]:
     """Build, measure, calibrate and touch a board; count: for each number of quiet fingers."""
     built, responses = measured(rig, seed)
-    known = calibrate(rig, responses, check_consistency(rig, responses)).rig
+    known = calibrate(rig, responses).rig
     tables = [phased_table(each) for each in (rig, known, built.exactly_known)]
     for fingers in random_fingers(rig, seed, count):
         bought, calibrated, exact = (fingers.query(each) for each in tables)

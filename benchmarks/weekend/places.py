@@ -21,7 +21,7 @@ from benchmarks.setting import use_one_thread
 from benchmarks.weekend.boards import ROOT
 from benchmarks.weekend.chain import FOLDER, measured
 from model.errors import InputError
-from model.estimate.calibrate import calibrate, check_consistency
+from model.estimate.calibrate import calibrate
 from model.reduction.free_plate import solve_free_plate
 from model.rig.rig_file import load_rig
 
@@ -52,7 +52,7 @@ def known_by(board: int, count: int) -> Known:
     order = np.random.default_rng([7, board]).permutation(len(responses.sensors))
     some = responses.without(~np.isin(np.arange(len(order)), order[:count]))
     try:
-        found = calibrate(rig, some, check_consistency(rig, some))
+        found = calibrate(rig, some)
     except InputError as refused:
         return Known(refused=str(refused))
     if not found.is_good:

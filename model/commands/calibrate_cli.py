@@ -136,7 +136,7 @@ def calibrate(
     Write what was found beside the rig's file, and print its values with their uncertainties.
     """
     from model.estimate.calibrate import calibrate as fit
-    from model.estimate.calibrate import check_consistency, standard_errors
+    from model.estimate.calibrate import standard_errors
     from model.estimate.fit_report import (
         calibration_json,
         change_rows,
@@ -153,8 +153,7 @@ def calibrate(
     rig = load_rig(rig_file, mesh=mesh)
     measurement = measurement_of(read_measured(measured_file), rig)
     with Stopwatch() as timed, progress_bar("fits") as progress:
-        screened = check_consistency(rig, measurement)
-        calibration = fit(rig, measurement, screened, all_scales=all_scales, progress=progress)
+        calibration = fit(rig, measurement, all_scales=all_scales, progress=progress)
     rows = change_rows(calibration)
     notes = [*finding_rows(calibration), *check_rows(calibration)]
     refusal = None

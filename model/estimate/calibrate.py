@@ -202,14 +202,12 @@ class Calibration:
     @cached_property
     def rig(self) -> Rig:
         """The calibrated rig: without form errors, with its gains and its uncertainty."""
-        rig = self._fitted
         eras = []
-        for era, gains in zip(rig.eras, self._gains.T, strict=True):
-            known = np.isfinite(gains) & (gains != 0)
-            rows = zip(self.frequencies[known].tolist(), gains[known].tolist(), strict=True)
-            stated = tuple((f, abs(gain), float(np.angle(gain))) for f, gain in rows)
+        for era, gains in zip(self._fitted.eras, self._gains.T.tolist(), strict=True):
+            rows = zip(self.frequencies.tolist(), gains, strict=True)
+            stated = tuple((f, abs(g), float(np.angle(g))) for f, g in rows if abs(g) > 0)
             eras.append(replace(era, gains=stated or era.gains))
-        return replace(rig, eras=tuple(eras), uncertainty=self._uncertainty)
+        return replace(self._fitted, eras=tuple(eras), uncertainty=self._uncertainty)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -229,8 +227,9 @@ class Calibration:
             plate.errors(x, self.fit.errors),
             strict=True,
         ):
-            is_loss = row.kind == "loss_factor"
-            share = self._loss_error if is_loss else math.hypot(_MODEL_ERROR, of_mass)
+            share = (
+                self._loss_error if row.kind == "loss_factor" else math.hypot(_MODEL_ERROR, of_mass)
+            )
             whole = math.hypot(float(error), share * float(value))
             is_free = bool(self.fit.searched[number])
             found.append(
@@ -259,7 +258,7 @@ class Calibration:
     def gains_error(self) -> FloatArray:
         """Standard errors of the rig's gains (f, eras), NaN where not measured."""
         slopes, of_noise = self._gain_changes
-        variance = _variances(slopes.real, self._covariance(self.fit.searched))
+        variance = _variances(slopes.real, self.fit.covariance, self.fit.searched)
         size = np.abs(self.gains_of_fit)
         own = size * np.sqrt(of_noise + variance)
         return np.asarray(np.hypot(own, np.abs(self._gains) - size))
@@ -333,14 +332,14 @@ class Calibration:
         if count - wanted < LEAST_SENSORS or len(candidates) <= wanted:
             return None
         evenly_spaced = np.linspace(0, len(candidates) - 1, wanted + 2)[1:-1].round().astype(int)
-        unseen = np.zeros(count, dtype=bool)
-        unseen[candidates[evenly_spaced]] = True
+        unseen = np.isin(np.arange(count), candidates[evenly_spaced])
         searched = self.fit.searched.copy()
         searched[space.groups["sensor_scale"]] &= ~unseen
         searched[space.groups["sensor_place"]] &= np.repeat(~unseen, 2)
         seen = self.fit.measurement.part(~unseen[:, None])
-        part = replace(self, fit=replace(self.fit, measurement=seen))
-        part = part.fitted_again(searched, self.fit.x)
+        part = replace(self, fit=replace(self.fit, measurement=seen)).fitted_again(
+            searched, self.fit.x
+        )
         scales, which = self.sensor_scales[:, None], self.fit.measurement.known & unseen[:, None]
         measured, predicted = self.fit.measurement.values, part.after * scales
         size = row_rms(measured)
@@ -377,8 +376,13 @@ class Calibration:
 
     def fitted_again(self, searched: NDArray[np.bool_], start: FloatArray) -> "Calibration":
         """Fit the parameters of a mask (p,) from a start (p,) of all of them."""
-        model, measurement = self.plate.model, self.fit.measurement
-        found = fit_to_noise(model, measurement, searched=searched, start=start, prior=self.prior)
+        found = fit_to_noise(
+            self.plate.model,
+            self.fit.measurement,
+            searched=searched,
+            start=start,
+            prior=self.prior,
+        )
         return replace(self, fit=found)
 
     @property
@@ -415,12 +419,7 @@ class Calibration:
     @cached_property
     def _fitted(self) -> Rig:
         """The rig without form errors, its ERAs where they clearly are, with the gains before."""
-        rig, space = self.plate.rig_at(self._plain.x), self.plate.model.space
-        off = space.values(np.where(self.is_clear, self.fit.x, 0.0), "place").reshape(-1, 2)
-        sides = [rig.plate.length, rig.plate.width]
-        places = np.clip(np.array([(era.x, era.y) for era in rig.eras]) + off, 0, sides)
-        eras = zip(rig.eras, places.tolist(), strict=True)
-        return replace(rig, eras=tuple(replace(era, x=x, y=y) for era, (x, y) in eras))
+        return self.plate.rig_at(self._plain.x, "place")
 
     @cached_property
     def _fields(self) -> ComplexArray:
@@ -438,10 +437,6 @@ class Calibration:
         """Gains (f, eras) of responses (f, s, eras) that fit best, NaN where not measured."""
         return gains_of(model, self.fit.measurement.values, self.fit.measurement.weight)
 
-    def _covariance(self, which: NDArray[np.bool_]) -> FloatArray:
-        """Covariance of the parameters of a mask (p,)."""
-        return np.asarray(self.fit.covariance[np.ix_(which, which)])
-
     @cached_property
     def _gain_changes(self) -> tuple[ComplexArray, FloatArray]:
         """Relative changes of the gains by what is searched (f, eras, q); variances by noise."""
@@ -455,23 +450,6 @@ class Calibration:
         for era, factor in enumerate(space.indices("force_factor")):
             slopes[:, era, numbers == factor] += space.std[factor]
         return slopes, of_noise
-
-    @cached_property
-    def _readings_errors(self) -> tuple[FloatArray, FloatArray, float]:
-        """Errors of fields as sensors read them: relative magnitudes and phases [rad] (f, eras).
-
-        The third is the error that the magnitudes of all fields have in common. What else is
-        searched changes gain and field the opposite ways: sensors read their product.
-        """
-        slopes, of_noise = self._gain_changes
-        reads = self.plate.model.space.of("sensor_scale", "sensor_place") & self.fit.searched
-        covariance, slopes = self._covariance(reads), slopes[..., reads[self.fit.searched]]
-        common = np.nanmean(slopes, axis=(0, 1))
-        beside = slopes - common
-        magnitude, phase = (
-            np.sqrt(of_noise + _variances(part, covariance)) for part in (beside.real, beside.imag)
-        )
-        return magnitude, phase, math.sqrt(common.real @ covariance @ common.real)
 
     @cached_property
     def _loss_error(self) -> float:
@@ -499,33 +477,31 @@ class Calibration:
         coils = [row.name for row in self.plate.of_exciters if row.kind == "damping"]
         errors = self.plate.errors(x, self.fit.errors).tolist()
 
-        def relative(kind: str, theory: float = _MODEL_ERROR) -> float | None:
-            """Rms error of the values of a kind, None where one is not identified."""
-            of_kind = [
-                (one, error)
+        def relative(
+            kind: str, theory: float = _MODEL_ERROR, unidentified: float = math.inf
+        ) -> float:
+            """Rms error of the values of a kind."""
+            shares = [
+                math.hypot(error / one.value, theory) if one.is_identified else unidentified
                 for one, error in zip(self.parameters, errors, strict=True)
                 if one.kind == kind and one.name not in coils
+                if one.value > 0 or not one.is_identified
             ]
-            if not all(one.is_identified for one, _ in of_kind):
-                return None
-            shares = [math.hypot(e / one.value, theory) for one, e in of_kind if one.value > 0]
             return rms(shares)
 
-        fitted = {"place": self._place_error} | self._field_errors
-        if (stiffness := relative("stiffness")) is not None:
-            fitted["stiffness"] = stiffness
         losses = relative("loss_factor", self._loss_error), relative("damping")
-        if losses[0] is not None and losses[1] is not None:
-            fitted["damping"] = math.expm1(max(losses[0], losses[1]))
-        feet = [
-            error / one.value if one.is_identified else before.supports
-            for one, error in zip(self.parameters, errors, strict=True)
-            if one.foot
-        ]
-        if feet:
-            fitted["supports"] = math.hypot(rms(feet), _MODEL_ERROR)
+        fitted = self._field_errors | {
+            "place": self._place_error,
+            "stiffness": relative("stiffness"),
+            "damping": math.expm1(max(losses)),
+            "supports": relative(
+                "supports", unidentified=math.hypot(before.supports, _MODEL_ERROR)
+            ),
+        }
+        if not any(one.foot for one in self.parameters):
+            del fitted["supports"]
         # An error is hardly known better than to two digits.
-        fitted = {key: float(f"{value:.2g}") for key, value in fitted.items()}
+        fitted = {key: float(f"{each:.2g}") for key, each in fitted.items() if each < math.inf}
         if "damping" in fitted:
             fitted["damping"] += 1
         if self.parameters[0].is_identified:
@@ -545,8 +521,17 @@ class Calibration:
         the best gains for such fields, as the sensors read them: other errors move gains and fields
         in opposite directions.
         """
-        magnitude, phase, common = self._readings_errors
-        lacking = self._lacking
+        slopes, of_noise = self._gain_changes
+        lacking, covariance = self._lacking, self.fit.covariance
+        # What else is searched changes gain and field the opposite ways: sensors read the product.
+        reads = self.plate.model.space.of("sensor_scale", "sensor_place") & self.fit.searched
+        slopes = slopes[..., reads[self.fit.searched]]
+        common = np.nanmean(slopes, axis=(0, 1))
+        beside = slopes - common
+        magnitude, phase = (
+            np.sqrt(of_noise + _variances(part, covariance, reads))
+            for part in (beside.real, beside.imag)
+        )
         known = np.isfinite(magnitude) & np.isfinite(lacking)
         if not known.any(axis=0).all():
             return {}
@@ -555,13 +540,12 @@ class Calibration:
         # The best gain of a field that is off by so much at n sensors: but at resonances, masses
         # and stiffness that are off change a field in phase with it.
         off = field / np.sqrt(self.fit.measurement.known.sum(axis=1)[known])
-        gain = rms(np.hypot(off, magnitude[known]))
         turned = rms(np.hypot(math.sqrt(0.5) * off, phase[known]))
         return {
-            "gain": max(gain, _LEAST),
+            "gain": max(rms(np.hypot(off, magnitude[known])), _LEAST),
             "phase_deg": math.degrees(max(turned, _LEAST)),
             "field": field,
-            "common_gain": common,
+            "common_gain": math.sqrt(_variances(common.real, covariance, reads)),
         }
 
     @property
@@ -588,36 +572,35 @@ class Calibration:
         error of the rig before counts where the data determine a place less than its prior does.
         """
         space, kind = self.plate.model.space, KINDS["place"]
-        kept = space.values(np.where(self.is_clear, 0.0, self.fit.x), "place")
-        error = space.values(self.fit.errors, "place")
+        kept, error = (
+            space.values(each, "place")
+            for each in (np.where(self.is_clear, 0.0, self.fit.x), self.fit.errors)
+        )
+        whole = np.hypot(np.hypot(kept, error), kind.theory)
         by_data = error < math.sqrt(0.5) * kind.std
-        before = self.plate.rig.uncertainty.place
-        of_each = np.where(by_data, np.hypot(np.hypot(kept, error), kind.theory), before)
-        return rms(of_each)
+        return rms(np.where(by_data, whole, self.plate.rig.uncertainty.place))
 
 
 def calibrate(
     rig: Rig,
     measured: Measurement,
-    screened: Screening,
     *,
     all_scales: bool = False,
     progress: Progress = unseen,
 ) -> Calibration:
-    """Fit a rig to responses measured on it, screened by `check_consistency`.
+    """Fit a rig to responses measured on it, once `check_consistency` has screened them.
 
     all_scales: estimate the scale of every sensor, not only of wrong ones; progress: called with
     the fits done and all. Raises InputError if fewer than three sensors have a signal, for a plate
     of another size, for gains that no drive has, and for suspensions or feet at a bound.
     """
     # All scales are unknown at first, so that a wrong one does not bias the fit.
-    found = _fitted_with_scales(rig, measured, screened)
+    found = _fitted_with_scales(rig, measured, check_consistency(rig, measured))
     progress(1, 3)  # with all scales free, of what is identified, without held-out sensors
     scales, space = found.sensor_scales, found.plate.model.space
-    is_unknown = np.ones(len(scales), dtype=bool)
-    if not all_scales:
-        error = space.values(found.fit.errors, "sensor_scale")
-        is_unknown = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
+    error = space.values(found.fit.errors, "sensor_scale")
+    is_wrong = np.abs(scales - 1) > np.maximum(_WRONG_SCALE, _SIGNIFICANCE * error)
+    is_unknown = is_wrong | all_scales
     start, own = found.fit.x.copy(), space.groups["sensor_scale"]
     start[own] = (np.where(is_unknown, scales, 1.0) - 1) / space.std[own]
     found = replace(found, prior=_prior(found.plate, start, is_unknown))
@@ -752,34 +735,35 @@ def _check_gains(found: Calibration) -> None:
 
 def _check_suspensions(found: Calibration) -> None:
     """Raise InputError for exciters and feet with a stiffness at its bound, of another kind."""
-    exciters, feet = {}, {}
     names = {row.era for row in found.plate.of_exciters}
-    for one in found.parameters:
-        if not one.at_bound:
-            continue
-        factor = f"{one.value / one.before:.2g}"
-        if one.foot:
-            feet[one.foot] = factor
-        elif one.kind == "stiffness" and one.era in names:
-            exciters[one.era] = factor
+    bound = [one for one in found.parameters if one.at_bound]
+    exciters = [one for one in bound if one.kind == "stiffness" and one.era in names]
+    feet = [one for one in bound if one.foot]
+
+    def factors(rows: list[Parameter]) -> str:
+        return ", ".join(f"{one.value / one.before:.2g}" for one in rows)
+
     if exciters:
         raise InputError(
-            f"stiffness of {', '.join(exciters)} must be about that of the rig, got "
-            f"{', '.join(exciters.values())} times it, the bound of what is searched; check "
+            f"stiffness of {', '.join(one.era for one in exciters)} must be about that of the rig, "
+            f"got {factors(exciters)} times it, the bound of what is searched; check "
             "resonance and resonance_is of these: whether free or mounted (era plate show prints "
             "where the glued magnets resonate), and by era rig check that they are glued"
         )
     if feet:
         raise InputError(
-            f"stiffness of feet {', '.join(feet)} must be about that of the rig, got "
-            f"{', '.join(feet.values())} times it, the bound of what is searched; check their "
+            f"stiffness of feet {', '.join(one.foot for one in feet)} must be about that of the "
+            f"rig, got {factors(feet)} times it, the bound of what is searched; check their "
             "kind, their places and that all of them touch"
         )
 
 
-def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Variances (f, n) of linear functions of parameters, by slopes (f, n, q) and covariance."""
-    return np.asarray(((slopes @ covariance) * slopes).sum(axis=-1))
+def _variances(
+    slopes: FloatArray, covariance: FloatArray, searched: NDArray[np.bool_]
+) -> FloatArray:
+    """Variances (...) of functions of the parameters of a mask (p,), by slopes (..., q)."""
+    own = covariance[np.ix_(searched, searched)]
+    return np.asarray(((slopes @ own) * slopes).sum(axis=-1))
 
 
 def standard_errors(calibration: Calibration) -> dict[KeyPath, float]:

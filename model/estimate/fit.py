@@ -609,13 +609,12 @@ class SensedPlate:
         """
         return self.model.at(np.zeros(self.model.space.size) if z is None else z).responses
 
-    def rig_at(self, z: FloatArray) -> Rig:
-        """The rig with the fitted values of z."""
-        own = np.zeros(len(z))
-        own[self.numbers] = z[self.numbers]
-        beside = self.model.space.groups["force_factor"]
-        own[beside] = z[beside]  # with the damping that was found beside it
-        values = Values(self.rig, self.model.space, own)
+    def rig_at(self, z: FloatArray, *beside: str) -> Rig:
+        """The rig with the fitted values of z, and with those of further kinds."""
+        # A force factor is found with the damping beside it.
+        own = self.model.space.of("force_factor", *beside)
+        own[self.numbers] = True
+        values = Values(self.rig, self.model.space, np.where(own, z, 0.0))
         return rig_with(self.rig, values, self.rig.uncertainty)
 
     def values(self, z: FloatArray) -> FloatArray:

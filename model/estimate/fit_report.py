@@ -320,13 +320,14 @@ def contrast_rows(expected: Sequence[ExpectedContrast]) -> list[str]:
     """Lines of the contrast to expect before and after, and of what is promised."""
     if not expected:
         return ["contrast: nothing is promised"]
-    rows = ["contrast on plates like this one, median over random fingers:"]
-    for each in expected:
-        rows.append(
+    return [
+        "contrast on plates like this one, median over random fingers:",
+        *(
             f"  {each.quiet} quiet: as written {each.before:.1f} dB, identified {each.after:.1f} "
             f"dB; nine of ten plates {each.promised:.1f} dB"
-        )
-    return rows
+            for each in expected
+        ),
+    ]
 
 
 def identification_json(

@@ -46,7 +46,7 @@ from model.arrays import ComplexArray, FloatArray, IntArray
 from model.fem import Mesh, element_slopes
 from model.finger import Grid
 from model.reduction.free_plate import TERMS, FreeModes, FreePlate, FreeReceptance, combined
-from model.reduction.reduced_plate import ReducedPlate, place_slopes, reduce_free_plate
+from model.reduction.reduced_plate import place_slopes, reduce_free_plate
 from model.rig.rig import Rig, Uncertainty
 from model.spectral.direct_solution import stiffness_slopes
 from model.structure.attachments import (
@@ -75,7 +75,21 @@ MASS_CELLS = Grid(8, 6)
 MIN_LOSS_FACTOR = 1e-9
 """Least loss factor, so that there are derivatives by its logarithm."""
 
+FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
+"""Parts of a finger's load that vary independently."""
+
+MODE_SHIFTS = 12
+"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
+
 _SLOWEST = 2 * np.pi  # rad/s; of slower modes the frequency of losses is taken as this
+
+AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
+
+Number: TypeAlias = float | NDArray[np.floating[Any]]
+"""One number for all parameters of a kind, or one for each."""
+
+Range: TypeAlias = tuple[Number, Number, Number]
+"""Standard deviation, lowest and highest deviation of parameters, in the unit of `Values`."""
 
 
 @dataclass(frozen=True)
@@ -104,24 +118,9 @@ class RestingFinger:
     """Number of the only tone during which it rests, None for all."""
 
 
-FINGER_PARTS = ("contact mass", "pulp", "phalanx", "joint")
-"""Parts of a finger's load that vary independently."""
-
-AnyArray: TypeAlias = NDArray[np.floating[Any]] | NDArray[np.complexfloating[Any, Any]]
-
-MODE_SHIFTS = 12
-"""Number of the lowest elastic modes with eigenvalues and loss factors of their own."""
-
-Number: TypeAlias = float | NDArray[np.floating[Any]]
-"""One number for all parameters of a kind, or one for each."""
-
-Range: TypeAlias = tuple[Number, Number, Number]
-"""Standard deviation, lowest and highest deviation of parameters, in the unit of `Values`."""
-
-
 @dataclass(frozen=True, eq=False)
 class SearchScope:
-    """What may differ of a rig with sensors, of which `Kind` derives its parameters."""
+    """What may differ of a rig with sensors; each `Kind` derives its parameters from it."""
 
     rig: Rig
     sensors: Sequence[str]
@@ -325,31 +324,19 @@ class ReducedModes:
     No further modes count as truncated.
     """
 
-    plate: ReducedPlate
+    eigenvalues: FloatArray
+    """omega² (r,) [rad²/s²]."""
+    losses: FloatArray
+    """Their imaginary part beside the plate's own loss factor (r,)."""
+    dispersion: Dispersion | None
+    """How they change with frequency, None where they do not."""
+    shapes_at: Callable[[FloatArray], FloatArray]
+    """Shapes at points or footprints [m], (n, r)."""
     cells: FloatArray
     """Shapes where foreign mass may lie (c, r)."""
     stiffening: FloatArray
     """Derivatives (3, r, r) [rad²/s²] of the stiffness between coordinates by length, width
     (relative) and Poisson's ratio."""
-
-    @property
-    def eigenvalues(self) -> FloatArray:
-        """omega² (r,) [rad²/s²]."""
-        return np.asarray(self.plate.omega**2)
-
-    @property
-    def losses(self) -> FloatArray:
-        """Their imaginary part beside the plate's own loss factor (r,)."""
-        return self.plate.losses
-
-    @property
-    def dispersion(self) -> Dispersion | None:
-        """How they change with frequency, None where they do not."""
-        return self.plate.dispersion
-
-    def shapes_at(self, points: FloatArray) -> FloatArray:
-        """Shapes at points or footprints [m], (n, r)."""
-        return self.plate.at(points)
 
     def truncated_terms(self, points: FloatArray, others: FloatArray) -> FloatArray:
         """Sums over truncated modes: zero, (TERMS, n, m)."""
@@ -368,7 +355,14 @@ def reduced_modes(rig: Rig, free: FreePlate) -> ReducedModes:
         degrees = free.mesh.nx, free.mesh.ny
         frequency = math.sqrt(plate.lowest_bending_frequency * free.frequency_max)
         stiffening = stiffness_slopes(plate, degrees, unknowns, frequency=frequency)
-    return ReducedModes(reduced, reduced.at(cells), stiffening)
+    return ReducedModes(
+        np.asarray(reduced.omega**2),
+        reduced.losses,
+        reduced.dispersion,
+        reduced.at,
+        reduced.at(cells),
+        stiffening,
+    )
 
 
 Modes: TypeAlias = FreeModes | ReducedModes
@@ -407,14 +401,9 @@ def places_of(
     """
     moving, shapes = footprints[movable], modes.shapes_at(footprints)
     truncated = modes.truncated_terms(footprints, footprints)
-    if not len(movable):
-        none = np.zeros((len(truncated), 0, len(footprints)))
-        return AttachmentPoints(footprints, shapes, truncated, np.zeros((0, shapes.shape[1])), none)
-
-    def field(points: FloatArray) -> FloatArray:
-        return modes.truncated_terms(points, footprints).swapaxes(0, 1)
-
-    by_place = place_slopes(field, moving, sides)
+    by_place = place_slopes(
+        lambda points: modes.truncated_terms(points, footprints).swapaxes(0, 1), moving, sides
+    )
     return AttachmentPoints(
         footprints,
         shapes,
@@ -469,11 +458,9 @@ class ForwardModel:
         """Indices of the sensors among the attachments, (s,)."""
         names = [era.name for era in self.rig.eras]
         after = len(names) + len(self.rig.masses) + self.mass_count + len(self.fingers)
-        found = []
-        for sensor in self.sensors:
-            found.append(names.index(sensor.era) if sensor.era else after)
-            after += not sensor.era
-        return np.array(found, dtype=int)
+        at_eras = [names.index(each.era) if each.era else -1 for each in self.sensors]
+        alone = np.array(at_eras) < 0
+        return np.where(alone, after + np.cumsum(alone) - 1, at_eras)
 
     @cached_property
     def lateness(self) -> FloatArray:
@@ -766,12 +753,16 @@ class PlateAt:
         stiffness = np.asarray(modulus * lossy, dtype=complex)
         return model.free.receptance(model.omega, stiffness, eta, thickness, modulus)
 
+    @property
+    def reach_of_modes(self) -> tuple[ComplexArray, ComplexArray]:
+        """`reach` of what is observed (f, s, r), and transposed of what is pushed (f, r, c)."""
+        return self.reach[:, self.model.observed], self.reach[:, self.pushed].swapaxes(1, 2)
+
     def by_log_stiffness(
         self, of_modes: ComplexArray | float, of_rest: ComplexArray | float
     ) -> ComplexArray:
         """Derivatives by a change of the log stiffness of modes (f, r) and of all else (f,)."""
-        functions, reach = self.functions, self.reach
-        seen, driven = reach[:, self.model.observed], reach[:, self.pushed].swapaxes(1, 2)
+        functions, seen, driven = self.functions, *self.reach_of_modes
         change = (seen * (of_modes * functions.elastic)[:, None]) @ driven
         if self.bending is not None:
             change += seen @ (self.bending * np.reshape(of_rest, (-1, 1, 1))) @ driven
@@ -814,12 +805,13 @@ class PlateAt:
     def by_stretch(self, *numbers: int) -> ComplexArray:
         """Derivatives by relative length, width and Poisson's ratio, by number, as modes couple."""
         assert self.model.form is not None  # noqa: S101  sides differ
-        seen = self.reach[:, self.model.observed]
-        driven = self.reach[:, self.pushed].swapaxes(1, 2)
-        factor = -(self.functions.q * self.functions.thickness)[:, None, None]
-        slopes = [self.model.form.stiffening[number] for number in numbers]
+        factor, (seen, driven) = -(self.functions.q * self.functions.thickness), self.reach_of_modes
         return np.stack(
-            [self.responding(factor * (seen @ slope @ driven)) for slope in slopes], axis=-1
+            [
+                self.responding(factor[:, None, None] * (seen @ slope @ driven))
+                for slope in self.model.form.stiffening[list(numbers)]
+            ],
+            axis=-1,
         )
 
     @cached_property

@@ -160,10 +160,10 @@ class Identification:
         """Values of the parameters, gains of sensors among them."""
         return self.fitted.plate.values
 
-    @cached_property
+    @property
     def mode_shift(self) -> float:
         """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
-        return rms(self.fitted.x[self.fitted.space.of("mode_shifts")])
+        return _mode_shift(self.fitted)
 
     @property
     def is_explained(self) -> bool:
@@ -331,15 +331,16 @@ def fit_board(rig: Rig, measurement: Measurement) -> Fit:
                 break
             other = _with_grain(found[-1].model.rig, math.exp(across), math.exp(shear))
             found.append(fit_in_stages(other, measurement))
-        if any(_is_good(each) for each in found):
+        if any(
+            each.chi2 <= _GRAIN_GOOD and _mode_shift(each) ** 2 <= _GRAIN_GOOD for each in found
+        ):
             break
     return likeliest(found)
 
 
-def _is_good(found: Fit) -> bool:
-    """Whether a fit explains a measurement by a board whose modes need not shift beyond theirs."""
-    shifts = found.x[found.space.of("mode_shifts")]
-    return found.chi2 <= _GRAIN_GOOD and float((shifts**2).mean()) <= _GRAIN_GOOD
+def _mode_shift(found: Fit) -> float:
+    """Rms by which the lowest modes had to shift, in standard deviations, 0 without any."""
+    return rms(found.x[found.space.of("mode_shifts")])
 
 
 def _grain_shown(found: Fit) -> tuple[float, float]:
@@ -576,22 +577,16 @@ def _advice(found: Identification, combination: FloatArray) -> str:
     covariance += np.diag(unknown.astype(float))
     at = wider.at(x)
     noise = _ADVISED_NOISE * np.sqrt((np.abs(at.responses) ** 2).mean(axis=(0, 2), keepdims=True))
-    narrowed = _narrowed(
-        jacobian(at) / noise[..., None], covariance, covariance @ (direction * wider.space.std)
-    )
+    narrowed = np.zeros(at.responses.shape)
+    direction = covariance @ (direction * wider.space.std)
+    slopes = jacobian(at) / noise[..., None]
+    for part in (slopes.real, slopes.imag):  # by each response measured on its own
+        variance = ((part @ covariance) * part).sum(axis=-1)
+        narrowed += (part @ direction) ** 2 / (1 + variance)
     f, s, e = map(int, np.unravel_index(best_of(narrowed.ravel()), narrowed.shape))
     sensor = wider.sensors[s]
     place = f"ERA {sensor.era}" if sensor.era else f"({sensor.x:.3g}, {sensor.y:.3g}) m"
     return f"play ERA {rig.eras[e].name} at {tones[f]:.0f} Hz and measure at {place}"
-
-
-def _narrowed(J: ComplexArray, covariance: FloatArray, direction: FloatArray) -> FloatArray:
-    """Decrease of a combination's variance by each response measured on its own, (f, s, e)."""
-    total = np.zeros(J.shape[:3])
-    for part in (J.real, J.imag):
-        variance = ((part @ covariance) * part).sum(axis=-1)
-        total += (part @ direction) ** 2 / (1 + variance)
-    return total
 
 
 def standard_errors(found: Identification) -> dict[KeyPath, float]:

@@ -140,11 +140,6 @@ def _bolts_by_sheets(scope: SearchScope, std: float) -> Range:
     return _added(bolt, np.where(is_coil, COIL_DEVIATES * bolt, 0.05 * unit), largest)
 
 
-def _feet_by_sheets(scope: SearchScope, std: float) -> Range:
-    """Range of feet whose deviation a rig states; others are known."""
-    return scope.rig.uncertainty.supports, -math.log(10.0), math.log(10.0)
-
-
 def _by_lag(plate: PlateAt, factor: complex, power: int) -> ComplexArray:
     """Derivatives by what makes drives lag with a power of frequency."""
     f = 1e-3 * plate.model.frequencies[:, None]
@@ -460,7 +455,11 @@ KINDS: dict[str, Kind] = {
         ),
         value=lambda values: np.exp(values.own("supports")),
         stated=lambda scope, std: scope.uncertainty.supports,
-        by_sheet=_feet_by_sheets,
+        by_sheet=lambda scope, std: (
+            scope.rig.uncertainty.supports,
+            -math.log(10.0),
+            math.log(10.0),
+        ),
         is_listed=True,
     ),
     # Of each of FINGER_PARTS of a finger, which the daemon adds.

@@ -17,7 +17,7 @@ from benchmarks.calibration.hidden_plates import draw_plate, gains_of, measure, 
 from benchmarks.weekend import chain
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import Calibration, calibrate, check_consistency
+from model.estimate.calibrate import Calibration, calibrate
 from model.estimate.fit_report import calibration_json, change_rows, finding_rows
 from model.estimate.measurement import Measurement
 from model.rig.rig import Rig
@@ -45,7 +45,7 @@ def test_report_has_the_feet_that_responses_tell_of_and_names_others() -> None:
     truth = perturbed(rig, frequencies=FREQUENCIES)
     stiffer = tuple(replace(each, stiffness=1.4 * each.stiffness) for each in feet)
     responses = plates_measured(replace(truth, masses=stiffer), frequencies=FREQUENCIES)
-    found = calibrate(rig, responses, check_consistency(rig, responses))
+    found = calibrate(rig, responses)
     first, second = (one for one in found.parameters if one.foot)
     assert first.standard_error is not None
     assert first.standard_error < 0.02 * STIFF
@@ -88,7 +88,7 @@ def boards(seeds: range) -> Iterator[FloatArray]:
     rig = load_rig(chain.FOLDER / "rig.yaml")
     for seed in seeds:
         built, responses = chain.measured(rig, seed)
-        yield _off(calibrate(rig, responses, check_consistency(rig, responses)).rig, built.rig)
+        yield _off(calibrate(rig, responses).rig, built.rig)
 
 
 def plates(seeds: range) -> Iterator[FloatArray]:
@@ -97,7 +97,7 @@ def plates(seeds: range) -> Iterator[FloatArray]:
     for seed in seeds:
         hidden = draw_plate(rig, seed=seed)
         responses = measure(hidden, rig, seed=seed)
-        yield _off(calibrate(rig, responses, check_consistency(rig, responses)).rig, hidden.rig)
+        yield _off(calibrate(rig, responses).rig, hidden.rig)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def fitted(rig: Rig, truth: Rig) -> Calibration:
 
 def calibrated(rig: Rig, responses: Measurement, *, all_scales: bool = False) -> Calibration:
     """As `era calibrate` does it."""
-    return calibrate(rig, responses, check_consistency(rig, responses), all_scales=all_scales)
+    return calibrate(rig, responses, all_scales=all_scales)
 
 
 def test_calibrate_finds_every_parameter(truth, fitted):

@@ -134,17 +134,19 @@ def of_a_laminate(model: ForwardModel) -> ForwardModel:
 def test_derivatives_are_the_slopes_of_the_responses(model: ForwardModel, is_layered: bool) -> None:
     """Every analytic derivative is that of a central difference, of lossy modes too."""
     model = of_a_laminate(model) if is_layered else model
-    x, step = somewhere(model.space, 2), 1e-4
-    found = jacobian(model.at(x))
-    for number in np.flatnonzero(model.space.uncertain):
-        sides = []
-        for sign in (1, -1):
-            moved = x.copy()
-            moved[number] += sign * step
-            sides.append(model.at(moved).responses)
-        slope = (sides[0] - sides[1]) / (2 * step)
-        error = np.abs(found[..., number] - slope).max() / np.abs(slope).max()
-        assert error < 1e-4, model.space.names[number]
+    slopes_by_differences(model, somewhere(model.space, 2))
+
+
+def slopes_by_differences(model: ForwardModel, x: FloatArray) -> ComplexArray:
+    """Slopes at x of all that is uncertain, checked by central differences to 1e-4."""
+    space, step = model.space, 1e-4
+    found, size = jacobian(model.at(x)), np.abs(model.at(x).responses).max()
+    for number in np.flatnonzero(space.uncertain):
+        moved = step * np.eye(space.size)[number]
+        slope = (model.at(x + moved).responses - model.at(x - moved).responses) / (2 * step)
+        error = np.abs(found[..., number] - slope).max() / max(np.abs(slope).max(), 1e-6 * size)
+        assert error < 1e-4, space.names[number]
+    return found
 
 
 def test_drive_lags_as_an_actuator_with_a_resonance(model: ForwardModel) -> None:
@@ -242,19 +244,13 @@ def test_derivatives_are_slopes_of_the_responses(magnet: str) -> None:
     """
     keys = f"{KEYS}, magnet: {magnet}"
     model = model_of(exciter_rig(keys, frequency="[40, 300]", more=f"{PARTS}\n{FOAM}"))
-    space, step = model.space, 1e-4
+    space = model.space
     x = 0.5 * np.random.default_rng(2).standard_normal(space.size)
     x[space.groups["masses"].start] = 1.0
     x = np.clip(x, space.lower + 0.1, space.upper - 0.1) * space.uncertain
-    found = jacobian(model.at(x))
-    size = np.abs(model.at(x).responses).max()
     assert {"magnet mass SW", "force factor NE"} <= {*space.names}
     assert space.std[space.index("stiffness of foot foam")] == 0.3
-    for number in np.flatnonzero(space.uncertain):
-        moved = step * np.eye(space.size)[number]
-        slope = (model.at(x + moved).responses - model.at(x - moved).responses) / (2 * step)
-        error = np.abs(found[..., number] - slope).max() / max(np.abs(slope).max(), 1e-6 * size)
-        assert error < 1e-4, space.names[number]
+    found = slopes_by_differences(model, x)
     magnets = found[..., space.groups["magnet_mass"]]
     assert magnets.any() == (magnet == "free")
 

@@ -17,7 +17,7 @@ from benchmarks.desk_plate.truth import draw_truth
 from benchmarks.direct_plate import direct_acceleration
 from model.arrays import FloatArray
 from model.errors import InputError
-from model.estimate.calibrate import calibrate, check_consistency
+from model.estimate.calibrate import calibrate
 from model.estimate.fit import sensed_plate
 from model.estimate.forward import jacobian, viscous_difference
 from model.estimate.measurement import (
@@ -59,7 +59,7 @@ def test_loss_factor_of_a_plate_in_time_is_within_its_standard_error() -> None:
     noise = rng.standard_normal((2, *exact.shape))
     values = exact + 1e-3 * size * (noise[0] + 1j * noise[1])
     responses = Measurement(sensors_at(points), TONES, values.swapaxes(1, 2))
-    found = calibrate(rig, responses, check_consistency(rig, responses))
+    found = calibrate(rig, responses)
     loss = next(one for one in found.parameters if one.kind == "loss_factor")
     assert loss.standard_error is not None
     off = abs(loss.value - truth.rig.plate.loss_factor)
